@@ -16,7 +16,7 @@ import thruster_env  # noqa: F401 - registers BowThruster-v0  # noqa: F401 - reg
 from benchmarks.peers import EnsembleStep, KalmanStep, UnscentedStep, compiled_model, python_model
 from benchmarks.rates import arithmetic_limit, operations_of, step_of_env, step_of_filtered
 from benchmarks.timing import Measure, Row, alone, seconds_a_call, side_by_side
-from filters.wrappers.single import EstimateState
+from filters.wrappers.envs import EstimateState
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.memory import set_row
 from thruster_env.core.streams import ACTION_SPACE, derived_seed

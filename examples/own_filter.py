@@ -29,9 +29,11 @@ from typing import ClassVar
 
 import tuning
 from filters import ExtendedKalmanFilter
-from filters.algebra.blocks import forward_quotient
 from filters.algebra.operations import (
+    at_most,
+    diagonal,
     divide,
+    exponential,
     joseph,
     only,
     present,
@@ -39,9 +41,8 @@ from filters.algebra.operations import (
     uncorrelated,
     wrap,
 )
-from filters.algebra.points import root
-from filters.algebra.samples import log_density
-from filters.algebra.scalars import at_most, diagonal, exponential
+from filters.algebra.points import log_density, root
+from filters.algebra.roots import forward_quotient
 from filters.gaussian.extended import add_process_noise, propagate
 from filters.pages.page import Page
 from filters.pages.page_filter import PageFilter

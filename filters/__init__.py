@@ -1,16 +1,16 @@
 """Kalman-type filters: as values with `init`, `predict`, `update`, over batches, and as Gymnasium wrappers."""
 
 from filters.adaptive import RobustExtendedKalmanFilter, SageHusaFilter, VariationalBayesFilter
-from filters.augmented import Unknown, augmented_model
+from filters.augmented import Unknown, augmented_model, transformed_model
 from filters.baselines import Inversion, LowPass, OpenLoop
 from filters.engine.batch import Estimates
 from filters.engine.belief import Belief, Innovation
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
-from filters.ensembles.rank_histogram import RankHistogramFilter
 from filters.ensembles.square_root import (
     EnsembleTransformFilter,
     FiniteSizeEnsembleFilter,
     LocalEnsembleTransformFilter,
+    RankHistogramFilter,
     SerialSquareRootFilter,
 )
 from filters.ensembles.stochastic import DeterministicEnsembleKalmanFilter, EnsembleKalmanFilter
@@ -28,14 +28,11 @@ from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanF
 from filters.horizon.moving_horizon import MovingHorizonFilter
 from filters.particles.particle import AuxiliaryParticleFilter, ParticleFilter, RaoBlackwellisedParticleFilter
 from filters.registry import FILTERS, make_filter
-from filters.smoothers.modes import SmoothedModes, smooth_modes
+from filters.smoothers.rts import SmoothedModes, smooth_modes
 from filters.smoothers.smooth import Smoothed, smooth
 from filters.starts import Restarts, RestartWarning, restarts_of, run
 from filters.tensors import torch
-from filters.transformed import transformed_model
-from filters.wrappers.ids import register_filtered_envs
-from filters.wrappers.single import EstimateState
-from filters.wrappers.vector import EstimateStates
+from filters.wrappers.envs import EstimateState, EstimateStates, register_filtered_envs
 from thruster_env.core.compiled import may_be_inlined
 from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.state_space import StateSpaceModel

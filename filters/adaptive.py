@@ -8,10 +8,23 @@ from typing import ClassVar
 import numpy as np
 
 from filters.algebra.matrices import shifted
-from filters.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
-from filters.algebra.points import outer
-from filters.algebra.samples import log_density
-from filters.algebra.scalars import choose, constant, count, exceeds, is_number, trace
+from filters.algebra.operations import (
+    choose,
+    constant,
+    count,
+    divide,
+    exceeds,
+    eye,
+    is_number,
+    joseph,
+    only,
+    present,
+    sym,
+    trace,
+    uncorrelated,
+    wrap,
+)
+from filters.algebra.points import log_density, outer
 from filters.engine.belief import Belief
 from filters.gaussian.extended import add_process_noise, propagate
 from filters.pages.page import Page

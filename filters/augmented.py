@@ -1,8 +1,13 @@
-"""Joint estimation of state and parameters: a model whose unknown constants are states."""
+"""Joint estimation of state and parameters: a model whose unknown constants are states.
+
+A model of fewer states within a larger one: further states are kept as they are, and take part in nothing.
+Models in which states that have bounds are replaced by their logarithms or logits, which have none.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -13,8 +18,21 @@ from thruster_env.core.checks import finite, positive
 from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.equal_functions import makes_functions
-from thruster_env.core.sources import Source, assembled, entrywise, joiner, tuple_of, vector_part, written_out
-from thruster_env.model.quantities import Output, Quantity
+from thruster_env.core.sources import (
+    Source,
+    as_value,
+    assembled,
+    entrywise,
+    is_array,
+    joiner,
+    matrix_of,
+    tuple_of,
+    vector_part,
+    written_out,
+)
+from thruster_env.core.user_functions import as_function, as_made
+from thruster_env.model.affine import AffineModel, affine_model
+from thruster_env.model.quantities import Bound, Output, Quantity, checked_bounds
 from thruster_env.model.shape import constants_are_array
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -211,3 +229,257 @@ def _augmented_functions(
             "observe_jacobian", "h", observe_jacobian, m, "", shape.measurement_angles, False
         )
     return functions
+
+
+def embedded_model(
+    model: StateSpaceModel, larger: StateSpaceModel, moments: Mapping[int, tuple[float, float]] | None = None
+) -> StateSpaceModel:
+    """Extend a model to the states of a larger one; the states that `model` lacks keep their values.
+
+        own states:  x' = f(x, u) + w;   further states:  s' = s;   z = h(x) + v
+
+    Q, the prior's covariance and the Jacobians are zero between own and further states, so a Kalman filter
+    estimates the own states exactly as with `model` itself. Bounds and operating points are left out.
+
+    Args:
+        model: its states are among those of `larger`, by their symbols.
+        larger: defines all states, their order, and the prior of those that `model` lacks.
+        moments: mean and variance of such states by their index in `larger`, in place of that prior.
+
+    Raises:
+        ValueError: for a state that is not one of the larger model's.
+    """
+    positions = places_within(model.states, larger.states)
+    further, n = [i for i in range(larger.n) if i not in positions], larger.n
+    mean, prior_cov, q = larger.prior_mean.copy(), np.zeros((n, n)), np.zeros((n, n))
+    prior_cov[np.ix_(further, further)] = larger.prior_cov[np.ix_(further, further)]
+    for position, (value, variance) in (moments or {}).items():
+        if position in further:
+            mean[position], prior_cov[position], prior_cov[:, position] = value, 0.0, 0.0
+            prior_cov[position, position] = variance
+    block = np.ix_(positions, positions)
+    mean[list(positions)], prior_cov[block], q[block] = model.prior_mean, model.prior_cov, model.process_noise_cov
+    parts: dict[str, Any] = {
+        "process_noise_cov": q,
+        "measurement_noise_cov": model.measurement_noise_cov,
+        "prior_mean": mean,
+        "prior_cov": prior_cov,
+        "states": larger.states,
+        "input_quantities": model.input_quantities,
+        "measurements": model.measurements,
+    }
+    if isinstance(model, AffineModel):
+        return _embedded_matrices(model, positions, n, parts)
+    operating = None if model.operating_state is None else mean.copy()
+    if operating is not None:
+        operating[list(positions)] = model.operating_state
+    return StateSpaceModel(
+        **_embedded_functions(*model.functions, model.n, model.m, n, positions),
+        **parts,
+        inputs=model.inputs,
+        constants=model.constants,
+        substeps=model.substeps,
+        operating_state=operating,
+        operating_input=model.operating_input,
+    )
+
+
+def places_within(states: tuple[Quantity, ...], among: tuple[Quantity, ...]) -> tuple[int, ...]:
+    """Indices of states among others, by symbol; as many states with other symbols keep their order.
+
+    Raises:
+        ValueError: for states that are not among them, and if only one of a pair is an angle.
+    """
+    known, symbols = [state.symbol for state in among], [state.symbol for state in states]
+    if len(symbols) == len(known) and not set(symbols) & set(known):
+        positions = tuple(range(len(known)))
+    elif set(symbols) <= set(known):
+        positions = tuple(known.index(symbol) for symbol in symbols)
+    else:
+        rule = f"states of a mode must be some of the model's, {', '.join(known)}, or as many of other names"
+        raise ValueError(f"{rule}, but got {', '.join(symbols)}")
+    for state, position in zip(states, positions, strict=True):
+        if state.angle != among[position].angle:
+            kinds = "an angle" if among[position].angle else "no angle"
+            rule = f"{state.symbol} of a mode must be {kinds}, as in the model"
+            raise ValueError(f"{rule}, but got angle={state.angle}")
+    return positions
+
+
+def _embedded_matrices(
+    model: AffineModel, positions: tuple[int, ...], n: int, parts: Mapping[str, Any]
+) -> AffineModel:
+    """The embedded model of an affine model: affine itself, so its filters need no operating point."""
+    a, b, offset, c, shift = model.matrices()
+    whole_a, whole_b = np.eye(n), np.zeros((n, b.shape[1]))
+    whole_offset, whole_c = np.zeros(n), np.zeros((model.m, n))
+    at = list(positions)
+    whole_a[np.ix_(at, at)], whole_b[at], whole_offset[at], whole_c[:, at] = a, b, offset, c
+    return affine_model(
+        a=whole_a, b=whole_b, c=whole_c, state_offset=whole_offset, measurement_offset=shift, **parts
+    )
+
+
+@makes_functions
+def _embedded_functions(
+    transition,
+    transition_jacobian,
+    observe,
+    observe_jacobian,
+    count: int,
+    m: int,
+    n: int,
+    positions: tuple[int, ...],
+) -> dict[str, Callable | None]:
+    """Functions of the embedded model; its `count` own states have these positions among n."""
+    part_of_x = tuple_of(f"x[{position}]" for position in positions)
+    names: dict[str, Any] = {
+        "f": transition,
+        "h": observe,
+        "df": transition_jacobian,
+        "dh": observe_jacobian,
+        "np": np,
+    }
+    part = f"np.array({part_of_x})" if is_array(count) else part_of_x
+    after = [f"y[{positions.index(i)}]" if i in positions else f"x[{i}]" for i in range(n)]
+
+    def slope(i: int, j: int, rows: tuple[int, ...]) -> str:
+        if i in rows and j in positions:
+            return f"a[{rows.index(i)}][{positions.index(j)}]"
+        return "1.0" if i == j and rows is positions else "0.0"
+
+    def matrix(size: int, rows: tuple[int, ...], begun: str) -> tuple[str, ...]:
+        """Lines that return slopes, of size rows."""
+        if not is_array(size, n):
+            return (matrix_of(size, n, lambda i, j: slope(i, j, rows)),)
+        entries = (f"found[{i}, {j}] = a[{q}][{r}]" for q, i in enumerate(rows) for r, j in enumerate(positions))
+        return begun, *entries, "found"
+
+    functions: dict[str, Callable | None] = {
+        "transition": written_out("transition", "x, u, c", f"y = f({part}, u, c)", tuple_of(after), **names),
+        "observe": written_out("observe", "x, c", f"h({part}, c)", **names),
+        "transition_jacobian": None,
+        "observe_jacobian": None,
+    }
+    if transition_jacobian is not None:
+        lines = f"a = df({part}, u, c)", *matrix(n, positions, f"found = np.eye({n})")
+        functions["transition_jacobian"] = written_out("transition_jacobian", "x, u, c", *lines, **names)
+    if observe_jacobian is not None:
+        lines = f"a = dh({part}, c)", *matrix(m, tuple(range(m)), f"found = np.zeros(({m}, {n}))")
+        functions["observe_jacobian"] = written_out("observe_jacobian", "x, c", *lines, **names)
+    return functions
+
+
+def transformed_model(model: StateSpaceModel, bounds: Mapping[str | int, tuple] | None = None) -> StateSpaceModel:
+    """Make a model whose states with bounds are logarithms or logits s = T(x), so that every estimate keeps them.
+
+        s' = T(f(X(s), u)) + w,   z = h(X(s)) + v,   X the inverse of T
+        T = log(x - low) above a bound,  -log(high - x) below one,  log((x - low)/(high - x)) between two
+
+    Noise of s is relative noise of x: 0.02 is 2 % of the distance from the bound. Q and the prior's covariance
+    become G Q G and G P G, G = dT/dx at the prior mean, whose image is the new one: the median of the state. Give
+    others by `replace`. The states themselves are outputs of the new model, by their own symbols.
+
+    Args:
+        model: n states; operating points are left out, and Jacobians are found anew.
+        bounds: (low, high) of states by symbol or index, as `StateSpaceModel` has them; the model's own if None.
+
+    Raises:
+        ValueError: for wrong bounds or none, and a prior mean that is not within.
+
+    Source: Limpert, Stahel, Abbt (2001), "Log-normal distributions across the sciences".
+    """
+    all_bounds = model.bounds if bounds is None else checked_bounds(bounds, model.states)
+    if not all_bounds:
+        raise ValueError("a model is transformed by bounds of its states, but it has none: pass bounds=...")
+    x, n = model.prior_mean, model.n
+    slopes, states = np.ones(n), list(model.states)
+    for i, low, high in all_bounds:
+        if not low < x[i] < high:
+            raise ValueError(f"prior_mean of {states[i].symbol} must be within its bounds, but got {x[i]}")
+        slopes[i] = (low > -np.inf) / (x[i] - low) + (high < np.inf) / (high - x[i])
+        kind, word = ("logit", "logit") if np.isfinite([low, high]).all() else ("log", "logarithm")
+        state = states[i]
+        states[i] = Quantity(f"{word} of {state.name}", f"{kind}_{state.symbol}")
+    functions = dict(_functions(model.functions.transition, model.functions.observe, n, all_bounds))
+    to_new, to_old = functions.pop("to_new"), functions.pop("to_old")
+    outputs = {
+        symbol: Output(output.quantity, _OfStates(to_old, output.function))
+        for symbol, output in model.outputs.items()
+    }
+    for i, *_ in all_bounds:
+        outputs[model.states[i].symbol] = Output(model.states[i], _OfStates(to_old, i))
+    remaining = [bound for bound in model.bounds if bound.place not in {other.place for other in all_bounds}]
+    helpful: dict[str, Any] = {}
+    for name in ("operating_state", "state_low", "state_high"):
+        value = getattr(model, name)
+        with np.errstate(all="ignore"):
+            image = None if value is None else np.array(to_new(as_value(value)))
+        helpful[name] = image if image is not None and np.isfinite(image).all() else None
+    return StateSpaceModel(
+        **functions,
+        process_noise_cov=slopes[:, None] * model.process_noise_cov * slopes,
+        measurement_noise_cov=model.measurement_noise_cov,
+        prior_mean=to_new(as_value(x)),
+        prior_cov=slopes[:, None] * model.prior_cov * slopes,
+        inputs=model.inputs,
+        constants=model.constants,
+        analytic=model.analytic,
+        substeps=model.substeps,
+        operating_input=None if helpful["operating_state"] is None else model.operating_input,
+        bounds=remaining,
+        bounded_by=model.bounded_by,
+        states=states,
+        input_quantities=model.input_quantities,
+        measurements=model.measurements,
+        outputs=outputs,
+        **helpful,
+    )
+
+
+@dataclass(frozen=True)
+class _OfStates:
+    """An output as a function of the new states: that of the old ones, or the one at a place."""
+
+    to_old: Callable
+    which: Callable | int
+
+    def __call__(self, x, c):
+        old = self.to_old(x)
+        return old[self.which] if isinstance(self.which, int) else self.which(old, c)
+
+    def __getstate__(self) -> dict:
+        """A recipe in place of the function that was written out."""
+        return {name: as_made(value) for name, value in vars(self).items()}
+
+    def __setstate__(self, state: dict) -> None:
+        vars(self).update({name: as_function(value) for name, value in state.items()})
+
+
+@makes_functions
+def _functions(transition: Callable, observe: Callable, n: int, bounds: tuple[Bound, ...]) -> dict[str, Callable]:
+    bound_of = {bound.place: bound for bound in bounds}
+
+    def entry(logit: str, above: str, below: str) -> Callable:
+        def component(i: int) -> str:
+            if i not in bound_of:
+                return f"x[{i}]"
+            _, low, high = bound_of[i]
+            text = above if high == np.inf else below if low == -np.inf else logit
+            return text.format(x=f"x[{i}]", low=repr(low), high=repr(high), width=repr(high - low))
+
+        return component
+
+    of_bounded = entry("log(({x} - {low}) / ({high} - {x}))", "log({x} - {low})", "-log({high} - {x})")
+    of_free = entry("{low} + {width} / (1.0 + exp(-{x}))", "{low} + exp({x})", "{high} - exp(-{x})")
+    form = "array({})" if is_array(n) else "{}"
+    new, old = (form.format(tuple_of(map(of, range(n)))) for of in (of_bounded, of_free))
+    to_new = written_out("to_new", "x", new, log=np.log, array=np.array)
+    to_old = written_out("to_old", "x", old, exp=np.exp, array=np.array)
+    names: dict[str, Any] = {"f": transition, "h": observe, "new": to_new, "old": to_old}
+    return {
+        "to_new": to_new,
+        "to_old": to_old,
+        "transition": written_out("transition", "x, u, c", "new(f(old(x), u, c))", **names),
+        "observe": written_out("observe", "x, c", "h(old(x), c)", **names),
+    }

@@ -1,14 +1,36 @@
-"""Attainable accuracy: Riccati covariances, steady-state and along a path; `filters.posterior` has the bound."""
+"""Attainable accuracy: Riccati covariances, steady-state and along a path; `filters.bounds` has the bound.
+
+Bounds on the errors of angles: a wrapped error is at most half a turn, so a bound on plain errors is none.
+The posterior Cramer-Rao bound on any estimate, from simulated true trajectories under each input.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache, partial
 
 import numpy as np
 
 from filters.engine.batch import run
 from filters.gaussian.extended import ExtendedKalmanFilter
-from thruster_env.core.checks import as_floats, correlations
+from thruster_env.core.checks import as_floats, at_least, correlations, covariance_root, with_progress
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.derivatives import step_growth, step_of
+from thruster_env.core.matrices import multiplier, quadratic_form
+from thruster_env.core.sources import Source, matrix_reader, vector_reader, vector_writer
+from thruster_env.core.streams import GROUP
+from thruster_env.core.threads import cores, spread
 from thruster_env.model.affine import AffineModel
-from thruster_env.model.simulate import simulate
+from thruster_env.model.shape import (
+    Functions,
+    Shape,
+    constants_reader,
+    number_places,
+    observation_slopes,
+    padded,
+    transition_slopes,
+)
+from thruster_env.model.simulate import noise_step, simulate, truth_steps
 from thruster_env.model.state_space import StateSpaceModel
 
 STIFF = 1e8  # S over R, from which an update of covariances loses half of their digits: roots keep them
@@ -82,3 +104,307 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
         return estimates.covs
     estimates = run(ExtendedKalmanFilter(model=model, form="square-root"), keys, inputs, measured)
     return np.where((estimates.divergences > 0)[:, None, None, None], np.nan, estimates.covs)
+
+
+SMALL = 0.1  # variance [rad^2] up to which half a turn is so far away that nothing changes in float64
+TERMS, POINTS = 24, 400  # of the Fourier series; of the curve
+LEAST, MOST = 5e-3, 1e4  # multipliers mu [rad^4] of the curve's ends but for the last, mu = infinity
+
+
+def wrapped_variances(variances: np.ndarray, angles: Sequence[bool]) -> np.ndarray:
+    """Bounds (..., n) on mean squares of wrapped errors, from posterior Cramér-Rao bounds P on plain ones.
+
+    A density f of an error e on the circle, whose information is at most J = 1/P, has at least the mean square
+
+        v(J) = min E[e^2]  over periodic f on (-pi, pi] with E[(d log f/de)^2] <= J
+
+    A posterior density has no more information after it is wrapped, or after other states are integrated out, and
+    v is convex, so the mean of v over measurements is at least v of the mean information: v(1/P) is a bound. With
+    f = psi^2 it is the ground state of -4 mu psi'' + e^2 psi = lambda psi, v = lambda - mu J. Far from the cut psi
+    is a Gaussian and v = P; so it is up to P = 0.1 rad^2 (18 degrees). For large P it tends to pi^2/3, the mean
+    square of a completely unknown angle.
+
+    Args:
+        variances: P of n states [rad^2 where they are angles].
+        angles: (n,), which states are angles.
+
+    Source: Van Trees (1968), Detection, Estimation, and Modulation Theory I, section 2.4, for P.
+    """
+    if not any(angles):
+        return variances
+    bounded = np.array(variances)
+    for i in np.flatnonzero(angles):
+        large = bounded[..., i] > SMALL
+        bounded[large, i] = _curve()(bounded[large, i] ** -0.5)
+    return bounded
+
+
+@cache
+def _curve() -> Callable:
+    """V as a function of sqrt(J): cubic between points, where dv/dJ = -mu is known."""
+    from scipy.interpolate import CubicHermiteSpline
+
+    multipliers = np.geomspace(MOST, LEAST, POINTS)
+    points = np.array([_ground_state(mu) for mu in multipliers])
+    roots = np.sqrt(points[:, 0])
+    # For little information v = pi^2/3 - 2 sqrt(2 J), by perturbation of the uniform density.
+    ends = np.append(0.0, roots), np.append(np.pi**2 / 3.0, points[:, 1])
+    return CubicHermiteSpline(*ends, np.append(-2.0 * np.sqrt(2.0), -2.0 * multipliers * roots))
+
+
+def _ground_state(mu: float) -> tuple[float, float]:
+    """J and v of a multiplier mu, from psi as a sum of cos(k e), k = 0, 1, ..."""
+    k = np.arange(TERMS)
+    square = _means(np.add.outer(k, k)) + _means(np.subtract.outer(k, k))
+    unit = np.where(k == 0, np.sqrt(0.5), 1.0)  # the constant has twice the mean square of a cosine
+    square *= np.outer(unit, unit)
+    psi = np.linalg.eigh(square + np.diag(4.0 * mu * k**2))[1][:, 0]
+    return float(4.0 * k**2 @ psi**2), float(psi @ square @ psi)
+
+
+def _means(order: np.ndarray) -> np.ndarray:
+    return np.where(order == 0, np.pi**2 / 3.0, 2.0 * np.where(order % 2, -1.0, 1.0) / np.maximum(order**2, 1))
+
+
+ALL_UP_TO = 12  # states, for which the matrices of every sequence cost nothing that counts
+MOST_WORK = 2e10  # truths x steps x n^3, of all sequences of a larger model together
+MOST_STEPS = 3e7  # truths x steps x substeps, of all sequences of any model together
+WORK_AT_ONCE = 2e9  # of the same, some seconds: Ctrl-C is heard in between
+SINGULAR = 1e-13  # least eigenvalue of Q with unit variances, within rounding: Q has no inverse
+ROUNDING = 8 * 2.0**-52  # of slopes by central differences, relative to (|x_i| + s_i)/h_j
+MOST_BYTES, MATRICES = 2**28, 8  # of so many matrices (n, n) a sequence and step at once
+
+
+def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int = 100, seed: int = 0) -> np.ndarray:
+    """Posterior Cramer-Rao bound on the covariance of any estimate, conditional on each input sequence.
+
+    With F = df/dx and H = dh/dx at states simulated under this input sequence ("truths"), and P = J^-1,
+
+        J_0 = P_0^-1 + E[H' R^-1 H],  D11 = E[F' Q^-1 F],  D12 = -E[F'] Q^-1,
+        J_{k+1} = Q^-1 + E[H' R^-1 H] - D12' (J_k + D11)^-1 D12
+
+    written with P in place of J, so that P_0 may be singular, and with C = E[(F - E[F])' Q^-1 (F - E[F])]:
+
+        P_{k+1} = (G_k^-1 + E[H' R^-1 H])^-1,  G_k = Q + E[F] (P_k^-1 + C)^-1 E[F]'
+
+    which loses no digits where Q is small beside F P F'. Expectations are over truths of one sequence: with
+    Jacobians pooled over different inputs, the result would not be a bound. It bounds squares of plain errors: of
+    a state that is an angle, `filters.bounds.wrapped_variances` of it bounds those of wrapped ones.
+
+    Args:
+        model: the model that draws the truth; Q must be positive definite.
+        inputs: (B, K, p), one sequence a row.
+        truths: truths drawn for each sequence.
+        seed: of the truths.
+
+    Returns:
+        Bound P_k for every sequence and step, (B, K + 1, n, n); index 0 is after the first measurement. It is
+        not finite from the step on at which numbers are too large for float64.
+
+    Raises:
+        ValueError: if Q is singular: then the recursion's Q^-1 does not exist.
+
+    Source: Tichavsky, Muravchik, Nehorai (1998), "Posterior Cramer-Rao bounds for discrete-time nonlinear
+    filtering", IEEE Trans. Signal Processing 46(5), eqs. 21 and 34-36.
+    """
+    inputs = np.ascontiguousarray(as_floats(inputs))
+    return _posterior_bound(model, inputs, _truth_keys(len(inputs), truths, seed))
+
+
+def posterior_variances(
+    model: StateSpaceModel, inputs: np.ndarray, *, truths: int = 100, seed: int = 0
+) -> np.ndarray:
+    """Diagonals of `posterior_bound` without its matrices; fewer sequences for large or long models.
+
+    Those of angles are bounds on the squares of wrapped errors (`filters.bounds.wrapped_variances`).
+
+    As many sequences are taken, spread evenly over those given, as 3e7 substeps of truths allow, and of a model
+    with more than twelve states no more than 2e10 of truths x steps x n^3 allow: at least one, and one alone where
+    all are the same, for its bound is that of all. The number of truths is never reduced.
+
+    Args:
+        model: the model that draws the truth; Q must be positive definite.
+        inputs: (B, K, p), one sequence a row.
+        truths: truths drawn for each sequence.
+        seed: of the truths.
+
+    Returns:
+        Variances for every sequence that is taken and every step, (B or fewer, K + 1, n).
+
+    Raises:
+        ValueError: if Q is singular.
+    """
+    inputs, keys = as_floats(inputs), _truth_keys(len(inputs), truths, seed)
+    rows = sequences_taken(inputs, truths, model)
+    inputs, keys = np.ascontiguousarray(inputs[rows], dtype=np.float64), np.ascontiguousarray(keys[rows])
+    count, steps = inputs.shape[:2]
+    most = max(MOST_BYTES // (8 * MATRICES * (steps + 1) * model.n**2), cores())
+    variances = np.empty((count, steps + 1, model.n))
+    parts = [slice(first, min(first + most, count)) for first in range(0, count, most)]
+    for part in with_progress("posterior bound", parts, [len(inputs[part]) for part in parts]):
+        variances[part] = np.einsum("bkii->bki", _posterior_bound(model, inputs[part], keys[part]))
+    return wrapped_variances(variances, model.shape.state_angles)
+
+
+def gathering_code(model: StateSpaceModel) -> tuple[CompiledOrPython, str]:
+    """What sums up Jacobians for the bound of a model, and a hash of all code that determines the bound."""
+    functions = model.functions
+    fingerprint = function_fingerprint(*functions, within=__name__)
+    return _gatherer(functions, model.shape, is_interpreting()), fingerprint
+
+
+def sequences_taken(inputs: np.ndarray, truths: int, model: StateSpaceModel) -> np.ndarray:
+    """Indices of the sequences that `posterior_variances` of a model uses."""
+    count, steps, _ = inputs.shape
+    large = model.n > ALL_UP_TO
+    if large and count and (inputs == inputs[:1]).all():
+        return np.arange(1)
+    most = MOST_STEPS / (truths * steps * model.substeps)
+    if large:
+        most = min(most, MOST_WORK / (truths * steps * model.n**3))
+    most = min(max(int(most), 1), count)
+    return np.arange(most) * count // most if count else np.arange(0)
+
+
+def _truth_keys(count: int, truths: int, seed: int) -> np.ndarray:
+    size = count, at_least("truths", truths, 2), 2
+    return np.random.default_rng(seed).integers(0, 2**32, size=size).astype(np.float64)
+
+
+def _posterior_bound(model: StateSpaceModel, inputs: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    """The bound of `posterior_bound` from the truths of these keys, by square roots S S' = P."""
+    if not has_bound(model.process_noise_cov):
+        raise ValueError(f"the bound needs a positive definite Q, but got {model.process_noise_cov.tolist()}")
+    (count, steps, _), n = inputs.shape, model.n
+    f_mean, spread_of_f, information = (np.zeros((count, steps + 1, n, n)) for _ in range(3))
+    q_inverse, r_inverse = _inverse(model.process_noise_cov), _inverse(model.measurement_noise_cov)
+    fixed = inputs, model.numbers, q_inverse.ravel(), r_inverse.ravel(), f_mean, spread_of_f, information
+    add, done = _gatherer(model.functions, model.shape, is_interpreting()), 0
+    # Some truths at a time, in the same order: Ctrl-C is heard in between.
+    size = max(int(WORK_AT_ONCE / (max(count, 1) * (steps + 1) * n**3)), 1)
+    parts = [np.ascontiguousarray(keys[:, first : first + size]) for first in range(0, keys.shape[1], size)]
+    for batch in with_progress("truths", parts, [part.shape[1] for part in parts]):
+        spread(partial(add, batch, done, *fixed), count)
+        done += batch.shape[1]
+    spread_of_f /= done
+    information /= done
+
+    bound = np.empty((count, steps + 1, n, n))
+    prior, noise = (covariance_root(cov) for cov in (model.prior_cov, model.process_noise_cov))
+    noises = np.broadcast_to(noise.T, (count, n, n))
+    root = _informed(np.broadcast_to(prior, (count, n, n)), information[:, 0])
+    bound[:, 0] = _square(root)
+    for k in range(steps):
+        propagated = f_mean[:, k] @ _informed(root, spread_of_f[:, k])
+        rows = np.concatenate([np.swapaxes(propagated, -1, -2), noises], axis=-2)
+        root = _informed(np.swapaxes(np.linalg.qr(rows, mode="r"), -1, -2), information[:, k + 1])
+        bound[:, k + 1] = _square(root)
+    return bound
+
+
+def has_bound(process_noise_cov: np.ndarray) -> bool:
+    """Whether a Q has a posterior bound: the recursion needs its inverse, which rounding must not make up."""
+    if not np.diag(process_noise_cov).all():
+        return False
+    return bool(np.linalg.eigvalsh(correlations(process_noise_cov)[0])[0] > SINGULAR)
+
+
+def _inverse(cov: np.ndarray) -> np.ndarray:
+    """The inverse of a covariance of any magnitude, which enters the recursion as a weight."""
+    scaled, deviations = correlations(cov)
+    return np.linalg.inv(scaled) / deviations / deviations[:, None]
+
+
+@np.errstate(all="ignore")  # numbers too large for float64 are NaN in the end
+def _informed(root: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """A root of (P^-1 + information)^-1, P = root root' of any rank: root (I + root' information root)^-1/2."""
+    gained = np.swapaxes(root, -1, -2) @ information @ root
+    lost = ~np.isfinite(gained).all(axis=(-1, -2), keepdims=True)
+    gained = np.where(lost, 0.0, (gained + np.swapaxes(gained, -1, -2)) / 2)
+    lower = np.linalg.cholesky(np.eye(root.shape[-1]) + gained)
+    return np.where(lost, np.nan, np.swapaxes(np.linalg.solve(lower, np.swapaxes(root, -1, -2)), -1, -2))
+
+
+@np.errstate(all="ignore")
+def _square(root: np.ndarray) -> np.ndarray:
+    return root @ np.swapaxes(root, -1, -2)
+
+
+@lru_cache(maxsize=64)
+def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
+    n, m, transition = shape.n, shape.m, functions.transition
+    transition_matrix = transition_slopes(functions, shape)
+    observation_matrix = observation_slopes(functions, shape)
+    (begin, _, _), disturb = truth_steps(functions, shape), noise_step(n, m)
+    state, store_state = vector_reader(n), vector_writer(n)
+    control, constants = vector_reader(shape.inputs), constants_reader(shape)
+    scales = vector_reader(n, number_places(n, m).scales)
+    substeps, room = number_places(n, m).substeps, padded(max(n, m), GROUP)
+    times, identity = multiplier(n, n, n), matrix_reader(n, n)
+    read_weight_n, read_weight_m = matrix_reader(n, n), matrix_reader(m, m)
+    quadratic_n, quadratic_m = quadratic_form(n, n), quadratic_form(m, n)
+    accumulate = _into("out[b, k, {i}, {j}] += weight * a[{i}][{j}]", n)
+    move_mean = _into("out[b, k, {i}, {j}] += weight * (a[{i}][{j}] - out[b, k, {i}, {j}])", n)
+    less_mean = _from_mean(n, functions.transition_jacobian is None)
+    fingerprint = function_fingerprint(transition, transition_matrix, observation_matrix, within=__name__)
+
+    @inlined
+    def whole_step(x, u, numbers, c, eye):
+        f = identity(eye)
+        for _ in range(int(numbers[substeps])):
+            f = times(transition_matrix(x, scales(numbers), u, c), f)
+            x = transition(x, u, c)
+        return f, x
+
+    def gather(keys, before, inputs, numbers, q_inverse, r_inverse, f_mean, spread_of_f, information, first, last):
+        fingerprint  # noqa: B018 - part of the cache's key
+        x, u, draws, eye = np.zeros(n), np.zeros(inputs.shape[2]), np.zeros(room), np.eye(n).ravel()
+        c, s = constants(numbers), scales(numbers)
+        weight_q, weight_r = read_weight_n(q_inverse), read_weight_m(r_inverse)
+        for b in range(first, last):
+            for truth in range(keys.shape[1]):
+                key_0, key_1 = keys[b, truth, 0], keys[b, truth, 1]
+                share = 1.0 / (before + truth + 1.0)  # of this truth in the mean, as Welford (1962) has it
+                begin(x, draws, key_0, key_1, numbers)
+                for k in range(f_mean.shape[1]):
+                    measured = quadratic_m(observation_matrix(state(x), s, c), weight_r)
+                    accumulate(information, b, k, measured, 1.0)
+                    if k == inputs.shape[1]:
+                        break
+                    for i in range(u.shape[0]):
+                        u[i] = inputs[b, k, i]
+                    f, predicted = whole_step(state(x), control(u), numbers, c, eye)
+                    apart = quadratic_n(less_mean(f, f_mean, b, k, state(x), s), weight_q)
+                    accumulate(spread_of_f, b, k, apart, 1.0 - share)
+                    move_mean(f_mean, b, k, f, share)
+                    store_state(x, predicted)
+                    disturb(x, draws, k + 1, key_0, key_1, numbers)
+
+    return CompiledOrPython(gather)
+
+
+def _into(line: str, n: int):
+    """Return `add(out, b, k, a, weight)`, the line for each entry i, j of a matrix a (n, n)."""
+    source = Source("add", "out, b, k, a, weight", a=(n, n))
+    for i in source.range(n):
+        for j in source.range(n):
+            source.line(line.format(i=i, j=j))
+    return source.function()
+
+
+def _from_mean(n: int, by_differences: bool):
+    """Return `less_mean(f, means, b, k, x, s)`: F - E[F]; 0 where that is rounding of differences.
+
+    A tiny Q would take that for information.
+    """
+
+    def entry(i, j):
+        apart = f"f[{i}][{j}] - means[b, k, {i}, {j}]"
+        if not by_differences:
+            return apart
+        noise = f"{ROUNDING} * (abs(x[{i}]) + s[{i}]) / step_of(x[{j}], s[{j}], far)"
+        return f"({apart} if abs({apart}) > {noise} else 0.0)"
+
+    source = Source("less_mean", "f, means, b, k, x, s", result=(n, n), f=(n, n), x=(n,), s=(n,))
+    source.line("far = step_growth(x, s)")
+    return source.function(source.entries((n, n), entry), step_of=step_of, step_growth=step_growth(n))

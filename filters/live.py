@@ -13,7 +13,7 @@ from filters.engine.session import Session
 from filters.monitoring.monitor import Alarm, Health, Monitor, monitor_of, watch_of
 from filters.starts import FirstRestart, Restarts
 from thruster_env.core.checks import as_floats, finite, one_of, positive, short_repr
-from thruster_env.core.stamps import closeness, count_steps, resolution_of
+from thruster_env.logs.grid import closeness, count_steps, resolution_of
 
 if TYPE_CHECKING:
     from filters.filter import Filter

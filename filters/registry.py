@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 from filters.adaptive import RobustExtendedKalmanFilter, SageHusaFilter, VariationalBayesFilter
 from filters.baselines import Inversion, LowPass, OpenLoop
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
-from filters.ensembles.rank_histogram import RankHistogramFilter
 from filters.ensembles.square_root import (
     EnsembleTransformFilter,
     FiniteSizeEnsembleFilter,
     LocalEnsembleTransformFilter,
+    RankHistogramFilter,
     SerialSquareRootFilter,
 )
 from filters.ensembles.stochastic import DeterministicEnsembleKalmanFilter, EnsembleKalmanFilter

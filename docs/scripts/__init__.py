@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from thruster_env.core.files import write_whole
-from thruster_env.core.plots import new_figure, tidy
+from thruster_env.core.files import new_figure, tidy, write_whole
 from thruster_env.core.text_tables import with_tables
 
 DOCS = Path(__file__).parents[1]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from docs.scripts import digits, subplots
-from thruster_env.core.plots import BLUE, DARK, RUST, save_figure
+from thruster_env.core.files import BLUE, DARK, RUST, save_figure
 from thruster_env.core.text_tables import markdown_table
 from tuning.exploring.bench import SCENES, Bench, Scene
 from tuning.exploring.view import View

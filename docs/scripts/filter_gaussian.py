@@ -20,14 +20,14 @@ from filters import (
     smooth,
     thruster_model,
 )
+from filters.bounds import posterior_bound
 from filters.consistency.intervals import rmse_ratios
 from filters.consistency.nees import normalized_squares
 from filters.filter import Filter
 from filters.gaussian.mixtures import BLENDINGS
-from filters.logs.figure import TRUTH, plot_style
-from filters.posterior import posterior_bound
+from filters.logs.findings import TRUTH, plot_style
 from filters.registry import FILTERS
-from thruster_env.core.plots import BLUE, DARK, MUSTARD, RUST, SKY, save_figure
+from thruster_env.core.files import BLUE, DARK, MUSTARD, RUST, SKY, save_figure
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.thruster.linear.analysis import steady_state

@@ -11,9 +11,9 @@ from docs.scripts import legend_below, log_ticks, subplots
 from docs.scripts.filter_gaussian import PUBLISHED_NOISE, STYLES, Runs, errors_of, held_runs, runs_of, times
 from docs.scripts.ranking import POSITIVE, SETTLED, assumed, batches
 from filters import InteractingMultipleModelFilter, ParticleFilter, affine_model, make_filter, run, thruster_model
-from filters.ensembles.rank_histogram import record_members
+from filters.ensembles.square_root import record_members
 from filters.filter import Filter
-from thruster_env.core.plots import BLUE, DARK, PALE, RUST, save_figure
+from thruster_env.core.files import BLUE, DARK, PALE, RUST, save_figure
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.plant import make_plant
 from tuning.experiments import mixed_linear

@@ -43,7 +43,7 @@ from filters import (
 from filters.filter import Filter
 from filters.registry import filter_type
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.plots import BLUE, DARK, MUSTARD, RUST, save_figure
+from thruster_env.core.files import BLUE, DARK, MUSTARD, RUST, save_figure
 from thruster_env.core.text_tables import markdown_table
 
 QUIET, LOUD = 0.5, 2.0  # standard deviations [N] of a sensor whose noise changes

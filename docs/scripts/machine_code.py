@@ -11,9 +11,8 @@ from docs.scripts import by_name
 from filters import StateSpaceModel
 from filters.gaussian import extended
 from filters.pages import kernels
-from filters.pages.equations import Equations
 from filters.pages.kernels import as_programs
-from filters.pages.page import RowMemory
+from filters.pages.page import Equations, RowMemory
 from filters.pages.traced import MOST
 from thruster_env.graphs.programs import Program
 

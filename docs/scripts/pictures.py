@@ -17,8 +17,7 @@ import thruster_env  # noqa: F401 - registers the envs
 from docs.scripts import subplots
 from filters import EstimateState
 from filters.engine.batch import run
-from thruster_env.core.files import write_whole
-from thruster_env.core.plots import BLUE, DARK, RUST, save_figure
+from thruster_env.core.files import BLUE, DARK, RUST, save_figure, write_whole
 from tuning.api.run import Tuning
 from tuning.cli.demo import FILTER, SCENARIO, before_and_after
 from tuning.cli.tune import tune

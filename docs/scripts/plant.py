@@ -10,8 +10,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from docs.scripts import by_name, digits, label_grid, legend_below, subplots
-from thruster_env.core.files import write_whole
-from thruster_env.core.plots import BLUE, DARK, RUST, SKY, save_figure
+from thruster_env.core.files import BLUE, DARK, RUST, SKY, save_figure, write_whole
 from thruster_env.core.streams import episode_keys
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.env.commands import ObserveStateVector

@@ -16,9 +16,9 @@ from filters.consistency.intervals import Interval, rmse_intervals
 from filters.consistency.nees import whitened
 from filters.filter import Filter
 from filters.horizon.window import LOSSES, STUDENT
-from filters.logs.figure import colour_of
+from filters.logs.findings import colour_of
 from filters.registry import FILTERS, filter_type
-from thruster_env.core.plots import DARK, GREY, new_figure, save_figure
+from thruster_env.core.files import DARK, GREY, new_figure, save_figure
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.model.simulate import simulate
@@ -29,7 +29,7 @@ from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Problem
-from tuning.reporting.error_tables import unless_blank
+from tuning.reporting.leaderboard import unless_blank
 from tuning.search.parameters import KALMAN_SIZES, ensemble_sizes_of
 from tuning.thruster.scenario import SCENARIOS, find_scenario
 

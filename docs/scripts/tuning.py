@@ -18,7 +18,7 @@ from filters.consistency.intervals import Interval
 from filters.filter import Filter
 from filters.registry import make_filter
 from thruster_env.core.compiled import inlined
-from thruster_env.core.plots import BLUE, DARK, RUST, save_figure
+from thruster_env.core.files import BLUE, DARK, RUST, save_figure
 from thruster_env.core.sources import written_out
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.model.affine import affine_model
@@ -26,7 +26,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.dynamics import Constants
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, scaled_default
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
-from tuning.evaluation.held_out import evaluate_held_out
+from tuning.evaluation.summary import evaluate_held_out
 from tuning.experiments.benchmark import run_in_memory
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
 from tuning.likelihood.identifiability import Identifiability, identify

@@ -21,7 +21,7 @@ from optuna.trial import TrialState
 
 import tuning.search.study
 from docs.scripts import log_ticks, subplots
-from thruster_env.core.plots import BLUE, RUST, save_figure
+from thruster_env.core.files import BLUE, RUST, save_figure
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.core.threads import cores
 from tuning.problems.data import Data

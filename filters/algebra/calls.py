@@ -20,14 +20,15 @@ from typing import Any
 
 import numpy as np
 
-from filters.algebra import blocks as blocks_called
-from filters.algebra import geometric, matrices, operations
+from filters.algebra import matrices, operations
 from filters.algebra import members as members_called
+from filters.algebra import operations as geometric
+from filters.algebra import points as densities
 from filters.algebra import points as points_called
-from filters.algebra import samples as densities
-from filters.algebra import upper as upper_called
-from filters.algebra.blocks import by_entries
+from filters.algebra import roots as blocks_called
+from filters.algebra import roots as upper_called
 from filters.algebra.matrices import Matrix, Operation, in_order
+from filters.algebra.roots import by_entries
 from thruster_env.core import matrices as matrix_functions
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.sources import Source, entrywise, is_array, matrix_of, tuple_of, written_out

@@ -16,10 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from filters.algebra import matrices, samples, scalars
+from filters.algebra import matrices
+from filters.algebra import operations as scalars
+from filters.algebra import points as samples
 from filters.algebra.matrices import Matrix, Operation, operation, same
+from filters.algebra.operations import choose, constant, exceeds
 from filters.algebra.points import outer
-from filters.algebra.scalars import choose, constant, exceeds
 from thruster_env.core import matrices as arrays
 from thruster_env.core.angles import row_aligner, whole_turns
 from thruster_env.core.compiled import not_inlined

@@ -5,17 +5,48 @@ Each is a function of arrays, an operation on Matrices, and a derivative along a
     d (C S^-1) = (dC - K dS) S^-1,  K = C S^-1
 
 Source: Magnus, Neudecker (2019), Matrix Differential Calculus with Applications in Statistics and Econometrics.
+
+The geometric mean of two covariances.
+
+Operations on numbers: conditions and choices, traces, the count of measured channels; and slopes of graphs.
+
+A choice computes both sides. So a page that divides guards its divisor, not its quotient.
+
+Slopes are Matrices of the same graph as values. So operations that they share, such as a gain, a quotient S^-1 v
+or the product P H', are evaluated once. A slope of None is zero.
 """
 
 from __future__ import annotations
 
 import math
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 
 import numpy as np
 
-from filters.algebra.matrices import Matrix, minus, multiply, operation, plus, same, through
+from filters.algebra.matrices import (
+    Matrix,
+    Operation,
+    entries_product,
+    in_order,
+    magnitude,
+    minus,
+    multiply,
+    operation,
+    plus,
+    power,
+    reciprocal,
+    same,
+    shifted,
+    through,
+)
+from thruster_env.core import matrices
 from thruster_env.core.angles import wrapped
-from thruster_env.graphs.graphs import where
+from thruster_env.core.compiled import inlined
+from thruster_env.core.sources import Source, entrywise, is_array, matrix_reader, matrix_writer
+from thruster_env.graphs.graphs import Graph, called, where
+from thruster_env.graphs.programs import CALLED, CALLED_IN_ROUNDS, Place, Program, program_of
 
 
 def sym(a):
@@ -234,3 +265,269 @@ def _of_best_gain(result, arguments, slopes):
     (_, _, _, _, k), (_, dp, dc, ds, _) = arguments, slopes
     half = minus(dc, through(lambda slope: (k @ slope) * 0.5, ds))
     return minus(dp, through(lambda slope: with_transposed(slope @ k.T), half))
+
+
+def _by_entries(function, *arrays):
+    """A function of numbers, applied to the entries of arrays."""
+    with np.errstate(invalid="ignore"):
+        result = np.frompyfunc(function, len(arrays), 1)(*arrays)
+    return np.array(result.tolist()) if np.ndim(result) else result
+
+
+@operation(same)
+def exceeds(a, value):
+    """Whether a number, or each entry, is larger than the float `value`."""
+    return _by_entries(operator.gt, a, value)
+
+
+@operation(lambda a: ())
+def is_number(a):
+    """Whether a number is not NaN."""
+    return a == a
+
+
+@operation(lambda *shapes: shapes[1], lambda condition, a, b: a.symmetric and b.symmetric)
+def choose(condition, a, b):
+    """`a` if the condition holds, else `b`: numbers or matrices; the condition may differ between entries."""
+    return _by_entries(where, condition, a, b)
+
+
+@operation(lambda shape: ())
+def trace(a):
+    """The sum of the diagonal."""
+    return sum(a[i, i] for i in range(len(a)))
+
+
+@operation(lambda shape: ())
+def count(measured):
+    """The number of measured channels."""
+    return sum(where(channel, 1.0, 0.0) for channel in measured)
+
+
+@operation(same)
+def exponential(v):
+    """e^v of a number, or of each entry of a vector."""
+    return np.exp(v)
+
+
+@operation(lambda a: ())
+def logarithm(a):
+    """The natural logarithm of a number."""
+    return np.log(a)
+
+
+@operation(same)
+def at_most(v, value):
+    """The smaller of each entry of a vector and the float `value`."""
+    return np.array([where(entry > value, value, entry) for entry in v])
+
+
+@operation(same)
+def at_least(a, value):
+    """The larger of a number, or of each entry, and the float `value`; `value` for NaN."""
+    return _by_entries(lambda entry: where(entry > value, entry, value), a)
+
+
+@operation(lambda v, value: v)
+def below(v, value):
+    """1 for entries of a vector that are not larger than the float `value`, else 0."""
+    return np.array([where(entry > value, 0.0, 1.0) for entry in v])
+
+
+@operation(lambda v: (v[0], v[0]), lambda v: True)
+def diagonal(v):
+    """The diagonal matrix with the entries of a vector."""
+    return np.diag(np.ravel(v))
+
+
+def constant(value: float, like):
+    """A number, or a vector of equal numbers, with the shape and the kind of `like`."""
+    return shifted(like * 0.0, float(value)) if isinstance(like, Matrix) else np.full(np.shape(like), value)[()]
+
+
+reciprocal.derivative(
+    lambda result, arguments, slopes: through(lambda slope: slope * result * result * -1.0, slopes[0])
+)
+
+
+@power.derivative
+def _of_power(result, arguments, slopes):
+    a, exponent = arguments
+    return through(lambda slope: slope * power(a, exponent - 1.0) * exponent, slopes[0])
+
+
+logarithm.derivative(lambda result, arguments, slopes: through(lambda slope: slope / arguments[0], slopes[0]))
+
+
+@exponential.derivative
+def _of_exponential(result, arguments, slopes):
+    return through(lambda slope: entries_product(result, slope) if result.shape else result * slope, slopes[0])
+
+
+@entries_product.derivative
+def _of_entries(result, arguments, slopes):
+    (a, b), (da, db) = arguments, slopes
+    by_a = through(lambda slope: entries_product(slope, b), da)
+    return plus(by_a, through(lambda slope: entries_product(a, slope), db))
+
+
+@at_most.derivative
+def _of_limit(result, arguments, slopes):
+    v, value = arguments
+    return through(lambda slope: entries_product(slope, below(v, value)), slopes[0])
+
+
+@at_least.derivative
+def _of_lower_limit(result, arguments, slopes):
+    a, value = arguments
+    return through(lambda slope: choose(exceeds(a, value), slope, slope * 0.0), slopes[0])
+
+
+@magnitude.derivative
+def _of_magnitude(result, arguments, slopes):
+    return through(lambda slope: choose(exceeds(arguments[0], 0.0), slope, slope * -1.0), slopes[0])
+
+
+diagonal.derivative(lambda result, arguments, slopes: through(diagonal, slopes[0]))
+shifted.derivative(lambda result, arguments, slopes: slopes[0])
+trace.derivative(lambda result, arguments, slopes: through(trace, slopes[0]))
+
+
+@choose.derivative
+def _of_choice(result, arguments, slopes):
+    condition, *values = arguments
+    moves = (a * 0.0 if slope is None else slope for a, slope in zip(values, slopes[1:], strict=True))
+    return choose(condition, *moves)
+
+
+for _jumps in (below, exceeds, is_number, count):
+    _jumps.derivative(lambda *_: None)
+
+
+def slopes_of(wanted: Sequence[Matrix], moves: Mapping[Matrix, Matrix]) -> list[Matrix | None]:
+    """Slopes of matrices along one parameter, from those of given matrices, `moves`; None for zero."""
+    slopes: dict[Matrix, Matrix | None] = dict(moves)
+    for matrix in in_order(wanted):
+        if matrix not in slopes:
+            of = [slopes[a] if isinstance(a, Matrix) else None for a in matrix.arguments]
+            moving = any(slope is not None for slope in of)
+            slopes[matrix] = matrix.operation.slope(matrix, matrix.arguments, of) if moving else None
+    return [slopes[matrix] for matrix in wanted]
+
+
+ROUNDS = 14  # enough for condition numbers of 1e16: the last rounds each double the number of correct digits
+CLOSE = 1e-10  # if det((a + b)/2)^(1/size), which is at least 1, exceeds 1 by less, one more round is enough
+
+
+@operation(same, lambda a, b: True)
+def geometric_mean(a, b):
+    """A # B = A (A^-1 B)^(1/2) of two covariances, itself a covariance.
+
+    Replacing the two by their arithmetic and harmonic mean, again and again, converges to it. With both scaled to
+    determinant 1 one round is enough for two channels, and one channel needs none. For more than two channels
+    programs call a function.
+
+    Source: Bhatia (2007), Positive Definite Matrices, chapter 4; scaling by determinants: Higham (2008), Functions
+    of Matrices, section 6.5.
+    """
+    size = len(a)
+    if a.dtype == object and size > 2:
+        numbers = [a[0, 0].graph.number(entry) for entry in (*a.ravel(), *b.ravel())]
+        entries = called(_taught(size), size * size, *numbers)
+        return mirrored.compute(np.array(entries, dtype=object).reshape(size, size))
+    if size == 1:
+        return np.array([[(a[0, 0] * b[0, 0]) ** 0.5]])
+    a, b, unit = _scaled(a, b)
+    for _ in range(rounds(size)):
+        a, b = _closer(a, b)
+    return a * unit
+
+
+def _scaled(a, b):
+    """Both with determinant 1, and the factor of their mean."""
+    unit_a, unit_b = _unit(factor(a)), _unit(factor(b))
+    return a * (1.0 / unit_a), b * (1.0 / unit_b), (unit_a * unit_b) ** 0.5
+
+
+def _closer(a, b):
+    """One round: arithmetic and harmonic mean, both with determinant 1."""
+    both = a + b
+    of = factor(both)
+    parallel = mirrored(quotient(a, of) @ b)  # (a^-1 + b^-1)^-1
+    unit = _unit(of)
+    return both * (1.0 / unit), parallel * unit
+
+
+def rounds(size: int) -> int:
+    """Number of rounds."""
+    return 1 if size == 2 else ROUNDS
+
+
+def _unit(of):
+    return math.prod(of[1]) ** (1.0 / len(of[1]))
+
+
+@cache
+def geometric_mean_of(size: int) -> Callable:
+    """Return `mean(a, b)`, `geometric_mean` for `calls`; for large matrices it stops as soon as both are close."""
+    if size == 1:
+        return entrywise("mean", "a, b", (1, 1), lambda i, j: "(a[0][0] * b[0][0]) ** 0.5", a=(1, 1), b=(1, 1))
+    count, close = rounds(size), 1.0 + CLOSE if is_array(size, size) else 0.0  # small matrices do all rounds
+    cholesky, solve = matrices.cholesky_factor(size), matrices.row_solver(size, size)
+    times, add = matrices.multiplier(size, size, size), matrices.symmetric_sum(size)
+    source = Source("unit", "l", l=(size, size))  # l l' over this has determinant 1
+    unit = source.function(source.product(f"l[{i}][{i}] ** {2.0 / size!r}" for i in source.range(size)))
+    scaled = entrywise("scaled", "a, f", (size, size), lambda i, j: f"f * a[{i}][{j}]", a=(size, size))
+
+    @inlined
+    def mean(a, b):
+        unit_a, unit_b = unit(cholesky(a)), unit(cholesky(b))
+        a, b = scaled(a, 1.0 / unit_a), scaled(b, 1.0 / unit_b)
+        rounds_left = count
+        while rounds_left > 0:
+            rounds_left -= 1
+            both = add(a, b)
+            root = cholesky(both)
+            parallel = times(solve(a, root), b)
+            unit_both = unit(root)
+            if 0.5 * unit_both < close:  # it is 1 for equal ones, else larger
+                rounds_left = min(rounds_left, 1)
+            a, b = scaled(both, 1.0 / unit_both), scaled(add(parallel, parallel), 0.5 * unit_both)
+        return scaled(a, (unit_a * unit_b) ** 0.5)
+
+    return mean
+
+
+@cache
+def _taught(size: int) -> str:
+    """The name under which programs call the mean."""
+    mean, name, write = geometric_mean_of(size), f"geometric_mean_{size}", matrix_writer(size, size, 0)
+    first, second = (matrix_reader(size, size, at) for at in (0, size * size))
+
+    @inlined
+    def work(pair, result):
+        write(result, mean(first(pair), second(pair)))
+
+    CALLED[name], CALLED_IN_ROUNDS[name] = work, lambda: _as_programs(size)
+    return name
+
+
+def _as_programs(size: int) -> tuple[Program, Program, Program, int, int]:
+    """The mean as programs, for `CALLED_IN_ROUNDS`; "kept" holds both matrices and the factor of the mean."""
+    square = size * size
+
+    def program(array: str, work: Callable, to: str) -> Program:
+        graph = Graph()
+        numbers = np.array(
+            [graph.given(Place(array, k)) for k in range(2 * square + (array == "kept"))], dtype=object
+        )
+        a, b = (numbers[k * square : (k + 1) * square].reshape(size, size) for k in range(2))
+        results = np.concatenate([np.ravel(array) for array in work(a, b, *numbers[2 * square :])])
+        return program_of([(Place(to, k), graph.number(entry)) for k, entry in enumerate(results)], {})
+
+    first, again = program("given", _scaled, "kept"), program("kept", lambda a, b, unit: _closer(a, b), "kept")
+    last = program("kept", lambda a, b, unit: (a * unit,), "found")
+    return first, again, last, rounds(size), 2 * square + 1
+
+
+FUNCTIONS: dict[Operation, Callable] = {geometric_mean: lambda result, a, b: geometric_mean_of(a[0])}

@@ -11,16 +11,14 @@ import numpy as np
 
 from filters.algebra.matrices import Matrix, evaluate
 from filters.algebra.operations import factor, quotient
-from filters.algebra.samples import dot
+from filters.algebra.points import dot
 from filters.engine.batch import run
 from filters.engine.belief import memory_places
 from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
 from filters.filter import Filter
-from filters.pages.equations import Equations
-from filters.pages.kernels import numbers_of, stages_of
-from filters.pages.members import MembersMemory
-from filters.pages.members import stages_of as stages_of_members
-from filters.pages.page import RowMemory
+from filters.pages.kernels import MembersMemory, numbers_of, stages_of
+from filters.pages.kernels import member_stages_of as stages_of_members
+from filters.pages.page import Equations, RowMemory
 from filters.pages.page_filter import FilterWithPage, with_page
 from filters.pages.traced import MOST, Traced
 from thruster_env.core.angles import difference, wrapped_where

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.adaptive import RobustExtendedKalmanFilter, SageHusaFilter, VariationalBayesFilter
-from filters.algebra.samples import tail_of
+from filters.algebra.points import tail_of
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.filter import Filter
 from filters.gaussian.extended import (

@@ -15,16 +15,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from filters.algebra.blocks import forward_quotient
 from filters.algebra.matrices import input_matrix
 from filters.algebra.members import mean
 from filters.algebra.operations import only, present, uncorrelated, wrap
 from filters.algebra.points import root
+from filters.algebra.roots import forward_quotient
 from filters.engine.belief import Kernels, memory_places, own_place
 from filters.ensembles.ensemble import compare, expect
 from filters.ensembles.stochastic import DeterministicUpdateFilter, LocalisedFilter, with_rotation
-from filters.pages.kernels import Stage, stored
-from filters.pages.members import MembersMemory, extras_size, members_kernels, works_of
+from filters.pages.kernels import MembersMemory, Stage, extras_size, members_kernels, stored
+from filters.pages.kernels import member_works_of as works_of
 from filters.pages.page import Page
 from thruster_env.core.compiled import inlined
 from thruster_env.graphs.programs import Place

@@ -43,13 +43,24 @@ from typing import Any
 import numpy as np
 
 from filters.algebra.members import correlations, covariance, mean, on_branch, stretches, variances
-from filters.algebra.operations import divide, factor, inverse, only, present, sym, uncorrelated, wrap
-from filters.algebra.points import outer
-from filters.algebra.samples import dot, log_density
-from filters.algebra.scalars import at_least as at_least_number
-from filters.algebra.scalars import choose, constant, diagonal, exceeds
+from filters.algebra.operations import at_least as at_least_number
+from filters.algebra.operations import (
+    choose,
+    constant,
+    diagonal,
+    divide,
+    exceeds,
+    factor,
+    inverse,
+    only,
+    present,
+    sym,
+    uncorrelated,
+    wrap,
+)
+from filters.algebra.points import dot, log_density, outer
 from filters.engine.belief import Belief, Kernels
-from filters.pages.members import members_kernels
+from filters.pages.kernels import members_kernels
 from filters.pages.page import Page
 from filters.pages.page_filter import FilterWithPage
 from thruster_env.core.checks import at_least, positive, short_repr, switch

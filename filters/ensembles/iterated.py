@@ -15,15 +15,15 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import ClassVar, NamedTuple
 
-from filters.algebra.geometric import geometric_mean
 from filters.algebra.matrices import input_matrix
 from filters.algebra.members import covariance, mean, on_branch
-from filters.algebra.operations import divide, only, present, wrap
+from filters.algebra.operations import divide, geometric_mean, only, present, wrap
 from filters.engine.belief import Kernels, memory_places, own_place
 from filters.ensembles.by_parts import relax_row, row_moments, stretch_row
 from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, expect, propagate
-from filters.pages.kernels import Stage, stored
-from filters.pages.members import MembersMemory, stages_of, works_of
+from filters.pages.kernels import MembersMemory, Stage, stored
+from filters.pages.kernels import member_stages_of as stages_of
+from filters.pages.kernels import member_works_of as works_of
 from filters.pages.page import Page
 from thruster_env.core.checks import at_least
 from thruster_env.core.compiled import inlined

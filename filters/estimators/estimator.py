@@ -1,9 +1,17 @@
-"""The interface of an estimator: it maps inputs and measurements to means, and to covariances if it has them."""
+"""The interface of an estimator: it maps inputs and measurements to means, and to covariances if it has them.
+
+Checks of an estimator's output: shapes, finite numbers, valid covariances.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
+
+from thruster_env.core.checks import as_floats, correlation_flaws, short_repr
 
 
 class Output(NamedTuple):
@@ -66,3 +74,139 @@ def is_estimator(candidate) -> bool:
     return steps_alone(candidate) or (
         not isinstance(candidate, type) and callable(getattr(candidate, "run", None))
     )
+
+
+PARTS = {"mean": "n", "cov": "nn", "innovation": "m", "innovation_cov": "mm"}
+NAMES = {
+    "mean": "mean",
+    "cov": "covariance",
+    "innovation": "innovation",
+    "innovation_cov": "covariance of the innovation",
+}
+ROUNDING = 1e-4  # of correlations: single precision leaves less
+
+
+class Checks:
+    """Checks of an estimator's outputs, with messages that name it.
+
+    Args:
+        name: of the estimator.
+        n: states.
+        m: measurements.
+        has_covariance: whether it has to give covariances.
+    """
+
+    def __init__(self, name: str, n: int, m: int, has_covariance: bool):
+        self.name, self._sizes, self._has_covariance = name, {"n": (n,), "m": (m,)}, has_covariance
+
+    def output(self, returned, where: str, leading: tuple[int, ...] = ()) -> Output:
+        """The parts of an output as float64 arrays of shape (*leading, ...); ValueError if one is wrong.
+
+        Args:
+            returned: output of the estimator.
+            where: for messages, such as "step 3".
+            leading: shape of all before the states: () of one step, (B, K + 1) of many runs.
+        """
+        parts = returned if isinstance(returned, tuple) else (returned,)
+        if not 1 <= len(parts) <= len(PARTS):
+            rule = f"{self._label} must give a mean, or a tuple of mean, covariance, innovation and its covariance"
+            raise ValueError(f"{rule}, but gave a tuple of {len(parts)} at {where}")
+        output = Output(*parts)
+        if self._has_covariance and output.cov is None:
+            rule = f"{self._label} must give a covariance, or say has_covariance = False"
+            raise ValueError(f"{rule}, but gave none at {where}")
+        checked = {
+            name: None if value is None and name != "mean" else self._part(name, value, where, leading)
+            for name, value in output._asdict().items()
+        }
+        return Output(**checked)
+
+    @property
+    def _label(self) -> str:
+        return f"the estimator {self.name!r}"
+
+    def _part(self, name: str, value, where: str, leading: tuple[int, ...]) -> np.ndarray:
+        size = self._sizes[PARTS[name][0]]
+        is_cov = len(PARTS[name]) == 2
+        shape = (*leading, *size, *size) if is_cov else (*leading, *size)
+        try:
+            array = np.atleast_1d(as_floats(value))
+        except ValueError:
+            array = np.empty(0)
+        if is_cov and array.shape == (*leading, *size) != shape:
+            array = array[..., None] * np.eye(*size)
+        if array.shape != shape:
+            got = f"shape {array.shape}" if array.size else short_repr(value)
+            rule = f"{NAMES[name]} of {self._label} must be numbers of shape {shape}"
+            raise ValueError(f"{rule}, but got {got} at {where}")
+        if not np.isfinite(array).all():
+            location = _first(~np.isfinite(array), leading)
+            rule = f"{NAMES[name]} of {self._label} must be finite"
+            raise ValueError(f"{rule}, but it is not at {location or where}")
+        return self._covariance(name, array, where, leading) if is_cov else array
+
+    def _covariance(self, name: str, covs: np.ndarray, where: str, leading: tuple[int, ...]) -> np.ndarray:
+        least, asymmetry = correlation_flaws(covs)
+        wrong = (least < -ROUNDING) | (asymmetry > ROUNDING)
+        covs = 0.5 * (covs + covs.swapaxes(-1, -2))
+        if wrong.any():
+            location = _first(wrong, leading)
+            rule = f"{NAMES[name]} of {self._label} must be symmetric and positive semidefinite"
+            raise ValueError(f"{rule}, but it is not at {location or where}")
+        return covs
+
+
+def absent(is_cov: bool) -> float:
+    """The substitute for a missing output of an estimator: 0 for a covariance, NaN for innovations."""
+    return 0.0 if is_cov else np.nan
+
+
+def _first(wrong: np.ndarray, leading: tuple[int, ...]) -> str:
+    """Where the first wrong entry of many runs is; empty of a single step."""
+    if not leading:
+        return ""
+    run, step, *_ = np.argwhere(wrong)[0]
+    return f"step {step} of run {run}"
+
+
+def log_likelihoods(
+    innovations: np.ndarray, covs: np.ndarray, measurements: np.ndarray, gaussian: bool
+) -> np.ndarray:
+    """Log-likelihood of measurements, log N(innovation; 0, S) over the channels present, (B, K + 1).
+
+    It is 0 where nothing was measured. It is NaN where an innovation or S is missing, where S is not positive
+    definite, and if the likelihood is not Gaussian.
+
+    Args:
+        innovations: (B, K + 1, m); those of missing channels do not matter.
+        covs: S, (B, K + 1, m, m), likewise.
+        measurements: (B, K + 1, m), NaN where missing.
+        gaussian: whether the likelihood is Gaussian.
+    """
+    present = ~np.isnan(measurements)
+    if not gaussian:
+        return np.where(present.any(axis=-1), np.nan, 0.0)
+    pairs = present[..., :, None] & present[..., None, :]
+    s = np.where(pairs, covs, np.eye(covs.shape[-1]))
+    v = np.where(present, innovations, 0.0)
+    complete = np.asarray(np.isfinite(s).all(axis=(-1, -2)) & np.isfinite(v).all(axis=-1))
+    s = np.where(complete[..., None, None], s, np.eye(covs.shape[-1]))
+    definite = (np.linalg.eigvalsh(s)[..., 0] > 0.0) & complete
+    s = np.where(definite[..., None, None], s, np.eye(covs.shape[-1]))
+    squares = (v * np.linalg.solve(s, v[..., None])[..., 0]).sum(axis=-1)
+    densities = -0.5 * (squares + np.linalg.slogdet(s).logabsdet + present.sum(axis=-1) * math.log(2.0 * math.pi))
+    return np.where(present.any(axis=-1), np.where(definite, densities, np.nan), 0.0)
+
+
+def without_missing(output: Output, z: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Innovation and S as filters have them where channels of z are NaN: zero, and no correlations to these."""
+    innovation, s = output.innovation, output.innovation_cov
+    present = ~np.isnan(z)
+    if present.all():
+        return innovation, s
+    if innovation is not None:
+        innovation = np.where(present, innovation, 0.0)
+    if s is not None:
+        pairs = present[..., :, None] & present[..., None, :]
+        s = np.where(pairs | np.eye(s.shape[-1], dtype=bool), s, 0.0)
+    return innovation, s

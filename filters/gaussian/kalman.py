@@ -23,10 +23,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.algebra.blocks import inverse_of, zeros
 from filters.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from filters.algebra.points import hats
-from filters.algebra.samples import log_density
+from filters.algebra.points import hats, log_density
+from filters.algebra.roots import inverse_of, zeros
 from filters.gaussian import extended
 from filters.gaussian.extended import ExtendedKalmanFilter, add_process_noise, propagate
 from filters.pages.page import Page

@@ -17,17 +17,14 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from filters.algebra.operations import present
-from filters.algebra.points import outer
-from filters.algebra.samples import dot, log_density
-from filters.algebra.scalars import choose, exceeds
+from filters.algebra.operations import choose, exceeds, present
+from filters.algebra.points import dot, log_density, outer
 from filters.baselines import place_of
 from filters.engine.belief import Belief, Kernels, memory_places, own_place
 from filters.filter import Filter
 from filters.gaussian import extended
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.sigma_points import checked_corners, memberships, rules_at_corners
-from filters.pages.equations import Equations, PagedModel
 from filters.pages.kernels import (
     Stage,
     anything_measured,
@@ -39,7 +36,7 @@ from filters.pages.kernels import (
     stored,
     works_of,
 )
-from filters.pages.page import RowMemory
+from filters.pages.page import Equations, PagedModel, RowMemory
 from thruster_env.core.angles import places_of, whole_turns, wrapped
 from thruster_env.core.checks import at_least, one_of, short_repr
 from thruster_env.core.compiled import inlined

@@ -15,8 +15,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from filters.algebra.matrices import input_matrix
-from filters.algebra.samples import dot
-from filters.embedded import embedded_model, places_within
+from filters.algebra.points import dot
+from filters.augmented import embedded_model, places_within
 from filters.engine.belief import Belief, Kernels, memory_places, own_place, restart_if_lost
 from filters.filter import Filter
 from filters.gaussian.absent import Absent, absent_states, completer

@@ -8,13 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from filters.algebra.blocks import hstack, part, triangle, vstack, zeros
 from filters.algebra.matrices import operation
 from filters.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
-from filters.algebra.points import first, on_circle, ones, outer, root, square, units, without_first
-from filters.algebra.samples import log_density
+from filters.algebra.points import first, log_density, on_circle, ones, outer, root, square, units, without_first
+from filters.algebra.roots import hstack, part, triangle, vstack, zeros
 from filters.baselines import place_of
-from filters.gaussian.forms import initial_root, root_result
+from filters.gaussian.extended import initial_root, root_result
 from filters.pages.page import Page
 from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import finite, one_of, positive, short_repr, vector

@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from filters.learned import check_file
-from filters.learned.ensemble import DifferentiableEnsembleFilter
 from filters.learned.estimator import LearnedEstimator
-from filters.learned.gains import KalmanNet, RecursiveKalmanNet
-from filters.learned.networks import GatedRecurrentUnit
+from filters.learned.filters import DifferentiableEnsembleFilter, GatedRecurrentUnit, KalmanNet, RecursiveKalmanNet
 from thruster_env.core.checks import one_of
 from thruster_env.core.files import write_whole
 from thruster_env.model.state_space import StateSpaceModel

@@ -12,20 +12,44 @@ Filters that propagate another representation of the belief, such as sigma point
 
 A filter may keep extras, such as an estimate of R: `initial(model)` returns them as a dictionary at the prior. The
 functions read them from `model.extras`; as their last result they may return a dictionary of those that change.
+
+The model that pages of filters get, and the slopes of its equations along a parameter.
+
+A parameter moves the mean by dx and the constants by dc, and so
+
+    df = F dx + f_c dc,   dF = F_x dx + F_c dc
+
+If the model's functions can be traced, all of these follow from their graphs. Otherwise the functions are called:
+Jacobians that the model has are used, and all other slopes are central differences.
 """
 
 from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Callable, Mapping
+from copy import copy
 from functools import cache
 from math import prod
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
-from filters.algebra.matrices import Matrix, input_matrix
+import numpy as np
+
+from filters.algebra.matrices import Matrix, Operation, input_matrix, never, plus, through
+from filters.algebra.points import root
 from filters.engine.belief import memory_places, own_place
+from filters.pages.traced import not_known, traced_model
+from thruster_env.core.angles import NAMES, short_way
+from thruster_env.core.derivatives import RELATIVE_STEP, step_growth, step_of
+from thruster_env.core.sources import Source, entrywise, is_array, scaled_sum, tuple_of, vector_reader, written_out
 from thruster_env.graphs.programs import Place
-from thruster_env.model.shape import Shape, number_places
+from thruster_env.model.shape import (
+    Functions,
+    Shape,
+    constants_are_array,
+    number_places,
+    observation_slopes,
+    transition_slopes,
+)
 
 
 class Page(NamedTuple):
@@ -144,3 +168,332 @@ class RowMemory(NumbersMemory):
         super().__init__(shape, page, x, p, own_place(shape))
         self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
         self.ratio = self.ratio_in("given", 0)
+
+
+# Slopes of functions that are called, by central differences.
+
+
+@cache
+def called_parts(functions: Functions, shape: Shape, which: str, constants_move: bool) -> tuple[Callable, ...]:
+    """An equation y(x, ..., c), its Jacobian Y(x, scales, ..., c), and the slopes of both.
+
+        y_c dc = [y(c + h dc) - y(c - h dc)]/2h
+        dY = [Y(x + h dx, c + h dc) - Y(x - h dx, c - h dc)]/2h
+
+    y_c dc is a function of (x, scales, ..., c, dc, size), where size is the relative size of dc, and dY one of (x,
+    scales, ..., c, dx, dc, size), without the last two if constants do not move. Far from zero steps grow with
+    `step_growth`, because values are rounded more coarsely. If constants do not move, a large Jacobian F is
+    differentiated by each component of x, because there are fewer components than directions: then two more
+    functions follow, the derivative (columns, rows, columns) and its contraction with dx.
+
+    Args:
+        functions: of the model.
+        shape: its sizes.
+        which: "motion" for f, or "sight" for h.
+        constants_move: whether parameters move its constants.
+    """
+    if which == "motion":
+        value, matrix = functions.transition, transition_slopes(functions, shape)
+        rows, angles, inputs = shape.n, shape.state_angles, "u, c"
+    else:
+        value, matrix = functions.observe, observation_slopes(functions, shape)
+        rows, angles, inputs = shape.m, shape.measurement_angles, "c"
+    by_constants = _by_constants(value, rows, shape, angles, inputs)
+    size = rows, shape.n
+    entry = "(a[{0}][{1}] - b[{0}][{1}]) / (2.0 * h)"
+    difference = entrywise("difference", "a, b, h", size, lambda i, j: entry.format(i, j), a=size, b=size)
+    parts = value, matrix, by_constants, slope_of(matrix, difference, shape, inputs, constants_move)
+    large = is_array(rows, shape.n) and which == "motion" and not constants_move
+    return (*parts, _curvature(matrix, rows, shape.n, inputs), _contraction(rows, shape.n)) if large else parts
+
+
+def _by_constants(value: Callable, rows: int, shape: Shape, angles: tuple[bool, ...], inputs: str) -> Callable:
+    sides = [inputs.replace("c", f"shift(c, {sign}h, dc)") for sign in ("", "-")]
+    lines = (
+        f"h = {RELATIVE_STEP} * step_growth(x, scales) / max(size, 1e-300)",
+        f"above, below = {', '.join(f'value(x, {side})' for side in sides)}",
+        "difference(above, below, h)",
+    )
+    names: dict[str, Any] = {
+        "value": value,
+        "shift": _constants_shift(shape),
+        "difference": difference_of_values(rows, angles),
+        "step_growth": step_growth(shape.n),
+    }
+    return written_out("by_constants", f"x, scales, {inputs}, dc, size", *lines, **names)
+
+
+def difference_of_values(rows: int, angles: tuple[bool, ...]) -> Callable:
+    """`difference(above, below, h)`: (above - below)/2h, where differences of angles are in (-pi, pi]."""
+    source = Source("difference", "above, below, h", result=(rows,), above=(rows,), below=(rows,))
+    entries = source.vector(rows, lambda i: short_way(f"(above[{i}] - below[{i}])", i, angles) + " / (2.0 * h)")
+    return source.function(entries, **NAMES)
+
+
+def slope_of(
+    function: Callable, difference: Callable, shape: Shape, inputs: str, constants_move: bool
+) -> Callable:
+    """`slope(x, scales, ..., c, dx)` of a function (x, scales, ..., c); with dc and its size if constants move."""
+    sides = [
+        (sign, inputs.replace("c", f"shift(c, {sign}h, dc)") if constants_move else inputs) for sign in ("", "-")
+    ]
+    calls = (f"function(move(x, {sign}h, dx), scales, {side})" for sign, side in sides)
+    lines = (
+        f"h = step(x, scales, dx, {'size' if constants_move else '0.0'})",
+        f"above, below = {', '.join(calls)}",
+        "difference(above, below, h)",
+    )
+    names: dict[str, Any] = {
+        "function": function,
+        "step": _step(shape.n),
+        "move": scaled_sum(shape.n),
+        "shift": _constants_shift(shape),
+        "difference": difference,
+    }
+    return written_out("slope", f"x, scales, {inputs}, dx" + ", dc, size" * constants_move, *lines, **names)
+
+
+@cache
+def _step(count: int) -> Callable:
+    """Return `step(x, scales, d, size)`: the step h along d, and along a relative change of constants."""
+    source = Source("step", "x, scales, d, size", x=(count,), scales=(count,), d=(count,))
+    source.line("far = step_growth(x, scales)")
+    source.line("h = max(1e-300, size / far)")
+    for i in source.range(count):
+        source.line(f"h = max(h, {RELATIVE_STEP} * abs(d[{i}]) / step_of(x[{i}], scales[{i}], far))")
+    return source.function(f"{RELATIVE_STEP} / h", step_of=step_of, step_growth=step_growth(count))
+
+
+@cache
+def _constants_shift(shape: Shape) -> Callable:
+    """Return `shift(c, h, dc)`: the constants c + h dc, as the model's functions take them."""
+    if constants_are_array(shape.form):
+        return written_out("shift", "c, h, dc", "c + h * dc")
+    values = [f"c[{i}] + h * dc[{i}]" for i in range(shape.constants)]
+    if isinstance(shape.form, int):
+        return written_out("shift", "c, h, dc", tuple_of(values))
+    return written_out("shift", "c, h, dc", f"Constants({', '.join(values)})", Constants=shape.form)
+
+
+def _curvature(matrix: Callable, rows: int, columns: int, inputs: str) -> Callable:
+    """`curved(x, scales, ..., c)`: a Jacobian's derivative by each component of x, (columns, rows, columns)."""
+    lines = (
+        f"out, unit = np.empty(({columns}, {rows}, {columns})), np.zeros({columns})",
+        "far = step_growth(x, scales)",
+        f"for k in range({columns}):",
+        "    unit[k] = 1.0",
+        "    h = step_of(x[k], scales[k], far)",
+        "    d = read(unit)",
+        f"    above = matrix(move(x, h, d), scales, {inputs})",
+        f"    below = matrix(move(x, -h, d), scales, {inputs})",
+        f"    for i in range({rows}):",
+        f"        for j in range({columns}):",
+        "            out[k, i, j] = (above[i, j] - below[i, j]) / (2.0 * h)",
+        "    unit[k] = 0.0",
+        "out",
+    )
+    names: dict[str, Any] = {"matrix": matrix, "move": scaled_sum(columns), "read": vector_reader(columns)}
+    names |= {"np": np, "step_of": step_of, "step_growth": step_growth(columns)}
+    return written_out("curved", f"x, scales, {inputs}", *lines, _loops=True, **names)
+
+
+def _contraction(rows: int, columns: int) -> Callable:
+    """`slope(curvature, dx)`: a Jacobian's derivative along dx, from its derivatives by each component of x."""
+    lines = (
+        f"out = np.zeros(({rows}, {columns}))",
+        f"for k in range({columns}):",
+        f"    for i in range({rows}):",
+        f"        for j in range({columns}):",
+        "            out[i, j] += dx[k] * curvature[k, i, j]",
+        "out",
+    )
+    return written_out("slope", "curvature, dx", *lines, _loops=True, np=np)
+
+
+@cache
+def called_at_points(
+    functions: Functions, shape: Shape, which: str, constants_move: bool, points: int
+) -> tuple[Callable, Callable]:
+    """An equation Y(X, ..., c) of points X (n, points), and its slope dY(X, scales, ..., c, dX), by columns.
+
+        dy = [y(x + h dx, c + h dc) - y(x - h dx, c - h dc)]/2h
+
+    If parameters move constants, the slope takes (X, scales, ..., c, dX, dc, size). Other arguments are those of
+    `called_parts`.
+    """
+    if which == "motion":
+        value, rows, angles, inputs = functions.transition, shape.n, shape.state_angles, "u, c"
+    else:
+        value, rows, angles, inputs = functions.observe, shape.m, shape.measurement_angles, "c"
+    plain = written_out("plain", f"x, scales, {inputs}", f"value(x, {inputs})", value=value)
+    slope = slope_of(plain, difference_of_values(rows, angles), shape, inputs, constants_move)
+    behind = ", dc, size" if constants_move else ""
+    size = shape.n, points
+    return (
+        _by_columns(value, f"x, {inputs}", rows, x=size),
+        _by_columns(slope, f"x, scales, {inputs}, dx{behind}", rows, x=size, dx=size),
+    )
+
+
+def _by_columns(function: Callable, arguments: str, rows: int, **matrices: Any) -> Callable:
+    """A function of vectors, with results (rows,), applied to each column of matrices: (rows, points)."""
+    n, points = matrices["x"]
+    source = Source("by_columns", arguments, result=(rows, points), **matrices)
+    out = source.local("out", rows, points)
+    for j in source.range(points):
+        columns = {
+            name: f"column({source.array_of(name)}, {j})"
+            if source.loops
+            else tuple_of(f"{name}[{i}][{j}]" for i in range(n))
+            for name in matrices
+        }
+        operands = (columns.get(name, name) for name in arguments.split(", "))
+        source.line(f"y = function({', '.join(operands)})")
+        if source.loops:
+            source.line(f"store(out, {j}, y)")
+        else:
+            source.line(f"{tuple_of(out[i, j] for i in range(rows))} = y")
+    store = Source("store", "out, j, y", y=(rows,))
+    for i in store.range(rows):
+        store.line(f"out[{i}, j] = y[{i}]")
+    column = entrywise("column", "x, j", (n,), lambda i: f"x[{i}, j]")
+    return source.function(source.all_entries(out), function=function, column=column, store=store.function())
+
+
+class PagedModel:
+    """Attributes of the model that pages get, besides its equations f, F, h and H.
+
+    Attributes:
+        Q, R: its covariances; Q of a model with a step ratio is that of the step's length.
+        Q_root, R_root, prior_root: lower triangular roots of Q, R and the prior covariance.
+        prior_mean: of the state.
+        own: the filter's parameters.
+        extras: what the filter keeps besides mean and covariance, by name.
+        state_angles, measurement_angles: flags of components that are angles.
+    """
+
+    def __init__(self, memory: NumbersMemory):
+        shape, self._constants = memory.shape, memory.constants
+        self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
+        self.Q, self.R, self.Q_root, self.R_root = memory.Q, memory.R, memory.Q_root, memory.R_root
+        if shape.step_ratio and memory.ratio is not None:
+            self.Q = memory.Q * memory.ratio
+            self.Q_root = root(self.Q)
+        self.prior_mean, self.prior_root = memory.prior_mean, memory.prior_root
+        self.own, self.extras = memory.own, memory.kept
+
+    def at(self, constants: Matrix) -> Self:
+        """The same model with other constants."""
+        other = copy(self)
+        other._constants = constants
+        return other
+
+
+class Equations(PagedModel):
+    """A model whose functions take Matrices.
+
+    Attributes:
+        called: the functions that evaluate the model's operations, if these are calls.
+    """
+
+    def __init__(
+        self,
+        functions: Functions,
+        memory: NumbersMemory,
+        *,
+        constants_move: bool,
+        trace: bool,
+        partly: bool = False,
+    ):
+        """Take the model's functions, the matrices of its numbers, and whether parameters move its constants.
+
+        The functions are traced if `trace`, otherwise called. A function that cannot be traced raises TypeError:
+        here, or with `partly` only if a matrix that depends on it is evaluated.
+        """
+        shape = memory.shape
+        super().__init__(memory)
+        self._scales = memory.scales
+        self._moves = (memory.constants_slope, memory.size) if constants_move and shape.constants else ()
+        self.called: dict[Operation, Callable] = {}
+        chosen = functions, shape
+        parts: list[tuple[Callable, ...]]
+        if trace:
+            traced = traced_model(functions, shape, partly)
+            parts = [function.parts for function in traced]
+            self._parts_at_points: Callable = lambda which, points: traced[which == "sight"].of_points
+        else:
+            parts = [called_parts(*chosen, which, bool(self._moves)) for which in ("motion", "sight")]
+            self._parts_at_points = lambda which, points: called_at_points(
+                *chosen, which, bool(self._moves), points
+            )
+        self._f, self._F = self._operations("f", parts[0], shape.n, shape.n, trace)
+        self._h, self._H = self._operations("h", parts[1], shape.m, shape.n, trace)
+        self._traced, self._rows = trace, {"motion": shape.n, "sight": shape.m}
+        self._of_points: dict[tuple[str, int], Operation] = {}
+
+    def f(self, x: Matrix, u: Matrix) -> Matrix:
+        """The state, a substep after x; of points (n, points) that of each."""
+        return (self._f if len(x.shape) == 1 else self._at_points("motion", x))(x, u, self._constants)
+
+    def F(self, x: Matrix, u: Matrix) -> Matrix:  # noqa: N802
+        """df/dx."""
+        return self._F(x, self._scales, u, self._constants)
+
+    def h(self, x: Matrix) -> Matrix:
+        """What is measured at x; of points (n, points) at each."""
+        return (self._h if len(x.shape) == 1 else self._at_points("sight", x))(x, self._constants)
+
+    def H(self, x: Matrix) -> Matrix:  # noqa: N802
+        """dh/dx."""
+        return self._H(x, self._scales, self._constants)
+
+    def _operations(
+        self, name: str, parts: tuple[Callable, ...], rows: int, n: int, trace: bool
+    ) -> tuple[Operation, Operation]:
+        """An equation (x, ..., c) and its Jacobian (x, scales, ..., c); their derivatives are operations, too."""
+        shapes = (rows,), (rows, n), (rows,), (rows, n), (n, rows, n), (rows, n)
+        operations = [
+            Operation(part if trace else not_known, lambda *_, shape=shape: shape, never)
+            for part, shape in zip(parts, shapes, strict=False)
+        ]
+        value, matrix, by_constants, slope, *curved = operations
+        value.name, matrix.name = name, name.upper()
+        by_constants.name, slope.name = f"{name}_c", f"d{name.upper()}"
+        if not trace:
+            self.called |= dict(zip(operations, parts, strict=True))
+
+        @value.derivative
+        def of_value(result, arguments, slopes):
+            x, *inputs = arguments
+            along_x = through(lambda dx: matrix(x, self._scales, *inputs) @ dx, slopes[0])
+            return plus(along_x, by_constants(x, self._scales, *inputs, *self._moves) if self._moves else None)
+
+        @matrix.derivative
+        def of_matrix(result, arguments, slopes):
+            if curved:
+                curvature, contraction = curved
+                return contraction(curvature(*arguments), slopes[0])
+            return slope(*arguments, slopes[0], *self._moves)
+
+        return value, matrix
+
+    def _at_points(self, which: str, x: Matrix) -> Operation:
+        """An equation (X, ..., c) of each column of X; its slope (X, scales, ..., c, dX) is an operation, too."""
+        key = which, x.shape[1]
+        if key in self._of_points:
+            return self._of_points[key]
+        parts, rows = self._parts_at_points(*key), self._rows[which]
+        value, slope = (
+            Operation(part if self._traced else not_known, lambda x, *_: (rows, x[1]), never) for part in parts
+        )
+        value.name, slope.name = f"{which}_of_points", f"d_{which}_of_points"
+        self._of_points[key] = value
+        if not self._traced:
+            self.called |= {value: parts[0], slope: parts[1]}
+
+        @value.derivative
+        def of_value(result, arguments, slopes):
+            x, *inputs = arguments
+            return slope(x, self._scales, *inputs, slopes[0], *self._moves)
+
+        return value

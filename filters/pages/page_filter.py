@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from filters.engine.belief import Kernels
-from filters.engine.bounded import bounded_kernels
+from filters.engine.belief import Kernels, bounded_kernels
 from filters.filter import Filter
 from filters.pages.kernels import page_kernels
 from filters.pages.page import Page

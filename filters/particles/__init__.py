@@ -1,6 +1,6 @@
 """Filters whose belief is a weighted sample of states.
 
-A page is written for one particle, whose weight is a logarithm; `filters.algebra.samples` has weights, weighted
+A page is written for one particle, whose weight is a logarithm; `filters.algebra.points` has weights, weighted
 moments and the effective sample size. Resampling reorders particles, so it runs between the functions of the page;
 these pages are neither in C nor on tensors.
 """

@@ -8,25 +8,33 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from filters.algebra.blocks import hstack, pick, zeros
 from filters.algebra.members import on_branch
 from filters.algebra.operations import divide, only, present, sym, uncorrelated, wrap
-from filters.algebra.points import outer, root, square
-from filters.algebra.samples import log_density, weighted_covariance, weighted_mean, weighted_square, weights
+from filters.algebra.points import (
+    log_density,
+    outer,
+    root,
+    square,
+    weighted_covariance,
+    weighted_mean,
+    weighted_square,
+    weights,
+)
+from filters.algebra.roots import hstack, pick, zeros
 from filters.baselines import places_of
 from filters.engine.belief import Belief, Kernels
 from filters.ensembles.ensemble import add_process_noise, propagate
 from filters.gaussian import extended
 from filters.pages.page import Page
-from filters.particles import weighted
-from filters.particles.kernels import particle_kernels
-from filters.particles.weighted import (
+from filters.particles import kernels as weighted
+from filters.particles.kernels import (
     ResampledFilter,
     WeightedFilter,
     draw,
     expect,
     fit,
     initial_weighted,
+    particle_kernels,
     smooth,
     spread,
 )

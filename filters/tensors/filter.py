@@ -13,8 +13,8 @@ from torch.autograd.function import once_differentiable
 
 from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
 from filters.filter import Filter
-from filters.likelihood import likelihood
 from filters.pages.page_filter import with_page
+from filters.sensitivity import likelihood
 from filters.tensors.draws import round_keys
 from filters.tensors.equations import OfGraph, equation_of
 from filters.tensors.recursion import CompiledRecursion, Estimate, Numbers, Recursion
@@ -85,7 +85,7 @@ class TensorEstimates(NamedTuple):
 
 
 def compiled_likelihood(filter_: Filter, inputs: Any, measurements: Any, q: Tensor, r: Tensor) -> Tensor:
-    """Log-likelihoods (B,) of trajectories, with the gradient of `filters.likelihood` along Q and R.
+    """Log-likelihoods (B,) of trajectories, with the gradient of `filters.sensitivity` along Q and R.
 
     Args:
         filter_: a filter with a page.

@@ -16,14 +16,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filters.algebra import blocks, geometric, matrices, members, operations, points, scalars
-from filters.algebra import samples as densities
+from filters.algebra import matrices, members, operations, points
+from filters.algebra import operations as geometric
+from filters.algebra import operations as scalars
+from filters.algebra import points as densities
+from filters.algebra import roots as blocks
 from filters.algebra.matrices import Matrix, Operation, in_order, never
-from filters.pages.equations import PagedModel
-from filters.pages.kernels import Stage, stages_of
-from filters.pages.members import MembersMemory
-from filters.pages.members import stages_of as members_stages
-from filters.pages.page import NumbersMemory, Page, RowMemory
+from filters.pages.kernels import MembersMemory, Stage, stages_of
+from filters.pages.kernels import member_stages_of as members_stages
+from filters.pages.page import NumbersMemory, Page, PagedModel, RowMemory
 from filters.tensors.draws import Draw
 from thruster_env.core.angles import TURN
 from thruster_env.core.matrices import RESOLUTION

@@ -5,13 +5,37 @@ import pytest
 from scipy.stats import multivariate_normal, multivariate_t
 
 from filters.algebra import operations
-from filters.algebra import samples as densities
+from filters.algebra import points as densities
 from filters.algebra.calls import calls_of
 from filters.algebra.matrices import Matrix, evaluate, in_order, input_matrix
-from filters.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
-from filters.algebra.points import first, on_circle, ones, outer, root, square, units, without_first
-from filters.algebra.samples import heavier, log_density, outlier_weight, tail_of
-from filters.algebra.scalars import at_least, choose, exceeds, slopes_of
+from filters.algebra.operations import (
+    at_least,
+    choose,
+    divide,
+    exceeds,
+    eye,
+    joseph,
+    only,
+    present,
+    slopes_of,
+    sym,
+    uncorrelated,
+    wrap,
+)
+from filters.algebra.points import (
+    first,
+    heavier,
+    log_density,
+    on_circle,
+    ones,
+    outer,
+    outlier_weight,
+    root,
+    square,
+    tail_of,
+    units,
+    without_first,
+)
 from thruster_env.graphs.programs import Place
 
 RNG = np.random.default_rng(0)

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from filters import affine_model, make_filter, run
-from filters.bounds import path_bound
-from filters.posterior import posterior_bound
-from filters.wrapped import wrapped_variances
+from filters.bounds import path_bound, posterior_bound, wrapped_variances
 from tests.models import affine, state_space
 from thruster_env.core.checks import covariance_root
 from tuning.problems import model_problem

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
-from filters.wrappers.vector import EstimateStates
+from filters.wrappers.envs import EstimateStates
 
 DROPOUT = {"sensors": {"thrust": [{"name": "dropout", "probability": 0.5}]}}
 

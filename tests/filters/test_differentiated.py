@@ -8,8 +8,7 @@ import pytest
 from filters.differentiated import recursion
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.differentiated.runs import ModelSlopes
-from filters.likelihood import information, likelihood
-from filters.sensitivity import sensitivity
+from filters.sensitivity import information, likelihood, sensitivity
 from tests.filters.test_sensitivity import case, slopes_of
 from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.models import DT, pendulum, simulated, swing, wide_model

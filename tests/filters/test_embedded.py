@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filters import StateSpaceModel
-from filters.embedded import embedded_model
+from filters.augmented import embedded_model
 from thruster_env.core.compiled import interpreted
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from filters import EstimateState, make_filter, run
 from filters.estimators.estimator import Estimator
-from filters.wrappers.vector import EstimateStates
+from filters.wrappers.envs import EstimateStates
 from tests.models import random_affine, simulated
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.baselines import scaled_default

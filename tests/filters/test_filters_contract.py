@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 
 from filters import FILTERS, run
 from filters.ensembles.ensemble import EnsembleFilter
-from filters.particles.weighted import WeightedFilter
+from filters.particles.kernels import WeightedFilter
 from tests.models import KEY, MODELS, simulated, small, state_space, varying_noise, wide_model
 from tests.oracles import equal
 from thruster_env.core.streams import filter_keys

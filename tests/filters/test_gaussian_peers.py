@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, UnscentedKalmanFilter, run, thruster_model
-from filters.posterior import posterior_bound
+from filters.bounds import posterior_bound
 
 # The thruster of `data/dynamax_thruster.py`: written a second time, from the print.
 THRUSTER = json.loads((Path(__file__).parents[1] / "data" / "dynamax_thruster.json").read_text())

@@ -7,7 +7,9 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from filters import StateSpaceModel, bounds, likelihood, make_filter, posterior, run, thruster_model
+from filters import StateSpaceModel, bounds, make_filter, run, thruster_model
+from filters import bounds as posterior
+from filters import sensitivity as likelihood
 from filters.augmented import augmented_model
 from filters.registry import FILTERS, filter_type
 from filters.smoothers.smooth import smooth

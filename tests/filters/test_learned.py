@@ -12,12 +12,10 @@ from safetensors.numpy import load_file, save_file
 
 from filters import EstimateState, make_filter, run, thruster_model
 from filters.estimators.find import is_foreign, label_of
-from filters.learned.equations import Equations
-from filters.learned.estimator import unit_scales
+from filters.learned.estimator import Equations, unit_scales
 from filters.learned.file import LEARNED, read, write_estimator
-from filters.learned.gains import KalmanNet
-from filters.learned.networks import GainNetwork
-from filters.wrappers.vector import EstimateStates
+from filters.learned.filters import GainNetwork, KalmanNet
+from filters.wrappers.envs import EstimateStates
 from tests.models import KEY, pendulum, plane_model, random_affine, simulated
 from thruster_env.model.affine import affine_model
 from tuning.search.space import Choice

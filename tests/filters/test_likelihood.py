@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, run
-from filters.likelihood import information, likelihood
+from filters.sensitivity import information, likelihood
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate

@@ -19,8 +19,7 @@ from thruster_env.logs.read import read_log
 from thruster_env.logs.steps import in_steps
 from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.quantities import Quantity
-from thruster_env.thruster.logged import logged_model
-from thruster_env.thruster.model import thruster_model
+from thruster_env.thruster.model import logged_model, thruster_model
 from tuning.identification.family import ModelFamily
 from tuning.problems.log_problem import LogProblem
 

@@ -8,8 +8,7 @@ from scipy.stats import chi2, multivariate_normal
 
 from filters import make_filter, run, smooth
 from filters.logs.estimate import estimate
-from filters.logs.figure import draw_log, log_figure
-from filters.logs.findings import columns_of, compared, findings
+from filters.logs.findings import columns_of, compared, draw_log, findings, log_figure
 from tests.thruster_env.logs.test_logs import MODEL
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs.log import Log
@@ -133,7 +132,7 @@ def test_an_estimate_at_which_h_has_no_value_is_drawn_all_the_same(log):
 
 def test_the_prior_s_band_does_not_widen_the_picture(log, tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr("filters.logs.figure.save_figure", lambda figure, path: drawn.extend(figure.axes))
+    monkeypatch.setattr("filters.logs.findings.save_figure", lambda figure, path: drawn.extend(figure.axes))
     found = estimate(log, "kf", SEEN.replace(prior_cov=[1e6]))
     log_figure(tmp_path / "est.png", found, "kf on run")
     speed, innovation = drawn[0], drawn[-1]

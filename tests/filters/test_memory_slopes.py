@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from filters import KalmanFilter, StateSpaceModel, make_filter, run
-from filters.likelihood import likelihood
 from filters.pages.page import Page
 from filters.pages.traced import Traced
-from filters.sensitivity import sensitivity
-from filters.state_scores import state_score
+from filters.sensitivity import likelihood, sensitivity, state_score
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_pages import MADE, assert_slopes, wide_pendulum, with_noise
 from tests.filters.test_pages_called import turn_if

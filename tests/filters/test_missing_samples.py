@@ -7,7 +7,7 @@ import pytest
 
 import filters
 from filters import make_filter, run, smooth
-from filters.likelihood import likelihood
+from filters.sensitivity import likelihood
 from tests.kalman_by_hand import LinearModel
 from tests.models import line_model, simulated, small, wide_model
 from thruster_env.core.checks import as_floats

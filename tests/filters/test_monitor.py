@@ -11,13 +11,16 @@ import thruster_env  # noqa: F401 - registers its envs
 from filters import EstimateState, EstimateStates
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import alarms_of, columns_of, episode_sentence, episodes
-from filters.monitoring.monitor import TESTS, Alarm, Monitor, monitor_of
-from filters.monitoring.recursion import (
+from filters.monitoring.monitor import (
+    TESTS,
+    Alarm,
+    Monitor,
     chi_square,
     cusum_run_length,
     cusum_threshold,
     glr_run_length,
     glr_threshold,
+    monitor_of,
 )
 from filters.registry import make_filter
 from thruster_env.logs.log import Log

@@ -8,10 +8,8 @@ import pytest
 
 from filters import FILTERS, ExtendedKalmanFilter, KalmanFilter, make_filter, run, thruster_model
 from filters.differentiated.runs import KINDS, ModelSlopes, differentiable
-from filters.likelihood import information, likelihood
 from filters.pages.page_filter import PageFilter
-from filters.sensitivity import sensitivity
-from filters.state_scores import state_score
+from filters.sensitivity import information, likelihood, sensitivity, state_score
 from tests.filters.of_arrays import run_page
 from tests.filters.test_differentiated import units
 from tests.filters.test_likelihood import directions, two_channels

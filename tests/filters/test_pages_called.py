@@ -10,10 +10,8 @@ from filters import run
 from filters.differentiated import recursion
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.differentiated.runs import differentiable
-from filters.likelihood import likelihood
-from filters.pages.equations import called_at_points
-from filters.sensitivity import sensitivity
-from filters.state_scores import state_score
+from filters.pages.page import called_at_points
+from filters.sensitivity import likelihood, sensitivity, state_score
 from tests.filters.test_differentiated import units
 from tests.filters.test_likelihood import directions
 from tests.filters.test_pages import NAMES, assert_slopes, gaze, gaze_slopes, made, whirl, wide_pendulum

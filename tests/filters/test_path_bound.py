@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from filters.bounds import path_bound, riccati_covariances
-from filters.posterior import posterior_bound
+from filters.bounds import path_bound, posterior_bound, riccati_covariances
 from tuning.thruster.scenario import find_scenario
 
 pytestmark = pytest.mark.usefixtures("as_python")

@@ -1,6 +1,6 @@
 """Colours and dashes of filters: one each, none twice, all legible on white and on dark paper."""
 
-from filters.logs.figure import STYLES, TRUTH, colour_of, plot_style
+from filters.logs.findings import STYLES, TRUTH, colour_of, plot_style
 from filters.registry import FILTERS
 from tuning.reporting.page import luminance, on_dark
 

@@ -5,9 +5,8 @@ from collections import namedtuple
 import numpy as np
 import pytest
 
-from filters import posterior as bounds
-from filters.bounds import riccati_covariances
-from filters.posterior import posterior_bound, posterior_variances
+from filters import bounds
+from filters.bounds import posterior_bound, posterior_variances, riccati_covariances
 from tests.models import affine
 from thruster_env.thruster.model import thruster_model
 

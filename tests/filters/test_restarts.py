@@ -15,13 +15,12 @@ import filters
 from filters import EstimateState, RestartWarning, make_filter, restarts_of
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import findings, verdict
-from filters.wrappers.vector import EstimateStates
+from filters.wrappers.envs import EstimateStates
 from tests.models import affine, state_space
 from thruster_env.env.model_env import ModelEnv, Split
 from thruster_env.logs.log import Log
 from tuning.evaluation.evaluate import evaluate, restart_sentences
-from tuning.evaluation.held_out import Comparison
-from tuning.evaluation.summary import summarised, summary
+from tuning.evaluation.summary import Comparison, summarised, summary
 from tuning.problems.data import Data
 from tuning.problems.model_problem import RunsProblem
 from tuning.reporting.page import html_page

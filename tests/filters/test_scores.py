@@ -13,7 +13,7 @@ from filters.consistency.intervals import (
     gaussian_crps,
     uniformity,
 )
-from filters.consistency.verdicts import ranks_verdict
+from filters.consistency.report import ranks_verdict
 
 
 @pytest.mark.parametrize(("error", "deviation"), [(0.0, 1.0), (1.3, 0.7), (-4.0, 2.0)])

@@ -12,7 +12,7 @@ from filters import (
     make_filter,
     run,
 )
-from filters.algebra.geometric import geometric_mean_of
+from filters.algebra.operations import geometric_mean_of
 from tests.models import KEY, simulated, wide_model
 from tests.oracles import convergence
 from thruster_env.core.compiled import interpreted

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from filters import ExtendedKalmanFilter, KalmanFilter, run
-from filters.state_scores import state_score
+from filters.sensitivity import state_score
 from tests.filters.test_differentiated import swing_if
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_sensitivity import pendulum as turning_pendulum

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from filters.consistency.report import longest_stretches
-from filters.consistency.verdicts import HEAVY, STUCK, sentences
+from filters.consistency.report import HEAVY, STUCK, longest_stretches, sentences
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.evaluate import check_consistency

@@ -12,7 +12,7 @@ import torch
 
 import filters
 from filters import make_filter, run, thruster_model
-from filters.likelihood import likelihood
+from filters.sensitivity import likelihood
 from tests.filters.test_c import KEPT, OWN, made
 from tests.filters.test_filter_paths import diverging
 from tests.filters.test_likelihood import directions, two_channels

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filters.algebra.matrices import input_matrix
-from filters.algebra.samples import (
+from filters.algebra.points import (
     effective_size,
     normalised,
     weighted_covariance,
@@ -14,8 +14,7 @@ from filters.algebra.samples import (
     weighted_square,
     weights,
 )
-from filters.pages.kernels import Stage, as_calls
-from filters.pages.members import of_members
+from filters.pages.kernels import Stage, as_calls, of_members
 from filters.particles.kernels import systematic_resampler
 from thruster_env.core.streams import exponential
 from thruster_env.graphs.programs import OF_MEMBERS, Place

@@ -11,9 +11,7 @@ from collections import Counter
 import numpy as np
 
 from filters import FILTERS, affine_model, make_filter, run
-from filters.bounds import path_bound
-from filters.posterior import posterior_bound
-from filters.wrapped import wrapped_variances
+from filters.bounds import path_bound, posterior_bound, wrapped_variances
 from tests.filters.test_bounds_at_any_scale import VELOCITY, apart, exact_covariances
 from tests.fuzz.python_interface import _line, _until
 from tests.models import line_model, simulated, small

@@ -11,7 +11,7 @@ import numpy as np
 
 from tests.tuning.test_identify_starts import NOISE, OWN, PRESET, thruster_logs
 from tests.tuning.test_null_tests import EFFECTS
-from thruster_env.thruster.logged import Recorder
+from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
 from tuning.identification import Identification, identify
 from tuning.thruster.logs import ThrusterFamily

@@ -8,12 +8,11 @@ import pytest
 
 from docs.scripts.machine_code import TABLES, body
 from filters import ExtendedKalmanFilter
-from filters.differentiated.memory import Memory
-from filters.differentiated.recursion import Wanted, stages_of
-from filters.likelihood import likelihood
-from filters.pages.equations import Equations
+from filters.differentiated.recursion import Memory, Wanted, stages_of
 from filters.pages.kernels import as_programs
+from filters.pages.page import Equations
 from filters.pages.traced import MOST
+from filters.sensitivity import likelihood
 from thruster_env.core.compiled import interpreted
 
 PAGE = (Path(__file__).parents[2] / "docs" / "machine_code.md").read_text()

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from filters import EstimateState, EstimateStates, make_filter, run
-from filters.likelihood import likelihood
+from filters.sensitivity import likelihood
 from tests.models import KEY, line_model, simulated, wide_model
 from tests.thruster_env.logs.test_logs import MODEL
 from thruster_env.core.checks import as_floats, vector

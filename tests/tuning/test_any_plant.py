@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from filters.consistency.nees import normalized_squares
-from filters.consistency.verdicts import NO_TRUTH, sentences
+from filters.consistency.report import NO_TRUTH, sentences
 from filters.engine.batch import run
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
@@ -15,15 +15,14 @@ from tuning.cli import evaluate as consistency
 from tuning.cli.tables import choice_table
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
-from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import ensemble_sizes
-from tuning.evaluation.summary import summary
+from tuning.evaluation.summary import Comparison, summary
 from tuning.evaluation.worth import tuning_effect
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import score_label
 from tuning.reporting import leaderboard
 from tuning.reporting.choice_words import gains
-from tuning.reporting.error_tables import comparison_table
+from tuning.reporting.leaderboard import comparison_table
 from tuning.reporting.search_figures import comparison_figure, consistency_figure
 from tuning.reporting.sections import advice, held_out_section
 from tuning.reporting.subject import Subject

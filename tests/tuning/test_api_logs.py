@@ -12,7 +12,7 @@ import tuning
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
 from thruster_env.logs.write import write_log
-from thruster_env.thruster.preset_file import read_preset
+from thruster_env.thruster.parameters import read_preset
 from tuning.experiments.identification import record
 
 FREE = ["motor_damping", "voltage_gain"]

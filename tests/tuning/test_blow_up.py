@@ -6,7 +6,7 @@ import pytest
 import tuning
 from filters import make_filter
 from filters.consistency.nees import blow_up_sentence, root_mean_square
-from filters.consistency.verdicts import sentences
+from filters.consistency.report import sentences
 from thruster_env.model.affine import affine_model
 from tuning.cli.tuning_report import as_json, report
 from tuning.evaluation.evaluate import check_consistency

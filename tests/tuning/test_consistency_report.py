@@ -6,10 +6,10 @@ import pytest
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run
 from filters.consistency.intervals import Interval, gaussian_crps, mean_interval, rmse_ratios
 from filters.consistency.nees import normalized_squares
-from filters.consistency.report import consistency_report
-from filters.consistency.verdicts import (
+from filters.consistency.report import (
     comparison_sentence,
     confidence,
+    consistency_report,
     coverage_sentence,
     crps_sentence,
     divergence_sentence,
@@ -19,7 +19,7 @@ from filters.consistency.verdicts import (
     sentences,
 )
 from filters.engine.batch import Estimates
-from filters.ensembles.rank_histogram import Members, record_members
+from filters.ensembles.square_root import Members, record_members
 from tests.models import scalar_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from filters import affine_model, make_filter, thruster_model
-from filters.bounds import riccati_covariances
+from filters.bounds import posterior_bound, riccati_covariances
 from filters.consistency.nees import normalized_squares
-from filters.posterior import posterior_bound
 from thruster_env.core.compiled import interpreted
 from thruster_env.model import simulate
 from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio

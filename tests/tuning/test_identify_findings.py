@@ -9,7 +9,7 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
 from tuning.identification.profiles import validate
-from tuning.logs.identify import remarks
+from tuning.logs.problem import remarks
 
 DT, COOLING, SPEED = 0.1, 52_000.0, 55.0  # [s], [J/(min K)], [rad/s/V]
 HEAT, PERIOD = 6e5, 25  # heat capacity [J/K]; rows for which the coolant keeps its temperature

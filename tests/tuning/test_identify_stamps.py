@@ -11,8 +11,8 @@ from scipy.linalg import expm
 import tuning
 from filters import Unknown, augmented_model, make_filter
 from filters.engine.batch import run
-from filters.likelihood import likelihood
 from filters.logs.estimate import by_the_clock
+from filters.sensitivity import likelihood
 from tests.filters.test_live import A, oscillator
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs.log import Log
@@ -22,7 +22,7 @@ from thruster_env.model.continuous import noise_of_densities
 from tuning.evaluation.evaluate import evaluate
 from tuning.identification.objective import Objective
 from tuning.identification.profiles import validate
-from tuning.logs.identify import family_of
+from tuning.logs.problem import family_of
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.parameter import Coordinates
 from tuning.search.space import untuned_choice

@@ -12,7 +12,7 @@ from tests.tuning.test_identify import FREE, TRUTH, recorded
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.logs.log import Log
 from thruster_env.model.simulate import simulate
-from thruster_env.thruster.logged import Recorder, logged_model
+from thruster_env.thruster.model import Recorder, logged_model
 from thruster_env.thruster.plant import make_plant
 from tuning.identification import identify, validate
 from tuning.identification.starts import starts_of

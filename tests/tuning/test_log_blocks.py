@@ -11,8 +11,7 @@ from thruster_env.logs.log import Log, cut_at_gaps
 from thruster_env.logs.read import read_log
 from thruster_env.logs.write import write_columns
 from tuning.evaluation.evaluate import evaluate
-from tuning.logs.identify import split_runs
-from tuning.logs.problem import log_problem
+from tuning.logs.problem import log_problem, split_runs
 from tuning.problems.log_parts import parts_of
 from tuning.problems.log_problem import LogProblem
 from tuning.search.space import untuned_choice

@@ -8,7 +8,7 @@ import pytest
 from tests.filters.test_sensitivity import pendulum
 from tests.tuning.test_identify import FREE, TRUTH, recorded
 from tests.tuning.test_identify_starts import NOISE, OWN, PRESET, thruster_logs
-from thruster_env.thruster.logged import Recorder
+from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
 from tuning.identification import identify
 from tuning.identification.objective import kept_variance, lost_information

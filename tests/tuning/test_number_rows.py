@@ -5,7 +5,7 @@ import pytest
 
 from filters import affine_model
 from tuning.problems.model_problem import ModelProblem
-from tuning.reporting.units import number_rows
+from tuning.reporting.choice_words import number_rows
 from tuning.search.parameters import index_pairs
 from tuning.search.space import Choice
 

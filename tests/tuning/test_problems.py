@@ -6,13 +6,13 @@ import pickle
 import numpy as np
 import pytest
 
-from filters.posterior import posterior_bound
+from filters.bounds import posterior_bound
 from filters.tuned_file import NOISE
 from tests import pendulum_problem
 from tests.models import wide_model
 from tests.small_problems import pair, thruster
 from tests.tuned_files import write_untuned
-from tuning.evaluation import held_out
+from tuning.evaluation import summary as held_out
 from tuning.evaluation.baselines import Scaled
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.likelihood.family import Family

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 import tuning
-from filters import affine_model, make_filter
-from filters import posterior as bounds
-from filters.posterior import posterior_variances
+from filters import affine_model, bounds, make_filter
+from filters.bounds import posterior_variances
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.evaluate import check_consistency
 from tuning.problems.check import average_bound

@@ -9,9 +9,8 @@ from filters.consistency.intervals import Interval
 from filters.tuned_file import read_tuned_file
 from tests.tuned_files import rewrite, write_untuned
 from tuning.evaluation import summary as stored
-from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.summary import sizes_as_data, stored_comparison, stored_sizes
+from tuning.evaluation.summary import evaluate_held_out, sizes_as_data, stored_comparison, stored_sizes
 from tuning.evaluation.tuned import metrics, read_tuned
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.reporting import report as reports

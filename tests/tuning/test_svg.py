@@ -7,7 +7,7 @@ from html import unescape
 import numpy as np
 import pytest
 
-from thruster_env.core.plots import BLUE, MOST_POINTS, RUST, panels, thinned
+from thruster_env.core.files import BLUE, MOST_POINTS, RUST, panels, thinned
 from tuning.reporting.page import Code, Pair, Picture, Section, Table, figure_svg, html_page, on_dark, plain
 
 

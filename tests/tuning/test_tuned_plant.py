@@ -18,9 +18,8 @@ from tests.tuned_files import of_version, rewrite, write_untuned
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from thruster_env.core.compiled import interpreted
 from thruster_env.effects.signals import Gusts
-from thruster_env.thruster.parameters import PRESETS
+from thruster_env.thruster.parameters import PRESETS, PresetFile, write_preset
 from thruster_env.thruster.plant import differences, make_plant, plant_data
-from thruster_env.thruster.preset_file import PresetFile, write_preset
 from tuning.api.run import name_of
 from tuning.evaluation.tuned import read_tuned, verify
 from tuning.logs.problem import log_problem, problems_in

@@ -5,9 +5,9 @@ from math import nan
 import pytest
 
 from filters.consistency.intervals import Interval, span
-from tuning.reporting.error_tables import about, limit_cell, unless_blank
+from tuning.reporting.choice_words import power_of_ten, scaled_unit, typeset
+from tuning.reporting.leaderboard import about, limit_cell, unless_blank
 from tuning.reporting.page import Table, Words
-from tuning.reporting.units import power_of_ten, scaled_unit, typeset
 
 
 @pytest.mark.parametrize(

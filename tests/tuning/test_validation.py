@@ -34,8 +34,7 @@ from tuning.problems.excitation import Steps
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
-from tuning.reporting.choice_words import choice_sentences
-from tuning.reporting.units import apart
+from tuning.reporting.choice_words import apart, choice_sentences
 from tuning.search import validation
 from tuning.search.among_types import BASELINE
 from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD

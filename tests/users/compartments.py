@@ -16,7 +16,7 @@ Sources: M. White, G. N. Kenny (1990), Anaesthesia 45, 204-209 (the Marsh model,
 from typing import NamedTuple
 
 from filters import StateSpaceModel
-from thruster_env.core.integration import runge_kutta
+from thruster_env.core.derivatives import runge_kutta
 from tuning.problems.model_problem import ModelProblem
 
 DT = 0.25  # [min]

@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 
 from filters import StateSpaceModel
-from thruster_env.core.integration import runge_kutta
+from thruster_env.core.derivatives import runge_kutta
 from tuning.problems.env_problem import EnvProblem
 
 DT, STEPS = 1.0, 200  # [s]

@@ -16,7 +16,7 @@ import math
 from typing import NamedTuple
 
 from filters import StateSpaceModel
-from thruster_env.core.integration import runge_kutta
+from thruster_env.core.derivatives import runge_kutta
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 

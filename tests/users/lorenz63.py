@@ -11,7 +11,7 @@ Source: E. N. Lorenz (1963), "Deterministic nonperiodic flow", J. Atmospheric Sc
 from typing import NamedTuple
 
 from filters import StateSpaceModel
-from thruster_env.core.integration import runge_kutta
+from thruster_env.core.derivatives import runge_kutta
 from tuning.problems.model_problem import ModelProblem
 
 

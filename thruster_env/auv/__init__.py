@@ -1,7 +1,6 @@
 """An autonomous underwater vehicle; `import thruster_env` registers its envs."""
 
 from thruster_env.auv.env import SegorogeniAUVDepthEnv, SegorogeniAUVEnv, SegorogeniAUVPathEnv
-from thruster_env.auv.parameters import VehicleParameters
-from thruster_env.auv.presets import PRESETS
+from thruster_env.auv.parameters import PRESETS, VehicleParameters
 
 __all__ = ["PRESETS", "SegorogeniAUVDepthEnv", "SegorogeniAUVEnv", "SegorogeniAUVPathEnv", "VehicleParameters"]

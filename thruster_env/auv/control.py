@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thruster_env.auv.channels import SYMBOLS
 from thruster_env.auv.dynamics import cruise_thrust
-from thruster_env.auv.plant import Plant
-from thruster_env.auv.task import Task
+from thruster_env.auv.paths import Task
+from thruster_env.auv.plant import SYMBOLS, Plant
 from thruster_env.core.checks import one_of
 from thruster_env.env.model_env import remembered
 

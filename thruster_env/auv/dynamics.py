@@ -23,7 +23,7 @@ import numpy as np
 from thruster_env.auv.forces import accelerated, forces, forces_tangent
 from thruster_env.auv.parameters import VehicleParameters, derive_constants
 from thruster_env.core.compiled import inlined
-from thruster_env.core.integration import runge_kutta
+from thruster_env.core.derivatives import runge_kutta
 from thruster_env.core.streams import cosine_and_sine
 
 # Attitude and path of a vehicle: Euler angles, transformations between body and earth, their tangents.

@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 
 from thruster_env.auv import simulation as at
+from thruster_env.auv.paths import make_depth_task, make_task
 from thruster_env.auv.plant import Plant, make_plant
 from thruster_env.auv.rendering import Moment, Renderer
 from thruster_env.auv.simulation import Copies
-from thruster_env.auv.task import make_depth_task, make_task
 from thruster_env.core.checks import arguments_of, takes_arguments_of
 from thruster_env.core.memory import TIME
 from thruster_env.env.env import PlantEnv, PlantVectorEnv, ReportRows
@@ -133,7 +133,7 @@ class SegorogeniAUVEnv(ModelledVehicle, PlantEnv):
 
     ## Arguments
     The list, with units and defaults, is that of `thruster_env.auv.plant.make_plant` (the vehicle, its noise,
-    sensors and current; without `substeps`) and of `thruster_env.auv.task.make_task` (the path and the weights
+    sensors and current; without `substeps`) and of `thruster_env.auv.paths.make_task` (the path and the weights
     above); `render_mode`, and `render_size`, (width, height) of pictures in pixels, come on top. All but the first
     go by name. A wrong value raises a ValueError.
     """
@@ -256,7 +256,7 @@ class SegorogeniAUVPathEnv(SegorogeniAUVEnv):
     its own term.
 
     ## Arguments
-    `path` is "IV" by default; see `thruster_env.auv.task.make_task`. Episodes are truncated after 600 steps (30
+    `path` is "IV" by default; see `thruster_env.auv.paths.make_task`. Episodes are truncated after 600 steps (30
     s).
     """
 
@@ -277,7 +277,7 @@ class SegorogeniAUVDepthEnv(SegorogeniAUVEnv):
     Episodes are truncated after 1200 steps (60 s).
 
     ## Arguments
-    The list is that of `thruster_env.auv.plant.make_plant` and of `thruster_env.auv.task.make_depth_task`;
+    The list is that of `thruster_env.auv.plant.make_plant` and of `thruster_env.auv.paths.make_depth_task`;
     `render_mode` and `render_size` come on top.
     """
 

@@ -18,23 +18,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from thruster_env.auv import dynamics
-from thruster_env.auv.channels import (
+from thruster_env.auv.dynamics import angle_rates, attitude_of, cruise_thrust, in_earth_axes, operating_range
+from thruster_env.auv.parameters import VehicleParameters, checked
+from thruster_env.auv.plant import (
     ATTITUDE_INPUTS,
     CHANNELS,
+    CRUISE_SPEED,
     CURRENT_STATES,
     MEASURED,
     STATES,
     SYMBOLS,
+    Plant,
     channels_of,
+    make_plant,
     suite,
 )
-from thruster_env.auv.dynamics import angle_rates, attitude_of, cruise_thrust, in_earth_axes, operating_range
-from thruster_env.auv.parameters import VehicleParameters, checked
-from thruster_env.auv.plant import CRUISE_SPEED, Plant, make_plant
 from thruster_env.core.checks import covariance, one_of, positive
 from thruster_env.core.compiled import inlined
+from thruster_env.core.derivatives import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
 from thruster_env.core.equal_functions import makes_functions
-from thruster_env.core.integration import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
 from thruster_env.core.matrices import scaled
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.env.copies import functions_of

@@ -1,14 +1,26 @@
-"""The parameters of an underwater vehicle, and the constants of the equations of motion that follow from them."""
+"""The parameters of an underwater vehicle, and the constants of the equations of motion that follow from them.
+
+Vehicles by name: sizes and parameters, and where each number is from.
+
+Hull and added mass are those of a prolate spheroid (Lamb); cross-flow drag by strips, the lift of the body by
+Hoerner's formula and the lift of the fins follow Prestero (2001), chapter 4, and so do the products of velocities
+that come with the added mass.
+
+Two things differ from prints. The moment of the body's lift reduces the Munk moment, as in the values that
+Prestero prints (Muw 24.0 = 34.6 - 4.4 - 6.2): a public file of his formulas has the other sign. And the fins'
+factors hold for a pair of fins; the values printed for REMUS are half of that (`fins=1`).
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from thruster_env.auv.forces import Constants
-from thruster_env.core.checks import positive, within
+from thruster_env.core.checks import one_of, positive, within
 
 LARGEST = 1e9  # of any parameter, in units of SI: beyond it floating point may overflow
 
@@ -173,3 +185,196 @@ def derive_constants(p: VehicleParameters, substep: float = 0.0, propeller_torqu
 def _coupled(row: int) -> list[tuple[int, str]]:
     """The forces and moments that accelerate a velocity: those of its block, (X, Z, M) or (Y, K, N)."""
     return [(column, "XYZKMN"[column]) for column in ((0, 2, 4) if row in (0, 2, 4) else (1, 3, 5))]
+
+
+# The parameters of a slender vehicle from its main sizes: a spheroid, strips and four tail fins.
+
+
+GRAVITY = 9.81  # [m/s^2]
+CROSS_FLOW_DRAG = 1.1  # c_dc, of a cylinder (Prestero)
+FIN_DRAG = 0.56  # c_df, of a fin across the flow (Prestero)
+ASPECT_RATIO = 2.21  # of a fin and its image in the hull (Prestero)
+BODY_LIFT = 0.003  # a degree, by length over diameter (Hoerner, for slender bodies)
+CENTRE_OF_LIFT = 0.65  # of the length, from the nose (Hoerner)
+ROLL_ADDED_INERTIA = 0.3  # of the rigid body's, assumed as in the Marine Systems Simulator (r44)
+
+
+class Sizes(NamedTuple):
+    """Main sizes of a slender vehicle with four equal tail fins."""
+
+    mass: float  # [kg]
+    length: float  # [m]
+    diameter: float  # [m]
+    density: float  # of the water [kg/m^3]
+    gravity_below: float  # z_G: how far the centre of gravity lies below that of buoyancy [m]
+    axial_drag: float | None  # c_d, on the frontal area; None for Prestero's formula
+    fin_area: float  # of one fin [m^2]
+    fin_place: float  # x of the fins, negative [m]
+    fin_arm: float  # of a fin's middle from the axis [m]
+    fins: float = 2.0  # fins that lift together
+
+
+def lamb_factors(a: float, b: float) -> tuple[float, float, float]:
+    """Added mass along and across, and added inertia, over those of the displaced water, of a prolate spheroid.
+
+        e^2 = 1 - (b/a)^2,  l = ln((1+e)/(1-e)),  alpha = 2(1-e^2)/e^3 (l/2 - e),  beta = 1/e^2 - (1-e^2) l/(2e^3)
+        k_1 = alpha/(2 - alpha),  k_2 = beta/(2 - beta),
+        k' = e^4 (beta - alpha)/((2 - e^2)(2e^2 - (2 - e^2)(beta - alpha)))
+
+    Args:
+        a: semi-axis along [m], the longer one.
+        b: semi-axes across [m].
+
+    Source: Lamb (1932), Hydrodynamics, sections 114 and 115.
+    """
+    e2 = 1.0 - (b / a) ** 2
+    e = math.sqrt(e2)
+    log = math.log((1.0 + e) / (1.0 - e))
+    alpha = 2.0 * (1.0 - e2) / e**3 * (0.5 * log - e)
+    beta = 1.0 / e2 - (1.0 - e2) / (2.0 * e**3) * log
+    turning = e2**2 * (beta - alpha) / ((2.0 - e2) * (2.0 * e2 - (2.0 - e2) * (beta - alpha)))
+    return alpha / (2.0 - alpha), beta / (2.0 - beta), turning
+
+
+def axial_drag(length: float, diameter: float) -> float:
+    """Prestero's formula of c_d on the frontal area, friction with the hull's form in it; 0.10 for REMUS."""
+    slenderness = length / diameter
+    area = math.pi * diameter**2 / 4
+    form = 1.0 + 60.0 / slenderness**3 + 0.0025 * slenderness
+    return 3.397e-3 * math.pi * length * diameter / area * form
+
+
+def recipe(sizes: Sizes) -> VehicleParameters:
+    """All parameters of a vehicle from its main sizes, neutrally buoyant, with its weight amidships."""
+    m, length, d, rho = sizes.mass, sizes.length, sizes.diameter, sizes.density
+    a, b, x, pressure = length / 2, d / 2, sizes.fin_place, rho / 2
+    k_1, k_2, k_turn = lamb_factors(a, b)
+    ix, iy = 0.4 * m * b**2, 0.2 * m * (a**2 + b**2)
+    xud, yvd, kpd, mqd = -k_1 * m, -k_2 * m, -ROLL_ADDED_INERTIA * ix, -k_turn * iy
+    frontal = math.pi * b**2
+    c_d = axial_drag(length, d) if sizes.axial_drag is None else sizes.axial_drag
+    # Strips of width 2R dx across the flow: the integrals of 2R dx and of 2R |x|^3 dx over the spheroid.
+    side, third_moment = math.pi * a * b, 8 / 15 * a**4 * b
+    fin_drag = 2 * pressure * sizes.fin_area * FIN_DRAG
+    cross = -pressure * CROSS_FLOW_DRAG * side - fin_drag
+    turning = -pressure * CROSS_FLOW_DRAG * third_moment - abs(x) ** 3 * fin_drag
+    lift = pressure * d**2 * BODY_LIFT * (length / d) * 180 / math.pi
+    x_lift = (0.5 - CENTRE_OF_LIFT) * length
+    lift_slope = 1 / (1 / (1.8 * math.pi) + 1 / (math.pi * ASPECT_RATIO))
+    f = sizes.fins * pressure * lift_slope * sizes.fin_area  # lift of the fins over u^2 times their angle
+    munk = xud - yvd
+    return checked(
+        VehicleParameters(
+            m=m, W=m * GRAVITY, B=m * GRAVITY, xG=0.0, yG=0.0, zG=sizes.gravity_below, Ix=ix, Iy=iy, Iz=iy,
+            Xud=xud, Yvd=yvd, Yrd=0.0, Zwd=yvd, Zqd=0.0, Kpd=kpd, Mwd=0.0, Mqd=mqd, Nvd=0.0, Nrd=mqd,
+            Xuu=-pressure * c_d * frontal, Xwq=yvd, Xqq=0.0, Xvr=-yvd, Xrr=0.0,
+            Yvv=cross, Yrr=-x * abs(x) * fin_drag, Yuv=-lift - f, Yur=xud - f * x, Ywp=-yvd, Ypq=0.0, Yuudr=f,
+            Zww=cross, Zqq=x * abs(x) * fin_drag, Zuw=-lift - f, Zuq=-xud + f * x, Zvp=yvd, Zrp=0.0, Zuuds=-f,
+            Kpp=-fin_drag * sizes.fin_arm**3, Kup=-2 * f * sizes.fin_arm**2,
+            Mww=-x * fin_drag, Mqq=turning, Muw=munk + x_lift * lift + x * f, Muq=-f * x**2, Mvp=0.0,
+            Mrp=kpd - mqd, Muuds=x * f,
+            Nvv=x * fin_drag, Nrr=turning, Nuv=-munk - x_lift * lift - x * f, Nur=-f * x**2, Nwp=0.0,
+            Npq=mqd - kpd, Nuudr=x * f,
+        )
+    )  # fmt: skip
+
+
+SEGOROGENI_SIZES = Sizes(
+    mass=15.0,
+    length=0.98,
+    diameter=0.188,
+    density=1025.0,
+    gravity_below=0.02,
+    axial_drag=0.20,
+    fin_area=0.0053,
+    fin_place=-0.42,
+    fin_arm=0.087,
+)
+"""Segorogeni ITS. Ngatini and Nurhadi (2019), table I, print mass, length, and a beam that is taken as diameter.
+
+Not printed, and assumed here: sea water, neutral buoyancy; z_G = 0.02 m (REMUS has 0.0196); c_d = 0.20, which
+Sgarioto and others use for REMUS; fins of LAUV's 0.0064 m^2 scaled by (0.98/1.08)^2, at 0.86 of the half length
+from the middle, between LAUV's 0.74 and REMUS's 0.96; the fin's arm is the hull's radius there and half of its
+span. The stability margin hinges on the fins: it vanishes at 0.0037 m^2. A spheroid of these sizes displaces
+18.6 kg, the vehicle has 15 kg: added masses are those of 15 kg.
+"""
+
+SEGOROGENI = recipe(SEGOROGENI_SIZES)
+"""Segorogeni by the recipe, with the damping of roll by its fins."""
+
+SEGOROGENI_PAPERS = SEGOROGENI._replace(Kup=0.0)
+"""The same with the papers' terms alone: at 1 m/s it rolls with a period of 0.94 s that takes 33 s to decay."""
+
+REMUS_SIZES = Sizes(
+    mass=30.48,
+    length=1.33,
+    diameter=0.191,
+    density=1030.0,
+    gravity_below=0.0196,
+    axial_drag=None,
+    fin_area=0.00665,
+    fin_place=-0.638,
+    fin_arm=0.131,
+)
+"""REMUS 100 as Prestero (2001) has it; the axial drag by his formula."""
+
+REMUS100 = recipe(REMUS_SIZES)
+"""REMUS 100 by the recipe: the lift of both fins of a pair makes it stable on a straight course."""
+
+REMUS100_PRESTERO = VehicleParameters(
+    m=30.48, W=299.0, B=299.0, xG=0.0, yG=0.0, zG=0.0196, Ix=0.177, Iy=3.45, Iz=3.45,
+    Xud=-0.93, Yvd=-35.5, Yrd=1.93, Zwd=-35.5, Zqd=-1.93, Kpd=-0.0704, Mwd=-1.93, Mqd=-4.88, Nvd=1.93, Nrd=-4.88,
+    Xuu=-1.62, Xwq=-35.5, Xqq=-1.93, Xvr=35.5, Xrr=-1.93,
+    Yvv=-131.0, Yrr=0.632, Yuv=-28.6, Yur=5.22, Ywp=35.5, Ypq=1.93, Yuudr=9.64,
+    Zww=-131.0, Zqq=-0.632, Zuw=-28.6, Zuq=-5.22, Zvp=-35.5, Zrp=1.93, Zuuds=-9.64,
+    Kpp=-0.13, Kup=0.0,
+    Mww=3.18, Mqq=-9.4, Muw=24.0, Muq=-2.0, Mvp=-1.93, Mrp=4.86, Muuds=-6.15,
+    Nvv=-3.18, Nrr=-9.4, Nuv=-24.0, Nur=-2.0, Nwp=-1.93, Npq=-4.86, Nuudr=-6.15,
+)  # fmt: skip
+"""REMUS 100 as printed by Prestero (2001); unstable on a straight course, so data to compare with.
+
+Public files disagree: Yvv and Zww are -131 or -1310, Mqq -9.4 or -188, Nrr -9.4 or -94. Strips give -117 and
+-6.6, so the first of each pair is taken.
+"""
+
+_LAUV_FINS = 2 * 0.5 * 1028.0 * 0.0064 * 3.0  # lift of a pair over u^2 times its angle: density, area, slope
+
+LAUV = VehicleParameters(
+    m=18.0, W=18.0 * GRAVITY, B=1028.0 * 0.017551374956865266 * GRAVITY, xG=0.0, yG=0.0, zG=0.01,
+    Ix=0.5 * 18.0 * 0.075**2, Iy=18.0 / 12 * (3 * 0.075**2 + 1.08**2), Iz=18.0 / 12 * (3 * 0.075**2 + 1.08**2),
+    Xud=-1.0, Yvd=-16.0, Yrd=0.0, Zwd=-16.0, Zqd=0.0, Kpd=-0.005, Mwd=0.0, Mqd=-1.3, Nvd=0.0, Nrd=-1.3,
+    Xuu=-2.4, Xwq=-16.0, Xqq=0.0, Xvr=16.0, Xrr=0.0,
+    Yvv=-80.0, Yrr=0.3, Yuv=-_LAUV_FINS, Yur=-1.0 + 0.4 * _LAUV_FINS, Ywp=16.0, Ypq=0.0, Yuudr=_LAUV_FINS,
+    Zww=-80.0, Zqq=-0.3, Zuw=-_LAUV_FINS, Zuq=1.0 - 0.4 * _LAUV_FINS, Zvp=-16.0, Zrp=0.0, Zuuds=-_LAUV_FINS,
+    Kpp=-0.0006, Kup=-2 * _LAUV_FINS * 0.04**2,
+    Mww=1.5, Mqq=-9.1, Muw=15.0 - 0.4 * _LAUV_FINS, Muq=-(0.4**2) * _LAUV_FINS, Mvp=0.0, Mrp=1.295,
+    Muuds=-0.4 * _LAUV_FINS,
+    Nvv=-1.5, Nrr=-9.1, Nuv=-15.0 + 0.4 * _LAUV_FINS, Nur=-(0.4**2) * _LAUV_FINS, Nwp=0.0, Npq=-1.295,
+    Nuudr=-0.4 * _LAUV_FINS,
+    Xu=-2.4, Yv=-23.0, Yr=11.5, Zw=-23.0, Zq=-11.5, Kp=-0.3, Mw=3.1, Mq=-9.7, Nv=-3.1, Nr=-9.7,
+)  # fmt: skip
+"""LAUV as the Gazebo simulation lauv_gazebo (Apache-2.0) has it, its linear damping included.
+
+Mass, inertia, volume, added mass and damping are that file's. The products of velocities that come with the added
+mass (Munk's moment among them) follow from it; the fins lift with a slope of 3 at x = -0.4 m, 0.04 m off the axis.
+The hull's lift is not apart there: it is in the linear damping. gym-auv has the same damping, and an added mass
+from Lamb's factors with e = 1 - (b/a)^2, of which the root is forgotten. Coefficients hold about the centre of
+gravity there, and about the centre of buoyancy 1 cm above it here.
+"""
+
+PRESETS: dict[str, VehicleParameters] = {
+    "segorogeni": SEGOROGENI,
+    "segorogeni_papers": SEGOROGENI_PAPERS,
+    "remus100": REMUS100,
+    "remus100_prestero": REMUS100_PRESTERO,
+    "lauv": LAUV,
+}
+
+
+def preset_parameters(preset: str | Mapping | VehicleParameters) -> VehicleParameters:
+    """Parameters from a preset's name, a mapping of all fields, or parameters; ValueError otherwise."""
+    if isinstance(preset, VehicleParameters):
+        return checked(preset)
+    if isinstance(preset, Mapping):
+        return parameters_of(preset)
+    return PRESETS[one_of("preset", preset, tuple(PRESETS))]

@@ -25,16 +25,14 @@ from thruster_env.render.canvas import (
     SIZE,
     SOFT_INK,
     WHITE,
-    Canvas,
-    number,
-)
-from thruster_env.render.charts import (
     Axis,
+    Canvas,
     Charts,
     Strip,
     draw_gauge,
     draw_gauge_frames,
     newest,
+    number,
     round_up,
     runs,
 )

@@ -6,16 +6,27 @@ scalars, on NumPy arrays and inside numba. Source: Salmon, Moraes, Dror, Shaw (2
 numbers: as easy as 1, 2, 3"; normals by Box and Muller (1958).
 
 Source: Johnson, Kotz, Balakrishnan (1994), Continuous Univariate Distributions, volume 1, section 13.10.1.
+
+Episode keys of a vector env: copy i gets the keys that a single env with its seed would draw. Generators of
+foreign code: the global ones of Python, NumPy and torch, and those that objects hold.
 """
 
 from __future__ import annotations
 
+import copy
 import math
+import random
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from thruster_env.core.checks import options as checked_options
+from thruster_env.core.checks import seed as checked_seed
+from thruster_env.core.checks import short_repr
 from thruster_env.core.compiled import inlined, overloaded, when_compiling
 
 # The normal distribution, for compiled code.
@@ -391,3 +402,156 @@ def filter_generator(seed: int | None) -> np.random.Generator:
 def filter_keys(seeds) -> np.ndarray:
     """Keys, shape (len(seeds), 2), of a filter wrapper's first episode after `reset(seed=s)` for s in seeds."""
     return np.array([draw_key(filter_generator(int(seed))) for seed in seeds])
+
+
+KEYS_AHEAD = 16  # that a copy draws at a time: a call of its generator costs more than a step
+
+
+def _of_env(seed: int | None) -> np.random.Generator:
+    from gymnasium.utils.seeding import np_random
+
+    return np_random(seed)[0]
+
+
+class EpisodeKeys:
+    """The keys that each copy's own generator draws, one an episode."""
+
+    def __init__(self, count: int, make_generator: Callable[[int | None], np.random.Generator] = _of_env):
+        self._make_generator = make_generator
+        self._generators: list[np.random.Generator | None] = [None] * count
+        self._ahead = np.zeros((count, KEYS_AHEAD, 2))
+        self._used = np.full(count, KEYS_AHEAD)
+        self.seeded = False  # whether all copies have generators: asked at every step, so it is remembered
+
+    @property
+    def count(self) -> int:
+        """Number of copies."""
+        return len(self._generators)
+
+    def seed(self, seed: int | list[int | None] | None, mask: np.ndarray) -> None:
+        """Give copy i of those in the mask a generator from seed + i, or seed[i]; None keeps the one it has."""
+        seeds = self.seeds(seed)
+        for i in np.flatnonzero(mask):
+            if seeds[i] is not None or self._generators[i] is None:
+                self._generators[i] = self._make_generator(seeds[i])
+                self._used[i] = KEYS_AHEAD
+        self.seeded = None not in self._generators
+
+    def seeds(self, seed) -> list[int | None]:
+        """The seed of each copy; ValueError unless a reset's seed is None, a number, or one of these a copy."""
+        count = self.count
+        if isinstance(seed, (list, tuple)) or (isinstance(seed, np.ndarray) and seed.ndim == 1):
+            if len(seed) != count:
+                raise ValueError(f"seed must be None, a number or {count} of these, but got {short_repr(seed)}")
+            return [checked_seed(entry) for entry in seed]
+        first = checked_seed(seed)
+        return [None if first is None else first + i for i in range(count)]
+
+    def draw(self, which: np.ndarray) -> np.ndarray:
+        """The next key (len(which), 2) of some copies."""
+        for i in which[self._used[which] == KEYS_AHEAD]:
+            self._ahead[i] = draw_keys(self._generators[i], KEYS_AHEAD)
+            self._used[i] = 0
+        keys = self._ahead[which, self._used[which]]
+        self._used[which] += 1
+        return keys
+
+
+def reset_mask(options: Mapping | None, keys: EpisodeKeys) -> np.ndarray | None:
+    """The copies that a reset's options restart, (count,) booleans; None for all.
+
+    Raises ValueError for other options, and for a mask that leaves out copies that have never been reset.
+    """
+    mask, count = checked_options(options).get("reset_mask"), keys.count
+    if mask is None:
+        return None
+    try:
+        chosen = np.asarray(mask)
+    except ValueError:  # rows of different lengths
+        chosen = np.empty(0)
+    if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
+        rule = f"reset_mask must be {count} booleans, at least one of them true"
+        raise ValueError(f"{rule}, but got {short_repr(mask)}")
+    if not keys.seeded and not chosen.all():
+        raise ValueError(f"reset_mask must have all copies at the first reset, but got {short_repr(mask)}")
+    return chosen.copy()
+
+
+HELD = (np.random.Generator, np.random.RandomState, random.Random)
+
+
+class GlobalGenerators:
+    """The global generators' states for one owner, unaffected by draws of others in between.
+
+    Before `seed`, `used` leaves them alone. torch is seeded where it has been imported by then, on the CPU.
+    """
+
+    def __init__(self):
+        self._states: tuple | None = None
+        self._within = False
+
+    def seed(self, seed: int) -> None:
+        """Start from a seed below 2^32; the global generators stay as they are."""
+        before = _states()
+        random.seed(seed)
+        np.random.seed(seed)
+        torch = _torch()
+        if torch is not None:
+            torch.default_generator.manual_seed(seed)
+        self._states = _states()
+        if not self._within:
+            _set(before)
+
+    @contextmanager
+    def used(self) -> Iterator[None]:
+        """Within this context the global generators are the owner's; afterwards they are as before."""
+        if self._within or self._states is None:
+            yield
+            return
+        before, self._within = _states(), True
+        _set(self._states)
+        try:
+            yield
+        finally:
+            self._states, self._within = _states(), False
+            _set(before)
+
+    def __deepcopy__(self, memo) -> GlobalGenerators:
+        """An independent copy; states may be shared because they are never written into."""
+        other = GlobalGenerators()
+        other._states = self._states
+        return other
+
+
+def _torch() -> Any:
+    torch: Any = sys.modules.get("torch")
+    return torch if hasattr(torch, "default_generator") else None
+
+
+def _states() -> tuple:
+    torch = _torch()
+    return random.getstate(), np.random.get_state(), None if torch is None else torch.get_rng_state()
+
+
+def _set(states: tuple) -> None:
+    pythons, numpys, torchs = states
+    random.setstate(pythons)
+    np.random.set_state(numpys)
+    torch = _torch()
+    if torchs is not None and torch is not None:
+        torch.set_rng_state(torchs)
+
+
+def seeded_copy(original: Any, seed: int) -> Any:
+    """A deep copy of an object, in which each generator of Python and NumPy gets a new seed."""
+    memo: dict = {}
+    duplicate = copy.deepcopy(original, memo)
+    generators = (part for part in memo.values() if isinstance(part, HELD))
+    for number, generator in enumerate({id(generator): generator for generator in generators}.values()):
+        generator_seed = derived_seed(seed, HELD_GENERATORS, number)
+        if isinstance(generator, np.random.Generator):
+            kind: Any = type(generator.bit_generator)
+            generator.bit_generator.state = kind(generator_seed).state
+        else:
+            generator.seed(generator_seed)
+    return duplicate

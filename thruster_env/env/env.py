@@ -16,11 +16,10 @@ from gymnasium.vector.utils import batch_space
 
 from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.checks import seed as checked_seed
-from thruster_env.core.direct import direct
-from thruster_env.core.keys import EpisodeKeys, reset_mask
+from thruster_env.core.compiled import direct
 from thruster_env.core.memory import REWARD, TERMINATED, TIME
 from thruster_env.core.sources import written_out
-from thruster_env.core.streams import draw_key
+from thruster_env.core.streams import EpisodeKeys, draw_key, reset_mask
 from thruster_env.env.commands import of_copies, one_number, some_numbers
 from thruster_env.env.copies import PlantCopies
 from thruster_env.env.plant_data import as_json

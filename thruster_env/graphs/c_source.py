@@ -16,7 +16,7 @@ import numpy as np
 
 from thruster_env.graphs.folding import as_single
 from thruster_env.graphs.graphs import COMPARISONS, CONDITIONS, Number
-from thruster_env.graphs.loops import Cut
+from thruster_env.graphs.instructions import Cut
 from thruster_env.graphs.programs import CALLED_IN_ROUNDS, Place, Program
 
 OF_TWO = {name: name for name in ("+", "-", "*", "/", *COMPARISONS)} | {"and": "&&", "or": "||"}

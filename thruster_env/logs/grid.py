@@ -20,6 +20,11 @@ time.
 A row is a time at which any channel has a sample; a channel's clock offset is subtracted from its stamps first.
 The first row has the first stamp of the file, and what was sampled before it or after the last one is left out.
 Inputs are held from sample to sample, before the first at its value. Nothing is moved, averaged or interpolated.
+
+Time stamps: when two of them are one, and the steps of a model from one to the next.
+
+Stamps are rounded: float64 leaves 2.4e-7 s of seconds since 1970, and a recorder that writes milliseconds leaves
+1 ms. A step that is longer than the sample time by no more than that is one step.
 """
 
 from __future__ import annotations
@@ -32,11 +37,44 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.core.angles import wrapped
-from thruster_env.core.stamps import closeness, resolution_of
 from thruster_env.logs.columns import converted, parted
 
+SAME_STAMP = 1e-9  # of a sample time: two stamps that are no further apart are one
+ROUNDING = 1e-6  # of a sample time: so much longer it is still one step
+MOST_STEPS = 1_000_000  # from one stamp to the next; some seconds of an extended filter
+
+
+def resolution_of(latest: float, resolution: float = 0.0) -> float:
+    """The largest difference [s] that rounding makes between stamps up to the latest one.
+
+    Args:
+        latest: the stamp of the largest size [s].
+        resolution: that of the recorder [s]; float64's counts where it is coarser.
+    """
+    return max(resolution, 2.0 * math.ulp(latest))
+
+
+def closeness(dt: float, resolution: float) -> float:
+    """How far two stamps may be apart to be one [s], for a sample time dt [s] and their resolution [s]."""
+    return max(SAME_STAMP * dt, resolution)
+
+
+def count_steps(length: float, dt: float, resolution: float) -> int:
+    """How many equal steps of at most dt [s] a time [s] is divided into, for stamps of some resolution [s].
+
+    Both the time and dt, which is often read off stamps, are rounded.
+
+    Raises ValueError for more than MOST_STEPS, as after a clock was set.
+    """
+    count = length / dt - max(ROUNDING, 2.0 * resolution / dt)
+    if not count <= MOST_STEPS:
+        rule = f"two successive stamps must be at most {MOST_STEPS} steps of {dt:g} s apart"
+        raise ValueError(f"{rule}, but are {length:.9g} s: after a gap or a clock that was set start anew")
+    return max(1, math.ceil(count))
+
+
 TOLERANCE = 0.1  # of the sample time: stamps so close to a multiple of it are it
-CLOSE = 1e-9  # in steps: rounding
+CLOSE_TO_GRID = 1e-9  # in steps: rounding
 MOST_DIGITS = 9  # of a sample time
 MOST_HELD = 5  # missing rows in a row over which an input is held; more are a gap
 SURE = 4.0  # standard errors of a sample time within which it is rounded
@@ -129,7 +167,7 @@ def _rounded(period: float, spread: float) -> float:
     """A sample time with no more digits than it is known to."""
     for digits in range(1, MOST_DIGITS):
         short = float(f"{period:.{digits}g}")
-        if abs(short - period) <= SURE * spread + CLOSE * period:
+        if abs(short - period) <= SURE * spread + CLOSE_TO_GRID * period:
             return short
     return float(f"{period:.{MOST_DIGITS}g}")
 
@@ -188,7 +226,7 @@ def mean_held(series: Series, dt: float, steps: int, offset: float = 0.0, angle:
 
 def _lies_on_grid(times: np.ndarray) -> bool:
     """Whether times in steps are whole numbers up to rounding."""
-    return bool((abs(times - np.round(times)) <= CLOSE * np.maximum(1.0, abs(times))).all())
+    return bool((abs(times - np.round(times)) <= CLOSE_TO_GRID * np.maximum(1.0, abs(times))).all())
 
 
 # A log's rows at the times of its samples, without a grid.

@@ -10,10 +10,9 @@ from functools import cached_property
 import numpy as np
 
 from thruster_env.core.checks import as_floats, finite, positive, short_repr
-from thruster_env.core.stamps import resolution_of
 from thruster_env.logs.columns import INPUT, MEASUREMENT, STATE
 from thruster_env.logs.findings import STALE, Finding, Recording, Remark, found_in
-from thruster_env.logs.grid import CLOSE, Series, mean_held, sampled, time_text
+from thruster_env.logs.grid import CLOSE_TO_GRID, Series, mean_held, resolution_of, sampled, time_text
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -270,7 +269,7 @@ def stale_inputs(inputs: Mapping[str, Series], end: float, dt: float, start: flo
     remarks = []
     for key, samples in inputs.items():
         name, last = key.partition(":")[2], float(samples.times[-1])
-        if last <= CLOSE * dt:
+        if last <= CLOSE_TO_GRID * dt:
             text = f"{name} has no sample after the first row: it is held at {samples.values[-1]:.6g} in all rows"
             remarks.append(Remark(STALE, key, text))
         elif end - last > max(LONG * end, LONGER * float(np.diff(samples.times).max(initial=dt))):

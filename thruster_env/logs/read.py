@@ -36,8 +36,7 @@ from thruster_env.logs.grid import (
     sampled,
 )
 from thruster_env.logs.log import FEWEST_STEPS, Log, stale_inputs
-from thruster_env.logs.recorders.merged import Recorded
-from thruster_env.logs.recorders.registry import check_stamps, format_of
+from thruster_env.logs.recorders.registry import Recorded, check_stamps, format_of
 from thruster_env.logs.table import Table, read_table, table_of
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -105,7 +104,7 @@ def read_log(
         grid: whether samples are put on a grid; else rows are the times of samples
             (`thruster_env.logs.grid`), and `dt` is the sample time to which covariances belong.
         stamps: of a bag, the clock of all topics: "header" or "receipt"; by default that of the headers if all
-            topics have stamps of one clock (`thruster_env.logs.recorders.one_clock`).
+            topics have stamps of one clock (`thruster_env.logs.recorders.bags`).
         name: of a log that is not a file.
 
     Raises:

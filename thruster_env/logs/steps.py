@@ -18,8 +18,8 @@ from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import tuple_of, written_out
-from thruster_env.core.stamps import count_steps
 from thruster_env.logs.findings import Recording
+from thruster_env.logs.grid import count_steps
 from thruster_env.logs.log import Log
 from thruster_env.model.continuous import same_dt
 from thruster_env.model.quantities import Quantity

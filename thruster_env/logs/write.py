@@ -11,9 +11,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thruster_env.core.checks import as_floats
-from thruster_env.core.files import write_whole
+from thruster_env.core.files import (
+    BLUE,
+    DARK,
+    MUSTARD,
+    PLUM,
+    RUST,
+    WINE,
+    new_figure,
+    save_figure,
+    thinned,
+    tidy,
+    write_whole,
+)
 from thruster_env.core.modules import to_install
-from thruster_env.core.plots import BLUE, DARK, MUSTARD, PLUM, RUST, WINE, new_figure, save_figure, thinned, tidy
 from thruster_env.logs.columns import TIME_NAMES, parted, plain, suffix
 from thruster_env.logs.findings import GAP, OUTLIER, SATURATED, STUCK, outliers
 from thruster_env.logs.grid import digits_for

@@ -23,9 +23,8 @@ from thruster_env.core.checks import (
     vector,
 )
 from thruster_env.core.compiled import inlined
-from thruster_env.core.derivatives import jacobian
+from thruster_env.core.derivatives import jacobian, runge_kutta
 from thruster_env.core.equal_functions import makes_functions
-from thruster_env.core.integration import runge_kutta
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.model.state_space import StateSpaceModel
 

@@ -17,8 +17,7 @@ from gymnasium.error import DependencyNotInstalled
 from thruster_env.core.checks import one_of, positive
 from thruster_env.core.files import check_target, write_whole
 from thruster_env.core.modules import to_install
-from thruster_env.render.canvas import SIZE
-from thruster_env.render.charts import History
+from thruster_env.render.canvas import SIZE, History
 
 if TYPE_CHECKING:
     import pygame

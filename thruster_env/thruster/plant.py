@@ -37,9 +37,10 @@ from thruster_env.thruster.parameters import (
     PRESETS,
     ThrusterParameters,
     derive_constants,
+    is_file,
     preset_and_dead_band,
+    read_preset,
 )
-from thruster_env.thruster.preset_file import is_file, read_preset
 
 DEFAULT_DT = 0.01  # [s], the sample time of the published experiments
 DEFAULT_MAX_VOLTAGE = 24.0  # [V]

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.render.canvas import (
+    ABSURD,
     BAND,
     ESTIMATE,
     INK,
@@ -30,11 +31,16 @@ from thruster_env.render.canvas import (
     SIZE,
     SOFT_INK,
     WHITE,
+    Axis,
     Canvas,
+    Charts,
+    Strip,
+    draw_gauge,
+    draw_gauge_frames,
+    newest,
     number,
     with_band,
 )
-from thruster_env.render.charts import ABSURD, Axis, Charts, Strip, draw_gauge, draw_gauge_frames, newest
 from thruster_env.render.renderer import PlantRenderer
 
 # Contents of a picture: the truth at each step, and the estimate of a filter.
@@ -161,7 +167,7 @@ class Scene:
         self._gear_ratio = gear_ratio
         self._thrust_scale = thrust_scale
         self._flow_scale = flow_scale
-        from thruster_env.thruster.propeller import end_view, side_view  # which import pygame
+        from thruster_env.thruster.dynamics import end_view, side_view
 
         self._side = side_view(PROPELLER_RADIUS)
         self._end = end_view(PORTHOLE_RADIUS - 4)

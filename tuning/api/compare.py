@@ -14,11 +14,11 @@ import numpy as np
 from filters.consistency.intervals import Interval, slightly
 from filters.estimators.find import label_of
 from filters.filter import Filter
-from filters.logs.figure import colour_of
+from filters.logs.findings import colour_of
 from filters.registry import filter_type
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import at_least, short_repr
-from thruster_env.core.plots import panels
+from thruster_env.core.files import panels
 from thruster_env.core.text_tables import TITLE, plain_text, verbatim
 from tuning.api.evaluate import NOMINAL
 from tuning.api.held_out import cells_of
@@ -29,18 +29,22 @@ from tuning.api.study import DEFAULT_FILTER, Study, is_own, user_choice
 from tuning.evaluation.baselines import OWN
 from tuning.evaluation.compare import (
     DEFAULT_FILTERS,
+    OF_FILE,
+    OF_FILTER,
+    STUDY,
+    STUDY_TRIALS,
     Contender,
     Leaderboard,
     Row,
     contender,
     default_filters,
     fitting,
+    noise_sentence,
     sized,
     winners,
 )
 from tuning.evaluation.compare import compare as compare_all
 from tuning.evaluation.evaluate import restart_sentences
-from tuning.evaluation.knowledge import OF_FILE, OF_FILTER, STUDY, STUDY_TRIALS, noise_sentence
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.assumed import Unknowns, constants_in, suited, unknowns_of
 from tuning.problems.problem import Problem
@@ -295,7 +299,7 @@ def run_comparison(
         seed: of the study to which the held-out seeds belong.
         seeds: number of held-out seeds.
         console: where progress is shown.
-        knows: the Q and R of named filters, as `tuning.evaluation.knowledge.KNOWS` explains; None for the default.
+        knows: the Q and R of named filters, as `tuning.evaluation.compare.KNOWS` explains; None for the default.
         trials: of the study if filters know that; if given, they do.
         unknown: constants that filters also estimate in a second row.
         sizes: ensemble size by name; under None that of all others.

@@ -114,14 +114,14 @@ class LogEstimates:
 
     def plot_states(self) -> Figure:
         """Estimates of states and outputs over time beside the references, and the innovations below."""
-        from filters.logs.figure import draw_log
+        from filters.logs.findings import draw_log
 
         smoothed = ", smoothed," if self.found.smoothed else ""
         return drawn(draw_log(self.found, f"{self.filter.name}{smoothed} on {Path(self.log.name).name}"))
 
     def plot_innovations(self) -> Figure:
         """Innovations of each channel over time, in the 95 % band that the filter expects."""
-        from filters.logs.figure import draw_log
+        from filters.logs.findings import draw_log
 
         return drawn(draw_log(self.found, f"{self.filter.name} on {Path(self.log.name).name}", states=False))
 

@@ -12,8 +12,8 @@ from rich.table import Table
 
 from filters.consistency.intervals import Interval
 from filters.filter import Filter
-from filters.logs.figure import colour_of
-from thruster_env.core.plots import panels
+from filters.logs.findings import colour_of
+from thruster_env.core.files import panels
 from thruster_env.core.text_tables import plain_text, table, verbatim
 from tuning.api.progress import about, drawn, frame, html, number
 from tuning.evaluation.baselines import ORACLE

@@ -21,7 +21,7 @@ from tuning.identification.identify import identify as identify_runs
 from tuning.identification.objective import Objective
 from tuning.identification.profiles import Validation, fall_sentence, profile_figure, profiles, validate
 from tuning.identification.result import Identification
-from tuning.logs.identify import AnyStepFamily, check_offsets, family_of, remarks, split_runs, write_found
+from tuning.logs.problem import AnyStepFamily, check_offsets, family_of, remarks, split_runs, write_found
 from tuning.logs.read import model_of_logs
 from tuning.problems.parameter import Coordinates, Parameter
 
@@ -267,7 +267,7 @@ def identified(
     """Check the request, search with progress, and validate, as `thruster identify` does.
 
     Args:
-        family: from `tuning.logs.identify.family_of`.
+        family: from `tuning.logs.problem.family_of`.
         runs: for identification.
         proving: for validation; if there are none, `runs` are used.
         ranges: of some free parameters.

@@ -28,10 +28,9 @@ from rich.text import Text
 
 from filters.consistency.intervals import Interval, span
 from filters.estimators.find import label_of
-from thruster_env.core.checks import short_repr
+from thruster_env.core.checks import listening, short_repr
 from thruster_env.core.modules import to_install
-from thruster_env.core.progress import listening
-from tuning.evaluation.knowledge import TUNING
+from tuning.evaluation.compare import TUNING
 from tuning.search.study import STOPPING
 
 if TYPE_CHECKING:

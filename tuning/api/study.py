@@ -213,7 +213,7 @@ class Study:
         return "\n\n".join([*([first] if first else []), repr(self), *tables])
 
     def _repr_html_(self) -> str:
-        from tuning.reporting.units import number_rows
+        from tuning.reporting.choice_words import number_rows
 
         held_out = self.held_out
         rows = number_rows(list(held_out.choices.values()), self.choice.name, self.problem, _text)

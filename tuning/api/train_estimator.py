@@ -15,9 +15,8 @@ from filters.estimators.find import TRAINED
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.learned import check_installed
-from thruster_env.core.checks import at_least, one_of, positive
+from thruster_env.core.checks import at_least, listening, one_of, positive
 from thruster_env.core.files import check_target
-from thruster_env.core.progress import listening
 from tuning.api.problems import problem_of
 from tuning.api.progress import console_for
 from tuning.api.run import file_name

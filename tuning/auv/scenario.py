@@ -19,15 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from filters.bounds import path_bound
-from filters.wrapped import wrapped_variances
-from thruster_env.auv.channels import MAX_CHANNELS, STATES
+from filters.bounds import path_bound, wrapped_variances
 from thruster_env.auv.model import MODELS, model_of_plant, state_range
 from thruster_env.auv.paths import MANOEUVRES
 from thruster_env.auv.plant import (
     DEFAULT_DT,
     DEFAULT_PROCESS_NOISE,
     DEFAULT_PROPELLER_TORQUE,
+    MAX_CHANNELS,
+    STATES,
     Plant,
     check_same_plant,
     make_plant,

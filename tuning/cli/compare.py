@@ -16,8 +16,7 @@ from tuning.api.compare import INTERRUPTED, left_out_lines, run_comparison
 from tuning.cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
 from tuning.cli.output import announce_compilation, emit, progress_console
 from tuning.cli.problems import PROBLEMS
-from tuning.evaluation.compare import DEFAULT_FILTERS, MOST_STATES
-from tuning.evaluation.knowledge import KNOWS
+from tuning.evaluation.compare import DEFAULT_FILTERS, KNOWS, MOST_STATES
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.assumed import unknown_in
 from tuning.problems.find import find_problem

@@ -23,7 +23,7 @@ from tuning.cli.tuning_report import as_json
 from tuning.evaluation.baselines import NOISE, ORACLE, TUNED, baselines, same_filter
 from tuning.evaluation.evaluate import score_ratio
 from tuning.problems.problem import score_label
-from tuning.reporting.error_tables import above_bound, consistency_cells
+from tuning.reporting.leaderboard import above_bound, consistency_cells
 from tuning.reporting.report import Report, write_report
 from tuning.reporting.search_figures import comparison_figure, history_figure
 from tuning.reporting.time_figures import estimates_figure

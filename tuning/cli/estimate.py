@@ -25,19 +25,20 @@ from filters.logs.findings import (
 )
 from thruster_env.core.text_tables import table
 from thruster_env.logs.write import check_suffix, write_columns
-from tuning.cli.log_options import GridOptions, with_groups
 from tuning.cli.options import (
     A_LOG,
     FILTER,
     FILTER_HELP,
     OUTPUT,
     RUNS,
+    GridOptions,
     JsonOption,
     MonitorOption,
     SeedOption,
     asked_monitor,
     filter_option,
     one_file,
+    with_groups,
 )
 from tuning.cli.output import announce_compilation, check_picture, check_targets, emit
 from tuning.logs.read import as_tuned, read_named
@@ -131,7 +132,7 @@ def command(
     if out is not None:
         write_columns(out, columns_of(estimates, alarms), again=True)
     if plot is not None:
-        from filters.logs.figure import log_figure
+        from filters.logs.findings import log_figure
 
         log_figure(plot, estimates, f"{_title(estimates)} on {log.name}", alarms)
     files = [str(path) for path in (out, plot) if path is not None]

@@ -10,8 +10,7 @@ from rich.console import RenderableType
 
 from filters.consistency.intervals import rmse_ratios
 from filters.consistency.nees import SquaresCheck
-from filters.consistency.report import ConsistencyReport
-from filters.consistency.verdicts import MOST_STATES, comparison_sentence, sentences
+from filters.consistency.report import MOST_STATES, ConsistencyReport, comparison_sentence, sentences
 from filters.filter import Filter
 from filters.registry import filter_type
 from thruster_env.core.files import check_target
@@ -36,9 +35,9 @@ from tuning.cli.problems import PROBLEMS
 from tuning.cli.tables import choice_table
 from tuning.evaluation.baselines import GIVEN, ORACLE, TUNED, given_noise
 from tuning.evaluation.evaluate import check_consistency
-from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.summary import Comparison
 from tuning.problems.problem import Problem
-from tuning.reporting.error_tables import comparison_table
+from tuning.reporting.leaderboard import comparison_table
 from tuning.reporting.search_figures import consistency_figure
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice

@@ -17,13 +17,16 @@ import typer
 
 from tuning.api.evaluate import subject_of
 from tuning.api.explore import NEEDS
-from tuning.cli.log_options import BlockOptions, GridOptions, problems_of, with_groups
 from tuning.cli.options import (
     FILTER_HELP,
     INPUT,
     RUNS,
+    BlockOptions,
+    GridOptions,
     SeedOption,
     filter_option,
+    problems_of,
+    with_groups,
 )
 from tuning.cli.output import announce_compilation, working
 from tuning.cli.problems import PROBLEMS

@@ -15,25 +15,31 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from thruster_env.core.checks import finite, short_repr
-from thruster_env.core.plots import save_figure
+from thruster_env.core.files import save_figure
 from thruster_env.core.text_tables import table
 from thruster_env.logs.log import Log
-from thruster_env.thruster.logged import Recorder
-from thruster_env.thruster.parameters import ThrusterParameters, preset_parameters
+from thruster_env.thruster.model import Recorder
+from thruster_env.thruster.parameters import (
+    PresetFile,
+    ThrusterParameters,
+    is_file,
+    preset_parameters,
+    write_preset,
+)
 from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.preset_file import PresetFile, is_file, write_preset
 from tuning.api.identify import identified
-from tuning.cli.log_options import GridOptions, with_groups
 from tuning.cli.options import (
     A_LOG,
     FILTER,
     INPUT,
     OUTPUT,
     SEARCH,
+    GridOptions,
     HoldGapsOption,
     JsonOption,
     SeedOption,
     filter_option,
+    with_groups,
 )
 from tuning.cli.output import announce_compilation, check_picture, check_targets, emit, progress_console
 from tuning.experiments.bollard import FITTED, Identified, identify, read_table, relative_errors
@@ -41,7 +47,7 @@ from tuning.identification.identify import STARTS
 from tuning.identification.identify import identify as identify_logs
 from tuning.identification.profiles import Profile, Validation, fall_sentence, profile_figure, profiles
 from tuning.identification.result import Identification
-from tuning.logs.identify import family_of, remarks, split_runs, write_found
+from tuning.logs.problem import family_of, remarks, split_runs, write_found
 from tuning.logs.read import pairs, read_named
 from tuning.problems.parameter import Parameter
 from tuning.search.parameters import index_pairs

@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from thruster_env.core.checks import within
-from thruster_env.core.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from thruster_env.core.files import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.core.text_tables import table
 from thruster_env.thruster.linear.analysis import (
     INPUTS,
@@ -32,8 +32,8 @@ from thruster_env.thruster.linear.published import (
     PublishedLinearModel,
     published_for,
 )
+from thruster_env.thruster.parameters import is_file
 from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, Plant, make_plant
-from thruster_env.thruster.preset_file import is_file
 from tuning.cli.options import INPUT, OUTPUT, JsonOption, PresetOption
 from tuning.cli.output import check_picture, check_targets, emit, warn_beyond
 

@@ -20,16 +20,17 @@ from thruster_env.logs.findings import sentences
 from thruster_env.logs.grid import time_text
 from thruster_env.logs.log import Log
 from thruster_env.logs.recorders.bag_counts import METADATA
-from thruster_env.logs.recorders.one_clock import HEADER, RECEIPT
+from thruster_env.logs.recorders.bags import HEADER, RECEIPT
 from thruster_env.logs.recorders.registry import ENDINGS, Contents, Field, contents, format_of
 from thruster_env.logs.table import SUFFIXES, read_table
 from thruster_env.logs.write import check_suffix, write_log
-from tuning.cli.log_options import ReadingOptions, with_groups
 from tuning.cli.options import (
     A_LOG,
     INPUT,
     OUTPUT,
     JsonOption,
+    ReadingOptions,
+    with_groups,
 )
 from tuning.cli.output import check_picture, check_targets, emit
 from tuning.cli.printing import printed_whole

@@ -14,9 +14,9 @@ import numpy as np
 from rich.console import Console, RenderableType
 from rich.text import Text
 
+from thruster_env.core.checks import listening
 from thruster_env.core.compiled import tell_when_compiling
 from thruster_env.core.files import check_not_read, check_target, write_whole
-from thruster_env.core.progress import listening
 from thruster_env.core.text_tables import console
 from thruster_env.logs.recorders.registry import ENDINGS
 from thruster_env.logs.table import SUFFIXES

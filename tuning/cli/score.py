@@ -23,7 +23,7 @@ from tuning.policies.plants import plant_of
 from tuning.policies.setup import TrainingConfiguration, in_scenario
 from tuning.problems.data import held_out_seeds
 from tuning.problems.scenario import BaseScenario
-from tuning.reporting.error_tables import about, unless_blank
+from tuning.reporting.leaderboard import about, unless_blank
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.thruster.logs import of_preset
 

@@ -10,7 +10,7 @@ from rich.table import Table
 from thruster_env.core.text_tables import table
 from tuning.likelihood.gradient import GradientResult
 from tuning.problems.problem import Problem
-from tuning.reporting.units import number_rows
+from tuning.reporting.choice_words import number_rows
 from tuning.search.among_types import TypeResult
 from tuning.search.objectives import LIKELIHOOD, PROPER, reported, reported_name
 from tuning.search.parameters import index_pairs

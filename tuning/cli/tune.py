@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import typer
 
 from tuning.api.run import Tuning, aim_of, name_of, run_tuning, sampler_of, with_budget
-from tuning.cli.log_options import BlockOptions, GridOptions, problems_of, with_groups
 from tuning.cli.options import (
     FILTER,
     FILTER_HELP,
@@ -17,10 +16,14 @@ from tuning.cli.options import (
     OUTPUT,
     RUNS,
     SEARCH,
+    BlockOptions,
+    GridOptions,
     JsonOption,
     SeedOption,
     filter_option,
+    problems_of,
     spelt,
+    with_groups,
 )
 from tuning.cli.output import announce_compilation, check_targets, emit, progress_console
 from tuning.cli.problems import PROBLEMS

@@ -25,9 +25,8 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.blow_up import blow_up_on
 from tuning.evaluation.evaluate import likelihood_gain, score_ratio
-from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SIZE_TOLERANCE, left_out
-from tuning.evaluation.summary import numbers
+from tuning.evaluation.summary import Comparison, numbers
 from tuning.evaluation.tuned import consistency, metrics
 from tuning.evaluation.worth import memory_numbers, memory_sentence
 from tuning.likelihood.family import has_gradient
@@ -36,9 +35,8 @@ from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.logs.problem import model_named_in
 from tuning.problems.assumed import within
 from tuning.problems.plant_packages import built_in
-from tuning.reporting.choice_words import consistency_sentence, gains, model_doubts, residual_sentences
-from tuning.reporting.error_tables import comparison_table
-from tuning.reporting.units import apart
+from tuning.reporting.choice_words import apart, consistency_sentence, gains, model_doubts, residual_sentences
+from tuning.reporting.leaderboard import comparison_table
 from tuning.search.among_types import filter_types_tried
 from tuning.search.objectives import LIKELIHOOD, NIS_BAND, PROPER, reported, reported_name
 from tuning.search.parameters import index_pairs, size_ladder

@@ -22,7 +22,7 @@ from filters.consistency.intervals import (
 )
 from filters.consistency.report import ConsistencyReport, findings, joined, report_of
 from filters.consistency.time_constants import TimeConstants
-from filters.ensembles.rank_histogram import record_members
+from filters.ensembles.square_root import record_members
 from filters.filter import Filter
 from filters.starts import Restarts, restarts_of
 from thruster_env.model.quantities import Quantity

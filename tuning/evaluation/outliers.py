@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.consistency.nees import normalized_squares
-from filters.consistency.verdicts import rounded
+from filters.consistency.report import rounded
 from filters.filter import Filter
 from tuning.problems.assumed import within
 from tuning.problems.data import Data, estimates_in_parts

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters.bounds import ALL_UP_TO
 from filters.consistency.intervals import Interval
-from filters.posterior import ALL_UP_TO
-from thruster_env.core.progress import with_progress
+from thruster_env.core.checks import with_progress
 from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, score_ratio, values_of
 from tuning.problems.data import Data, estimates_in_parts
 from tuning.problems.problem import Problem

@@ -35,8 +35,15 @@ from thruster_env.core.files import write_whole
 from thruster_env.core.modules import is_code
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
-from tuning.evaluation.held_out import Comparison, evaluate_held_out
-from tuning.evaluation.summary import ROLES, comparison_as_data, sizes_as_data, summary, versions
+from tuning.evaluation.summary import (
+    ROLES,
+    Comparison,
+    comparison_as_data,
+    evaluate_held_out,
+    sizes_as_data,
+    summary,
+    versions,
+)
 from tuning.problems.assumed import augmented, name_and_unknown, suited
 from tuning.problems.find import find_given, find_problem, scenario_of
 from tuning.problems.plant_packages import built_in

@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from math import inf, isfinite, isnan
 
 from filters.consistency.intervals import Interval, slightly, span
+from filters.consistency.report import rounded
 from filters.consistency.time_constants import TimeConstants
-from filters.consistency.verdicts import rounded
 from tuning.evaluation.baselines import GIVEN, NO_RANGES, NOISE, ORACLE, RULE, SCALED, called
 from tuning.evaluation.evaluate import Evaluation, farthest, is_beyond
-from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.outliers import uneven_sentence
+from tuning.evaluation.summary import Comparison
 from tuning.problems.problem import Problem
 from tuning.search.forgetting import TOLERANCE
 

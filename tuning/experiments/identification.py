@@ -21,7 +21,7 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.logs.log import Log
 from thruster_env.model.simulate import simulate
-from thruster_env.thruster.logged import Recorder, logged_model
+from thruster_env.thruster.model import Recorder, logged_model
 from thruster_env.thruster.plant import make_plant
 from tuning.identification.identify import identify
 from tuning.identification.result import Identification

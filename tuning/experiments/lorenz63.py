@@ -32,8 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters import StateSpaceModel
-from thruster_env.core.derivatives import complex_step
-from thruster_env.core.integration import runge_kutta
+from thruster_env.core.derivatives import complex_step, runge_kutta
 from thruster_env.core.text_tables import markdown_table
 from tuning.experiments.benchmark import (
     RUNS,

@@ -38,10 +38,10 @@ from filters.bounds import riccati_covariances
 from filters.engine.batch import run
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.filter import Filter
-from filters.logs.figure import TRUTH, plot_style
+from filters.logs.findings import TRUTH, plot_style
 from thruster_env.core.checks import at_least, covariance_root, one_of, positive
+from thruster_env.core.files import new_figure, save_figure, tidy
 from thruster_env.core.matrices import zero_order_hold
-from thruster_env.core.plots import new_figure, save_figure, tidy
 from thruster_env.core.streams import COMPARISON_STUDY, derived_generator
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.simulate import Truth, simulate

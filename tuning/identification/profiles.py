@@ -16,7 +16,7 @@ from filters.engine.batch import Estimates
 from filters.starts import Starts, as_the_prior_says
 from thruster_env.core.angles import difference, on_one_branch
 from thruster_env.core.checks import one_of
-from thruster_env.core.plots import BLUE, DARK, RUST, panels
+from thruster_env.core.files import BLUE, DARK, RUST, panels
 from thruster_env.core.sources import as_value
 from thruster_env.core.text_tables import verbatim
 from thruster_env.logs.log import Log

@@ -20,8 +20,7 @@ from filters.engine.batch import run
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.learned import read_estimator
-from filters.learned.equations import Equations
-from filters.learned.estimator import LearnedEstimator, Scales, Track
+from filters.learned.estimator import Equations, LearnedEstimator, Scales, Track
 from filters.learned.file import LEARNED
 from filters.tensors.stages import density, factor
 from thruster_env.core.angles import wrapped_where

@@ -14,7 +14,7 @@ import numpy as np
 from filters.consistency.intervals import pooled_mean
 from filters.differentiated import recursion
 from filters.differentiated.runs import ModelSlopes, Truth
-from filters.likelihood import Likelihood
+from filters.sensitivity import Likelihood
 from thruster_env.core.checks import one_of
 from thruster_env.core.sources import is_array
 from thruster_env.model.state_space import StateSpaceModel

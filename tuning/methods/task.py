@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.likelihood import Likelihood
 from filters.registry import filter_type
+from filters.sensitivity import Likelihood
 from thruster_env.core.streams import METHOD_OF_TUNING, derived_generator
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import same_filter

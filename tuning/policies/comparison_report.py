@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from filters.logs.figure import colour_of
-from thruster_env.core.files import check_target, write_whole
-from thruster_env.core.plots import DARK, new_figure, save_figure, tidy
+from filters.logs.findings import colour_of
+from thruster_env.core.files import DARK, check_target, new_figure, save_figure, tidy, write_whole
 from thruster_env.core.text_tables import markdown_table, with_tables
 from tuning.policies.comparison import (
     BEST,

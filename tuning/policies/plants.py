@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.auv.channels import STATES
 from thruster_env.auv.control import DepthAndCourse
 from thruster_env.auv.env import SegorogeniAUVDepthEnv, SegorogeniAUVPathEnv
 from thruster_env.auv.model import MODEL_ARGUMENTS as AUV_MODEL_ARGUMENTS
 from thruster_env.auv.model import auv_model
-from thruster_env.auv.plant import CRUISE_SPEED
+from thruster_env.auv.plant import CRUISE_SPEED, STATES
 from thruster_env.auv.plant import Plant as VehiclePlant
 from thruster_env.auv.plant import make_plant as make_vehicle
 from thruster_env.core.checks import one_of

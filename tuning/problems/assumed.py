@@ -20,8 +20,8 @@ import gymnasium as gym
 import numpy as np
 
 from filters.augmented import Unknown, augmented_model
+from filters.consistency.report import estimable
 from filters.consistency.time_constants import Run
-from filters.consistency.verdicts import estimable
 from filters.tuned_file import AUGMENTED, NOISE, PRIOR
 from thruster_env.core.angles import on_one_branch
 from thruster_env.core.checks import at_least, one_of, positive, short_repr

@@ -7,9 +7,9 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from filters.posterior import gathering_code, posterior_variances, sequences_taken
+from filters.bounds import gathering_code, posterior_variances, sequences_taken
 from thruster_env.core.checks import short_repr
-from thruster_env.core.number_cache import cached_numbers
+from thruster_env.core.modules import cached_numbers
 from thruster_env.core.sources import as_value
 from thruster_env.model.quantities import Quantities, Quantity
 from thruster_env.model.state_space import StateSpaceModel

@@ -14,8 +14,7 @@ from filters.consistency.time_constants import Run
 from filters.engine.batch import Estimates, run
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
-from thruster_env.core.checks import at_least
-from thruster_env.core.progress import with_progress
+from thruster_env.core.checks import at_least, with_progress
 from thruster_env.core.threads import cores
 from thruster_env.model.shape import LANES
 

@@ -18,7 +18,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.core.global_generators import GlobalGenerators
+from thruster_env.core.streams import GlobalGenerators
 from thruster_env.core.user_functions import OURS, Made, as_made
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.problem import Problem

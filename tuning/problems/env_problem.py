@@ -12,7 +12,6 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 
 from thruster_env.core.checks import as_floats, covariance, covariance_root, short_repr
-from thruster_env.core.global_generators import GlobalGenerators
 from thruster_env.core.modules import error_line
 from thruster_env.core.streams import (
     ACTION_SPACE,
@@ -20,6 +19,7 @@ from thruster_env.core.streams import (
     GLOBAL_GENERATORS,
     POLICY,
     RANDOM_ACTIONS,
+    GlobalGenerators,
     derived_generator,
     derived_seed,
     draw_key,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from filters.baselines import OpenLoop
-from filters.posterior import has_bound
+from filters.bounds import has_bound
 from filters.starts import PRIOR as RUNS_PROBLEM_PRIOR
 from filters.tuned_file import NOISE, PRIOR
 from thruster_env.core.angles import difference
@@ -142,7 +142,7 @@ class ModelProblem(AssumedProblem):
         """The posterior Cramér-Rao bound of the truth on these inputs, (n,); NaN where its Q is singular.
 
         It is averaged over all inputs; for more than twelve states over as many as `posterior_variances` takes.
-        Of an angle it is that of wrapped errors (`filters.wrapped.wrapped_variances`).
+        Of an angle it is that of wrapped errors (`filters.bounds.wrapped_variances`).
         """
         return self._bound(data)
 

@@ -20,12 +20,12 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.engine.batch import Estimates
 from filters.filter import Filter
-from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
+from tuning.evaluation.summary import Comparison
 from tuning.problems.data import Data
+from tuning.reporting.choice_words import typeset
 from tuning.reporting.style import SCRIPT, STYLE
 from tuning.reporting.time_figures import one_run
-from tuning.reporting.units import typeset
 from tuning.search.objectives import reported, reported_name
 from tuning.search.trials import best_trial
 

@@ -18,10 +18,9 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.consistency.intervals import LEVELS, Interval
 from filters.consistency.nees import SquaresCheck
-from filters.consistency.report import ConsistencyReport
-from filters.consistency.verdicts import probability_text, rounded
-from filters.logs.figure import colour_of
-from thruster_env.core.plots import (
+from filters.consistency.report import ConsistencyReport, probability_text, rounded
+from filters.logs.findings import colour_of
+from thruster_env.core.files import (
     BLUE,
     DARK,
     GREEN,
@@ -37,8 +36,8 @@ from thruster_env.core.plots import (
 )
 from thruster_env.core.text_tables import TITLE, verbatim
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED
-from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
+from tuning.evaluation.summary import Comparison
 from tuning.reporting.page import Picture, figure_svg
 from tuning.reporting.time_figures import COLUMNS, plotted_states
 from tuning.search.objectives import SCORE, reported

@@ -13,15 +13,14 @@ from numpy import isfinite
 from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
 
-from filters.consistency.verdicts import rounded, sentences
+from filters.consistency.report import rounded, sentences
 from filters.registry import filter_type
 from thruster_env.core.sources import is_array
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import check_consistency, restart_sentences
-from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.summary import versions
+from tuning.evaluation.summary import Comparison, versions
 from tuning.evaluation.worth import all_warnings, memory_sentence, scaling_sentence, tuning_effect, without_truth
 from tuning.problems.assumed import within
 from tuning.problems.log_problem import LogProblem

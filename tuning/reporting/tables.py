@@ -7,14 +7,14 @@ from math import isnan
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from filters.consistency.verdicts import rounded
+from filters.consistency.report import rounded
 from tuning.evaluation.baselines import TUNED, Scaled, baseline_size, baselines
 from tuning.evaluation.evaluate import NOTHING
-from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.summary import Comparison
 from tuning.likelihood.identifiability import Identifiability
 from tuning.problems.problem import Problem
+from tuning.reporting.choice_words import number_rows, power_of_ten, scaled_unit
 from tuning.reporting.page import Table
-from tuning.reporting.units import number_rows, power_of_ten, scaled_unit
 from tuning.search.space import Choice
 
 MOST_ACROSS = 3  # errors of states and outputs side by side; more stand one below the other

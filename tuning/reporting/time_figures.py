@@ -12,9 +12,9 @@ import numpy as np
 
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
-from filters.logs.figure import MEASURED, TRUTH, colour_of
+from filters.logs.findings import MEASURED, TRUTH, colour_of
 from thruster_env.core.angles import with_breaks, wrapped, wrapped_where
-from thruster_env.core.plots import BLUE, GREY, RUST, new_figure, save_figure, thinned, tidy
+from thruster_env.core.files import BLUE, GREY, RUST, new_figure, save_figure, thinned, tidy
 from thruster_env.core.sources import as_value
 from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.model.quantities import Quantity

@@ -10,8 +10,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from filters.filter import Filter
+from filters.particles.kernels import WeightedFilter
 from filters.particles.particle import RaoBlackwellisedParticleFilter
-from filters.particles.weighted import WeightedFilter
 from filters.registry import FilterType, filter_type
 from filters.tuned_file import NOISE
 from filters.tuned_file import PRIOR as PRIOR_FACTOR

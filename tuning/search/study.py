@@ -17,7 +17,7 @@ from typing import NamedTuple
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from thruster_env.core.progress import tell
+from thruster_env.core.checks import tell
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.data import Data
 from tuning.search.among_types import (

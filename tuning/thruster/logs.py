@@ -18,11 +18,9 @@ from thruster_env.logs.grid import NEIGHBOURS
 from thruster_env.logs.log import Log, at_offset
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.env import ModelledThruster
-from thruster_env.thruster.logged import NO_BAND, Recorder, lag_weights, logged_plant, with_recorder
-from thruster_env.thruster.model import model_of_plant
-from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, checked
+from thruster_env.thruster.model import NO_BAND, Recorder, lag_weights, logged_plant, model_of_plant, with_recorder
+from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, checked, is_file, read_preset
 from thruster_env.thruster.plant import Plant
-from thruster_env.thruster.preset_file import is_file, read_preset
 from tuning.problems.find import FILE_SEQUENCES
 from tuning.problems.parameter import Parameter, squared
 from tuning.problems.problem import Problem
@@ -119,14 +117,14 @@ def family_of_preset(
 
 
 def preset_of(identification: Any, family: Any, logs: Sequence[str]):
-    """The identified thruster as the content of a preset file, `thruster_env.thruster.preset_file.PresetFile`.
+    """The identified thruster as the content of a preset file, `thruster_env.thruster.parameters.PresetFile`.
 
     Args:
         identification: from `tuning.identification.identify`.
         family: its `ThrusterFamily`.
         logs: names of the runs.
     """
-    from thruster_env.thruster.preset_file import PresetFile
+    from thruster_env.thruster.parameters import PresetFile
 
     plant, recorder = family.plant_at(identification.values), family.recorder_at(identification.values)
     offsets = {channel: _taken_off(family.logs, channel) for channel in plant.channels}
@@ -166,7 +164,7 @@ def _taken_off(logs: Sequence[Log], channel: str) -> float:
 
 def write_identified(path: str | Path, identification: Any, family: Any, logs: Sequence[str]) -> None:
     """Write the identified thruster as a preset file; arguments are those of `preset_of`."""
-    from thruster_env.thruster.preset_file import write_preset
+    from thruster_env.thruster.parameters import write_preset
 
     write_preset(path, preset_of(identification, family, logs), "A thruster as `thruster identify` found it.")
 

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from filters.baselines import OpenLoop
+from filters.bounds import has_bound
 from filters.engine.batch import run
-from filters.posterior import has_bound
 from filters.tuned_file import NOISE
 from thruster_env.core.checks import at_least, one_of, positive, short_repr, vector
 from thruster_env.core.streams import episode_keys, filter_keys
@@ -30,9 +30,9 @@ from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.control.controllers import PIController, lambda_gains
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
 from thruster_env.thruster.linear.analysis import equilibrium, jacobians, state_range, steady_state
-from thruster_env.thruster.linear.operating import operating_points
-from thruster_env.thruster.linear.published import make_linear_plant
+from thruster_env.thruster.linear.published import make_linear_plant, operating_points
 from thruster_env.thruster.model import model_of_plant
+from thruster_env.thruster.parameters import is_file, preset_mapping
 from thruster_env.thruster.plant import (
     DEFAULT_DT,
     DEFAULT_MAX_VOLTAGE,
@@ -42,7 +42,6 @@ from thruster_env.thruster.plant import (
     make_plant,
     plant_data,
 )
-from thruster_env.thruster.preset_file import is_file, preset_mapping
 from thruster_env.thruster.simulation import NEXT_REFERENCE, READINGS, Copies, simulate
 from thruster_env.thruster.task import Task
 from tuning.problems.check import average_bound

@@ -8,8 +8,7 @@ from tests.thruster_env.auv import textbook
 from tests.thruster_env.auv.textbook import random_states
 from thruster_env.auv import dynamics
 from thruster_env.auv.dynamics import attitude_of, in_earth_axes
-from thruster_env.auv.parameters import derive_constants
-from thruster_env.auv.presets import PRESETS, SEGOROGENI
+from thruster_env.auv.parameters import PRESETS, SEGOROGENI, derive_constants
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import vector_reader, vector_writer
 

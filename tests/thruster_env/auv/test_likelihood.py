@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from filters.likelihood import likelihood
+from filters.sensitivity import likelihood
 from thruster_env.auv.model import auv_model
 from thruster_env.core.compiled import interpreted
 

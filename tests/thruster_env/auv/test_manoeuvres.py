@@ -15,8 +15,15 @@ from thruster_env.auv.dynamics import (
     top_speed,
     velocity_rates_tangent,
 )
-from thruster_env.auv.parameters import derive_constants
-from thruster_env.auv.presets import LAUV, PRESETS, REMUS100, REMUS100_PRESTERO, SEGOROGENI, SEGOROGENI_PAPERS
+from thruster_env.auv.parameters import (
+    LAUV,
+    PRESETS,
+    REMUS100,
+    REMUS100_PRESTERO,
+    SEGOROGENI,
+    SEGOROGENI_PAPERS,
+    derive_constants,
+)
 from tuning.experiments.vehicle.estimators import planar_kinematics
 
 THRUST, TORQUE, DEGREE = 2.845, -0.017, math.pi / 180

@@ -6,7 +6,7 @@ import pytest
 
 import thruster_env.auv  # noqa: F401
 from filters import EstimateState, make_filter
-from filters.wrappers.vector import EstimateStates
+from filters.wrappers.envs import EstimateStates
 from thruster_env.auv.model import auv_model
 from thruster_env.auv.plant import make_plant
 

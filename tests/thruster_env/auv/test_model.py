@@ -8,9 +8,8 @@ from filters.registry import filter_type
 from tests.thruster_env.auv.textbook import random_states
 from thruster_env.auv import dynamics
 from thruster_env.auv.model import MODEL_ARGUMENTS, MODELS, auv_model, model_of_plant
-from thruster_env.auv.parameters import derive_constants
+from thruster_env.auv.parameters import SEGOROGENI, derive_constants
 from thruster_env.auv.plant import make_plant
-from thruster_env.auv.presets import SEGOROGENI
 from thruster_env.model.affine import linearize
 
 SENSORS = {"velocities": "papers", "motion": "motion", "navigation": "usbl", "current": "usbl"}

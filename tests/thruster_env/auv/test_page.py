@@ -4,11 +4,9 @@ import inspect
 import re
 from pathlib import Path
 
-from thruster_env.auv.channels import CHANNELS, INSTRUMENTS, SUITES
 from thruster_env.auv.model import MODELS
-from thruster_env.auv.parameters import VehicleParameters
-from thruster_env.auv.plant import make_plant
-from thruster_env.auv.presets import PRESETS
+from thruster_env.auv.parameters import PRESETS, VehicleParameters
+from thruster_env.auv.plant import CHANNELS, INSTRUMENTS, SUITES, make_plant
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "auv.md").read_text(encoding="utf-8")
 

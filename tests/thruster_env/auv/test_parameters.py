@@ -5,15 +5,18 @@ import pytest
 
 from tests.thruster_env.auv.textbook import random_states, without_drag_and_lift
 from thruster_env.auv.forces import forces
-from thruster_env.auv.parameters import VehicleParameters, checked, derive_constants, mass_matrix
-from thruster_env.auv.presets import (
+from thruster_env.auv.parameters import (
     LAUV,
     PRESETS,
     REMUS100,
     REMUS100_PRESTERO,
     REMUS_SIZES,
     SEGOROGENI,
+    VehicleParameters,
+    checked,
+    derive_constants,
     lamb_factors,
+    mass_matrix,
     preset_parameters,
     recipe,
 )

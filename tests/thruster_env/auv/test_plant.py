@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from thruster_env.auv.channels import CHANNELS, INSTRUMENTS, STATES, SUITES, SYMBOLS, channels_of, suite
-from thruster_env.auv.plant import make_plant
-from thruster_env.auv.presets import LAUV, SEGOROGENI
+from thruster_env.auv.parameters import LAUV, SEGOROGENI
+from thruster_env.auv.plant import CHANNELS, INSTRUMENTS, STATES, SUITES, SYMBOLS, channels_of, make_plant, suite
 
 
 def test_the_default_plant_is_the_documented_one():

@@ -10,9 +10,9 @@ import pytest
 from filters import FILTERS, StateSpaceModel, Unknown, augmented_model, make_filter, run, smooth
 from filters.baselines import component_solver
 from filters.consistency.report import consistency_report
-from filters.ensembles.rank_histogram import record_members
+from filters.ensembles.square_root import record_members
 from filters.gaussian.mixtures import Parts, part_aligner
-from filters.likelihood import likelihood
+from filters.sensitivity import likelihood
 from tests.models import affine, simulated, small
 from thruster_env.core.angles import difference, row_aligner, wrapped, wrapped_where
 from thruster_env.core.compiled import compiled, interpreted

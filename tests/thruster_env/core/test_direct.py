@@ -5,8 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from thruster_env.core.compiled import CompiledOrPython, compiled, interpreted
-from thruster_env.core.direct import direct
+from thruster_env.core.compiled import CompiledOrPython, compiled, direct, interpreted
 
 
 def scaled_sum(values, factor, twice):

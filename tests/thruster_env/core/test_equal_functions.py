@@ -16,8 +16,8 @@ import pytest
 from filters import make_filter, run
 from tests.models import state_space
 from thruster_env.core import equal_functions
+from thruster_env.core.derivatives import runge_kutta
 from thruster_env.core.equal_functions import first_equal
-from thruster_env.core.integration import runge_kutta
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
 

@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from thruster_env.core import number_cache as module
-from thruster_env.core.number_cache import cached_numbers
+from thruster_env.core import modules as module
+from thruster_env.core.modules import cached_numbers
 
 
 class Code:

@@ -1,6 +1,6 @@
 """Progress of long work: what is told, in which order, and only to those who listen."""
 
-from thruster_env.core.progress import listening, with_progress
+from thruster_env.core.checks import listening, with_progress
 
 
 def test_what_is_inside_a_part_stands_behind_it_and_a_single_part_is_not_told():

@@ -11,9 +11,8 @@ import pytest
 from filters import StateSpaceModel
 from thruster_env.graphs.branches import on_every_side
 from thruster_env.graphs.graphs import Graph
-from thruster_env.graphs.python_floats import with_python_floats
+from thruster_env.graphs.python_floats import is_refused, with_python_floats, written_function
 from thruster_env.graphs.tracing import traced
-from thruster_env.graphs.written_functions import is_refused, written_function
 
 GAINS = {"pull": 0.3, "names": ("a", "b")}
 LOGGER = logging.getLogger(__name__)

@@ -7,9 +7,9 @@ import pytest
 
 from filters import affine_model, make_filter, run
 from filters.logs.estimate import estimate
-from filters.logs.figure import draw_log
+from filters.logs.findings import draw_log
 from thruster_env.core.angles import on_one_branch, with_breaks, wrapped
-from thruster_env.core.plots import MOST_POINTS, thinned
+from thruster_env.core.files import MOST_POINTS, thinned
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs.grid import Series, mean_held, sampled
 from thruster_env.logs.log import Log, at_offset

@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 
 from thruster_env.model.continuous import noise_for_dt
 from thruster_env.thruster.dynamics import rates
-from thruster_env.thruster.logged import continuous_thruster, logged_model
+from thruster_env.thruster.model import continuous_thruster, logged_model
 
 
 @pytest.mark.parametrize(

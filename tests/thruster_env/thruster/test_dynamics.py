@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thruster_env.core.compiled import compiled, function_fingerprint
-from thruster_env.core.integration import runge_kutta
+from thruster_env.core.derivatives import runge_kutta
 from thruster_env.thruster.dynamics import (
     rates,
     rates_tangent,

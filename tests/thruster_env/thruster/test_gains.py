@@ -11,8 +11,7 @@ from thruster_env.thruster.control.controllers import (
     quadratic_problem,
 )
 from thruster_env.thruster.linear.analysis import equilibrium, steady_state
-from thruster_env.thruster.linear.operating import operating_points, sampled_plant
-from thruster_env.thruster.linear.published import make_linear_plant
+from thruster_env.thruster.linear.published import make_linear_plant, operating_points, sampled_plant
 from thruster_env.thruster.plant import make_plant
 from thruster_env.thruster.task import make_task, thrust_scale
 

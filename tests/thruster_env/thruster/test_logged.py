@@ -8,11 +8,23 @@ import thruster_env  # noqa: F401 - registers the env
 from filters import ExtendedKalmanFilter, run
 from thruster_env.core.streams import episode_keys
 from thruster_env.model.simulate import simulate
-from thruster_env.thruster.logged import Recorder, lag_weights, logged_model, with_recorder
-from thruster_env.thruster.model import model_of_plant, thruster_model
-from thruster_env.thruster.parameters import PRESETS, T200, preset_parameters
+from thruster_env.thruster.model import (
+    Recorder,
+    lag_weights,
+    logged_model,
+    model_of_plant,
+    thruster_model,
+    with_recorder,
+)
+from thruster_env.thruster.parameters import (
+    PRESETS,
+    T200,
+    PresetFile,
+    preset_parameters,
+    read_preset,
+    write_preset,
+)
 from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.preset_file import PresetFile, read_preset, write_preset
 
 PLANT = {"preset": "tunnel_physical", "sensors": ["thrust", "speed"], "substeps": 4}
 

@@ -14,8 +14,7 @@ from filters import EstimateState, thruster_model
 from filters.logs.estimate import estimate
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.logs.read import read_log
-from thruster_env.thruster.parameters import PRESETS
-from thruster_env.thruster.preset_file import PresetFile, write_preset
+from thruster_env.thruster.parameters import PRESETS, PresetFile, write_preset
 
 TWO_STATES = """
 from thruster_env.model.affine import affine_model

@@ -15,10 +15,8 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import write_log
 from thruster_env.model.simulate import simulate
-from thruster_env.thruster.logged import logged_model
-from thruster_env.thruster.model import thruster_model
-from thruster_env.thruster.parameters import TUNNEL_PHYSICAL
-from thruster_env.thruster.preset_file import PresetFile, read_preset, write_preset
+from thruster_env.thruster.model import logged_model, thruster_model
+from thruster_env.thruster.parameters import TUNNEL_PHYSICAL, PresetFile, read_preset, write_preset
 from tuning.experiments.identification import TRUTH, record
 from tuning.identification.result import with_values
 from tuning.problems.find import find_problem, scenario_of

@@ -12,15 +12,14 @@ import pytest
 
 import tuning
 from filters import EstimateState, make_filter, run
-from filters.likelihood import likelihood
 from filters.registry import filter_type
+from filters.sensitivity import likelihood
 from tests.filters.test_differentiated import swing_if
 from tests.models import pendulum, simulated, swing
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.compiled import interpreted
 from thruster_env.thruster.model import thruster_model
-from thruster_env.thruster.parameters import TUNNEL_PHYSICAL
-from thruster_env.thruster.preset_file import read_preset
+from thruster_env.thruster.parameters import TUNNEL_PHYSICAL, read_preset
 from tuning.evaluation.baselines import rule_of_thumb
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.find import find_problem

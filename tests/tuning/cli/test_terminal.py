@@ -17,8 +17,7 @@ from filters.consistency.intervals import Interval
 from filters.registry import FILTERS
 from tests.linear_problem import LinearProblem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from thruster_env.core.checks import any_case, meant, one_of
-from thruster_env.core.progress import listening
+from thruster_env.core.checks import any_case, listening, meant, one_of
 from thruster_env.core.text_tables import plain_text, table
 from tuning.api.progress import trial_bar
 from tuning.api.run import file_name

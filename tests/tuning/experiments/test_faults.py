@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from filters.monitoring.recursion import cusum_threshold
+from filters.monitoring.monitor import cusum_threshold
 from thruster_env.core.text_tables import with_tables
 from tuning.experiments.faults import BIASES, LOST_BLADES, PLANTS, best_delay, delays, markdown
 

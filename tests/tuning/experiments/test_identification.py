@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thruster_env.thruster.logged import Recorder
+from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
 from tuning.experiments import identification
 from tuning.experiments.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study

@@ -10,11 +10,20 @@ env = EstimateState(env, filter="template:Template")     # a wrapper around an e
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.algebra.blocks import forward_quotient
-from filters.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from filters.algebra.points import root
-from filters.algebra.samples import log_density
-from filters.algebra.scalars import at_most, diagonal, exponential
+from filters.algebra.operations import (
+    at_most,
+    diagonal,
+    divide,
+    exponential,
+    joseph,
+    only,
+    present,
+    sym,
+    uncorrelated,
+    wrap,
+)
+from filters.algebra.points import log_density, root
+from filters.algebra.roots import forward_quotient
 from filters.gaussian.extended import add_process_noise, propagate
 from filters.pages.page import Page
 from filters.pages.page_filter import PageFilter

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.core.plots import new_figure, save_figure, tidy
+from thruster_env.core.files import new_figure, save_figure, tidy
 from thruster_env.core.text_tables import markdown_table
 from tuning.experiments.methods.problems import (
     FULL_METHODS,

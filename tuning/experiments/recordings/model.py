@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.core.integration import runge_kutta
+from thruster_env.core.derivatives import runge_kutta
 from thruster_env.logs.columns import MEASUREMENT
 from thruster_env.logs.log import Log, at_offset
 from thruster_env.logs.table import read_table

@@ -16,16 +16,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.bounds import path_bound
+from filters.bounds import path_bound, wrapped_variances
 from filters.consistency.intervals import Interval, interval, mean_interval, resampled_means, rmse_intervals
 from filters.consistency.nees import normalized_squares
 from filters.engine.batch import run
 from filters.filter import Filter
-from filters.logs.figure import TRUTH as TRUTH_LOOK
-from filters.logs.figure import plot_style
-from filters.wrapped import wrapped_variances
+from filters.logs.findings import TRUTH as TRUTH_LOOK
+from filters.logs.findings import plot_style
 from thruster_env.core.checks import at_least, one_of
-from thruster_env.core.plots import BLUE, GREEN, PLUM, SKY, new_figure, save_figure
+from thruster_env.core.files import BLUE, GREEN, PLUM, SKY, new_figure, save_figure
 from thruster_env.model.simulate import Truth, simulate
 from tuning.experiments.vehicle.estimators import (
     Estimator,

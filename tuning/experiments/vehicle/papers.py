@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from thruster_env.auv.model import auv_model
-from thruster_env.auv.presets import SEGOROGENI
+from thruster_env.auv.parameters import SEGOROGENI
 from thruster_env.core.checks import one_of
 from thruster_env.model.state_space import StateSpaceModel
 

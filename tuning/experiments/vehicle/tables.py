@@ -14,8 +14,7 @@ import numpy as np
 
 from filters import FuzzyKalmanFilter
 from filters.consistency.intervals import Interval
-from thruster_env.auv.parameters import mass_matrix
-from thruster_env.auv.presets import SEGOROGENI
+from thruster_env.auv.parameters import SEGOROGENI, mass_matrix
 from thruster_env.core.text_tables import markdown_table
 from tuning.experiments.vehicle.estimators import MEASUREMENTS, level_model
 from tuning.experiments.vehicle.experiment import (

@@ -14,7 +14,7 @@ import tuning
 import tuning.cli.explore as command
 from tests.linear_problem import LinearProblem
 from tuning.cli.explore import _bench, _forward
-from tuning.cli.log_options import BlockOptions, GridOptions
+from tuning.cli.options import BlockOptions, GridOptions
 from tuning.exploring.page.session import Server
 
 
