@@ -167,7 +167,7 @@ class Scene:
         self._gear_ratio = gear_ratio
         self._thrust_scale = thrust_scale
         self._flow_scale = flow_scale
-        from thruster_env.thruster.dynamics import end_view, side_view
+        from thruster_env.thruster.propeller import end_view, side_view
 
         self._side = side_view(PROPELLER_RADIUS)
         self._end = end_view(PORTHOLE_RADIUS - 4)

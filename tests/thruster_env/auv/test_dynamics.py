@@ -8,22 +8,19 @@ from tests.thruster_env.auv import textbook
 from tests.thruster_env.auv.textbook import random_states
 from thruster_env.auv import dynamics
 from thruster_env.auv.dynamics import attitude_of, in_earth_axes
+from thruster_env.auv.model import MODELS
 from thruster_env.auv.parameters import PRESETS, SEGOROGENI, derive_constants
 from thruster_env.core.compiled import compiled, function_fingerprint
+from thruster_env.core.derivatives import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
 from thruster_env.core.sources import vector_reader, vector_writer
 
-SIZES = {"velocity": 6, "motion": 8, "navigation": 12}
 every_preset = pytest.mark.parametrize("k", PRESETS.values(), ids=PRESETS)
 
 
 def inputs_of(name, x, u):
     """Random inputs (count, 4) as a model takes them: with attitude, or with a current."""
-    extra = {"velocity": x[:, 6:8], "current": x[:, 9:12] / 20}.get(name)
+    extra = {"velocities": x[:, 6:8], "current": x[:, 9:12] / 20}.get(name)
     return u if extra is None else np.hstack([u, extra])
-
-
-def of(name, what):
-    return getattr(dynamics, f"{name}_{what}")
 
 
 @every_preset
@@ -117,11 +114,14 @@ def differences(step, x, u, c, h=1e-5):
     return np.transpose(columns)
 
 
-@pytest.mark.parametrize("method", ["", "euler_"])
-@pytest.mark.parametrize("name", SIZES)
+@pytest.mark.parametrize("method", ["runge-kutta", "euler"])
+@pytest.mark.parametrize("name", ["velocities", "motion", "navigation"])
 def test_jacobians_are_the_slopes_of_a_step(name, method):
-    count = SIZES[name]
-    step, jacobian = of(name, "euler" if method else "substep"), of(name, f"{method}jacobian")
+    count, rates, tangent = MODELS[name].count, MODELS[name].rates, MODELS[name].tangent
+    if method == "euler":
+        step, jacobian = euler(rates, count), euler_jacobian(tangent, count)
+    else:
+        step, jacobian = runge_kutta(rates, count), runge_kutta_jacobian(rates, tangent, count)
     for k in PRESETS.values():
         c, (x, u) = derive_constants(k._replace(xG=0.01, B=0.99 * k.B), 0.05), random_states(5, seed=3)
         for a, b in zip(x, inputs_of(name, x, u), strict=True):

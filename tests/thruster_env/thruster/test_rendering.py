@@ -15,7 +15,7 @@ pygame = pytest.importorskip("pygame")
 
 from thruster_env.render.canvas import BAND, fitting_axis  # noqa: E402
 from thruster_env.render.renderer import Window  # noqa: E402
-from thruster_env.thruster.dynamics import BLADES, end_view  # noqa: E402
+from thruster_env.thruster.propeller import BLADES, end_view  # noqa: E402
 from thruster_env.thruster.rendering import (  # noqa: E402
     AXIS,
     FLOW,
