@@ -24,9 +24,8 @@ from tuning.evaluation import sizes
 from tuning.experiments.lorenz96 import STEPS, problem
 from tuning.likelihood import family
 from tuning.problems import data as in_parts
-from tuning.search import parameters as filter_parameters
+from tuning.search import parameters, trials
 from tuning.search import plan as plans
-from tuning.search import trials
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import oracle_choice
 from tuning.search.study import StudyResult, open_study, quiet_optuna, run_study
@@ -206,7 +205,7 @@ def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int], 
     """Seconds of a study of so many trials on so many seeds, without pruning; the N of its runs; one filter."""
     quiet_optuna()
     few = mock.patch.multiple(plans, TRAINING_SEEDS=seeds, SIZE_SEEDS=seeds)
-    limits = mock.patch.object(filter_parameters, "KALMAN_SIZES", filter_parameters.Sizes(30, 5, LARGEST))
+    limits = mock.patch.object(parameters, "KALMAN_SIZES", parameters.Sizes(30, 5, LARGEST))
     sizes: list[int] = []
     filters: list[Filter] = []
 

@@ -20,13 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from filters.algebra import matrices, operations
-from filters.algebra import members as members_called
+from filters.algebra import matrices, members, operations, points, roots
 from filters.algebra import operations as geometric
-from filters.algebra import points as densities
-from filters.algebra import points as points_called
-from filters.algebra import roots as blocks_called
-from filters.algebra import roots as upper_called
 from filters.algebra.matrices import Matrix, Operation, in_order
 from filters.algebra.roots import by_entries
 from thruster_env.core import matrices as matrix_functions
@@ -180,16 +175,16 @@ _FUNCTIONS: dict[Operation, Callable] = {
     operations.factor: lambda result, shape: matrix_functions.cholesky_factor(shape[0]),
     operations.quotient: _quotient,
     operations.inverse: _inverse,
-    densities.density: lambda result, v, of, z: matrix_functions.innovation_likelihood(*v),
-    densities.dot: _dot,
-    densities.half_trace: _half_trace,
-    densities.heavier: _of_tail(f"({HEAVIER} if tail[0] > 0.0 else 0.0)"),
-    densities.outlier_weight: _of_tail(WEIGHT),
-    **points_called.FUNCTIONS,
-    **blocks_called.FUNCTIONS,
-    **members_called.FUNCTIONS,
+    points.density: lambda result, v, of, z: matrix_functions.innovation_likelihood(*v),
+    points.dot: _dot,
+    points.half_trace: _half_trace,
+    points.heavier: _of_tail(f"({HEAVIER} if tail[0] > 0.0 else 0.0)"),
+    points.outlier_weight: _of_tail(WEIGHT),
+    **points.FUNCTIONS,
+    **roots.FUNCTIONS,
+    **members.FUNCTIONS,
     **geometric.FUNCTIONS,
-    **upper_called.FUNCTIONS,
+    **roots.UD_FUNCTIONS,
 }
 
 
@@ -242,7 +237,7 @@ class _Text:
 
     def is_of_each(self, matrix: Matrix) -> bool:
         """Whether a matrix is evaluated in a loop over the members."""
-        return matrix.member and matrix not in self._known and members_called.function_of(matrix) is None
+        return matrix.member and matrix not in self._known and members.function_of(matrix) is None
 
     def _call(self, name: str, function: Callable, *arguments: str) -> str:
         self.names[name] = function
@@ -259,7 +254,7 @@ class _Text:
         if matrix in self._known:
             at = self._known[matrix]
             text = _read(at, matrix) if isinstance(at, Place) else self._call(f"read_{value}", at, "numbers")
-        elif any(a.member for a in matrix.of) and (rule := members_called.function_of(matrix)):
+        elif any(a.member for a in matrix.of) and (rule := members.function_of(matrix)):
             function, sized = rule
             text = self._call(f"work_{value}", function, *(values[a] for a in matrix.of), *["size"] * sized)
         else:
@@ -276,7 +271,7 @@ class _Text:
                 if a.member and a not in inside:
                     inside[a] = f"m{len(self.values)}_{len(inside)}"
                     columns = f"{self.values[a]}.shape[1]"
-                    read = self._call(f"read_{inside[a]}", members_called.reader(a.shape), self.values[a], "j")
+                    read = self._call(f"read_{inside[a]}", members.reader(a.shape), self.values[a], "j")
                     lines.append(f"    {inside[a]} = {read}")
             name = f"m{len(self.values)}_{len(inside)}"
             operands = (inside.get(a) or self.values[a] for a in arguments_of(matrix))
@@ -287,9 +282,7 @@ class _Text:
             value, name = f"v{len(self.values)}", inside[matrix]
             self.values[matrix] = value
             self.lines.append(f"{value} = np.empty(({prod(matrix.shape)}, {columns}))")
-            lines.append(
-                f"    {self._call(f'store_{name}', members_called.writer(matrix.shape), value, 'j', name)}"
-            )
+            lines.append(f"    {self._call(f'store_{name}', members.writer(matrix.shape), value, 'j', name)}")
         self.lines += [f"for j in range({columns}):", *lines]
 
 
@@ -313,7 +306,7 @@ def _stored(position: Place, matrix: Matrix, value: str) -> list[str]:
     (array, first), shape = position, matrix.shape
     if array == "table":
         loops = [f"for i in range({prod(shape)}):", "    for j in range(table.shape[1]):"]
-        return [*loops, f"        table[{first} + i, j] = {members_called.entry(value, shape, matrix.member)}"]
+        return [*loops, f"        table[{first} + i, j] = {members.entry(value, shape, matrix.member)}"]
     names, strides = "ijk"[: len(shape)], (prod(shape[k + 1 :]) for k in range(len(shape)))
     at = " + ".join([str(first), *(f"{name} * {stride}" for name, stride in zip(names, strides, strict=True))])
     loops = [f"{'    ' * k}for {name} in range({shape[k]}):" for k, name in enumerate(names)]

@@ -16,9 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from filters.algebra import matrices
-from filters.algebra import operations as scalars
-from filters.algebra import points as samples
+from filters.algebra import matrices, operations, points
 from filters.algebra.matrices import Matrix, Operation, operation, same
 from filters.algebra.operations import choose, constant, exceeds
 from filters.algebra.points import outer
@@ -360,15 +358,15 @@ _RULES: dict[Operation, Callable[[tuple, Kinds], Callable | None]] = {
     matrices.subtract: lambda parameters, kinds: _by_entries(kinds, "{a0} - {a1}"),
     matrices.scale: _multiple,
     matrices.multiply: _product,
-    scalars.entries_product: lambda parameters, kinds: _by_entries(kinds, "{a0} * {a1}"),
-    samples.total: lambda parameters, kinds: _called_total,
-    samples.weighted_mean: lambda parameters, kinds: written_out(
+    operations.entries_product: lambda parameters, kinds: _by_entries(kinds, "{a0} * {a1}"),
+    points.total: lambda parameters, kinds: _called_total,
+    points.weighted_mean: lambda parameters, kinds: written_out(
         "mean", "a, w, size", f"sums(a, w, size).reshape({kinds[0][0]})", sums=_weighted_sums
     ),
-    samples.largest: lambda parameters, kinds: _largest,
-    samples.effective_size: lambda parameters, kinds: _effective_size,
-    samples.spread_share: lambda parameters, kinds: _spread_share,
-    samples.weighted_square: lambda parameters, kinds: _weighted_square,
+    points.largest: lambda parameters, kinds: _largest,
+    points.effective_size: lambda parameters, kinds: _effective_size,
+    points.spread_share: lambda parameters, kinds: _spread_share,
+    points.weighted_square: lambda parameters, kinds: _weighted_square,
     mean: lambda parameters, kinds: _called_means,
     variances: lambda parameters, kinds: _variances,
     centred: lambda parameters, kinds: _centred,
@@ -377,8 +375,8 @@ _RULES: dict[Operation, Callable[[tuple, Kinds], Callable | None]] = {
     scatter: lambda parameters, kinds: _square,
 }
 SIZED = {  # operations whose functions take the number of members
-    *(samples.total, samples.weighted_mean, samples.largest, samples.effective_size, samples.spread_share),
-    *(samples.weighted_square, mean, variances, cross_covariance, scatter, centred, on_one_branch),
+    *(points.total, points.weighted_mean, points.largest, points.effective_size, points.spread_share),
+    *(points.weighted_square, mean, variances, cross_covariance, scatter, centred, on_one_branch),
 }
 
 
@@ -390,5 +388,5 @@ def _stretches(result: tuple, before: tuple, after: tuple, part: tuple) -> Calla
 
 FUNCTIONS: dict[Operation, Callable] = {
     stretches: _stretches,
-    samples.weights: lambda result, logarithm: exponential,
+    points.weights: lambda result, logarithm: exponential,
 }

@@ -33,7 +33,7 @@ from filters.algebra.operations import (
     quotient,
     with_transposed,
 )
-from thruster_env.core import matrices as matrix_functions
+from thruster_env.core import matrices
 from thruster_env.core.angles import row_brancher, wrapped
 from thruster_env.core.matrices import RESOLUTION
 from thruster_env.core.sources import Source, entrywise, written_out
@@ -207,7 +207,7 @@ def _units(result: tuple, x: tuple) -> Callable:
 
 
 def _on_one_side(result: tuple, angles: tuple[bool, ...], of: tuple) -> Callable:
-    turn, back = matrix_functions.transposer(*of), matrix_functions.transposer(*of[::-1])
+    turn, back = matrices.transposer(*of), matrices.transposer(*of[::-1])
     align = row_brancher(of[1], angles)
     return written_out("on_one_side", "y", "back(align(turn(y)))", turn=turn, back=back, align=align)
 
@@ -223,12 +223,12 @@ def _hats(result: tuple, u: tuple, nodes: tuple) -> Callable:
 
 
 FUNCTIONS: dict[Operation, Callable] = {
-    root: lambda result, of: matrix_functions.semidefinite_factor(*result[:1]),
+    root: lambda result, of: matrices.semidefinite_factor(*result[:1]),
     root_slope: _root_slope,
     units: _units,
     ones: lambda result, of: entrywise("ones", "a", result, lambda i: "1.0"),
     outer: lambda result, a, b: entrywise("outer", "a, b", result, lambda i, j: f"a[{i}] * b[{j}]", a=a, b=b),
-    square: lambda result, of: matrix_functions.square(*of),
+    square: lambda result, of: matrices.square(*of),
     first: lambda result, of: entrywise("first", "a", result, lambda i: f"a[{i}][0]", a=of),
     without_first: lambda result, a: entrywise("rest", "a", result, lambda i, j: f"a[{i}][{j + 1}]", a=a),
     on_one_side: _on_one_side,

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from filters.algebra import matrices
-from filters.algebra import operations as scalars
+from filters.algebra import matrices, operations
 from filters.algebra.matrices import Operation, minus, operation, same, through
 from filters.algebra.operations import factor, forward, mirrored, pivoted
 from thruster_env.core import matrices as matrix_functions
@@ -212,17 +211,17 @@ FUNCTIONS: dict[Operation, Callable] = {
     matrices.reciprocal: by_entries("1.0 / {a}"),
     matrices.power: by_entries("{a} ** {0!r}"),
     matrices.magnitude: by_entries("abs({a})"),
-    scalars.exceeds: by_entries("{a} > {0!r}"),
-    scalars.is_number: by_entries("{a} == {a}"),
-    scalars.choose: by_entries("({b} if {a} else {c})"),
-    scalars.exponential: by_entries("exp({a})", exp=np.exp),
-    scalars.logarithm: by_entries("log({a})", log=np.log),
-    scalars.at_most: by_entries("min({a}, {0!r})"),
-    scalars.at_least: by_entries("({a} if {a} > {0!r} else {0!r})"),
-    scalars.below: by_entries("(0.0 if {a} > {0!r} else 1.0)"),
-    scalars.trace: _trace,
-    scalars.diagonal: _diagonal,
-    scalars.count: _count,
+    operations.exceeds: by_entries("{a} > {0!r}"),
+    operations.is_number: by_entries("{a} == {a}"),
+    operations.choose: by_entries("({b} if {a} else {c})"),
+    operations.exponential: by_entries("exp({a})", exp=np.exp),
+    operations.logarithm: by_entries("log({a})", log=np.log),
+    operations.at_most: by_entries("min({a}, {0!r})"),
+    operations.at_least: by_entries("({a} if {a} > {0!r} else {0!r})"),
+    operations.below: by_entries("(0.0 if {a} > {0!r} else 1.0)"),
+    operations.trace: _trace,
+    operations.diagonal: _diagonal,
+    operations.count: _count,
     careful: lambda result, s: matrix_functions.careful_factor(*s[:1]),
     inverted: lambda result, of: matrix_functions.factored_inverse(of[0]),
     triangle: lambda result, a: matrix_functions.triangular_root(*a),

@@ -34,7 +34,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from filters.algebra import roots as upper
+from filters.algebra import roots
 from filters.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
 from filters.algebra.points import density, log_density, root, square
 from filters.algebra.roots import factor_of, forward_quotient, hstack, part, triangle, vstack, zeros
@@ -92,12 +92,12 @@ SQUARE_ROOT = Page(propagate_root, add_process_noise_root, update_root, represen
 
 def initial_ud(model):
     """The factors of the prior covariance."""
-    return {"UD": upper.factors(model.prior_root)}
+    return {"UD": roots.factors(model.prior_root)}
 
 
 def represent_ud(model, x, P):
     """The mean and U; D is read from the extras."""
-    return x, upper.unit_upper(model.extras["UD"])
+    return x, roots.unit_upper(model.extras["UD"])
 
 
 def propagate_ud(model, x, U, u):
@@ -107,8 +107,8 @@ def propagate_ud(model, x, U, u):
 
 def add_process_noise_ud(model, x, U):
     """Add Q at the end of a step."""
-    UD = upper.weighted_factors(hstack(U, model.Q_root), model.extras["UD"])
-    return x, square(upper.upper_root(UD)), {"UD": UD}
+    UD = roots.weighted_factors(hstack(U, model.Q_root), model.extras["UD"])
+    return x, square(roots.upper_root(UD)), {"UD": UD}
 
 
 def update_ud(model, x, P, z):
@@ -117,10 +117,10 @@ def update_ud(model, x, P, z):
     H, R_root = only(measured, model.H(x)), root(uncorrelated(measured, model.R))
     v = only(measured, wrap(z - model.h(x), model.measurement_angles))
     white = forward_quotient(R_root, H)
-    of_s = triangle(hstack(R_root, H @ upper.upper_root(UD)))
-    x = wrap(x + upper.measured_gain(UD, white) @ forward_quotient(R_root, v), model.state_angles)
-    UD = upper.measured_factors(UD, white)
-    return x, square(upper.upper_root(UD)), v, square(of_s), density(v, factor_of(of_s), measured), {"UD": UD}
+    of_s = triangle(hstack(R_root, H @ roots.upper_root(UD)))
+    x = wrap(x + roots.measured_gain(UD, white) @ forward_quotient(R_root, v), model.state_angles)
+    UD = roots.measured_factors(UD, white)
+    return x, square(roots.upper_root(UD)), v, square(of_s), density(v, factor_of(of_s), measured), {"UD": UD}
 
 
 UD = Page(propagate_ud, add_process_noise_ud, update_ud, represent_ud, initial_ud)

@@ -16,11 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filters.algebra import matrices, members, operations, points
+from filters.algebra import matrices, members, operations, points, roots
 from filters.algebra import operations as geometric
 from filters.algebra import operations as scalars
 from filters.algebra import points as densities
-from filters.algebra import roots as blocks
 from filters.algebra.matrices import Matrix, Operation, in_order, never
 from filters.pages.kernels import MembersMemory, Stage, stages_of
 from filters.pages.kernels import member_stages_of as members_stages
@@ -299,15 +298,15 @@ RULES: dict[Operation, Callable] = {
     scalars.at_least: lambda a, value: torch.where(a > value, a, value),
     scalars.diagonal: torch.diag_embed,
     points.hats: _hats,
-    blocks.inverted: lambda root: _symmetric(torch.cholesky_inverse(root)),
-    blocks.triangle: _triangle,
-    blocks.hstack: lambda a, b: _joined(-1, a, b),
-    blocks.vstack: lambda a, b: _joined(-2, a, b),
-    blocks.part: lambda a, top, left, rows, columns: a[..., top : top + rows, left : left + columns],
-    blocks.zeros: lambda a, *shape: a.new_zeros(shape),
-    blocks.factor_of: lambda lower: lower,
-    blocks.forward_quotient: _forward_quotient,
-    blocks.triangle_quotient: lambda a, lower: torch.linalg.solve_triangular(lower, a, upper=False, left=False),
+    roots.inverted: lambda root: _symmetric(torch.cholesky_inverse(root)),
+    roots.triangle: _triangle,
+    roots.hstack: lambda a, b: _joined(-1, a, b),
+    roots.vstack: lambda a, b: _joined(-2, a, b),
+    roots.part: lambda a, top, left, rows, columns: a[..., top : top + rows, left : left + columns],
+    roots.zeros: lambda a, *shape: a.new_zeros(shape),
+    roots.factor_of: lambda lower: lower,
+    roots.forward_quotient: _forward_quotient,
+    roots.triangle_quotient: lambda a, lower: torch.linalg.solve_triangular(lower, a, upper=False, left=False),
     members.mean: lambda x: x.mean(-1),
     members.variances: lambda x: x.var(-1),
     members.cross_covariance: _covariance,

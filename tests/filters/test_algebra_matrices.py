@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, multivariate_t
 
-from filters.algebra import operations
-from filters.algebra import points as densities
+from filters.algebra import operations, points
 from filters.algebra.calls import calls_of
 from filters.algebra.matrices import Matrix, evaluate, in_order, input_matrix
 from filters.algebra.operations import (
@@ -193,4 +192,4 @@ def test_a_covariance_that_is_none_has_no_density():
     seen = np.array([True, True])
     assert np.isnan(log_density(np.ones(2), np.array([[1.0, 2.0], [2.0, 1.0]]), seen))
     with pytest.raises(TypeError, match="no derivative"):
-        slopes_of([densities.dot(x := input_matrix("x", (2,)), x)], {x: input_matrix("dx", (2,), like=x)})
+        slopes_of([points.dot(x := input_matrix("x", (2,)), x)], {x: input_matrix("dx", (2,), like=x)})

@@ -7,9 +7,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from filters import StateSpaceModel, bounds, make_filter, run, thruster_model
+from filters import StateSpaceModel, bounds, make_filter, run, sensitivity, thruster_model
 from filters import bounds as posterior
-from filters import sensitivity as likelihood
 from filters.augmented import augmented_model
 from filters.registry import FILTERS, filter_type
 from filters.smoothers.smooth import smooth
@@ -105,7 +104,7 @@ def everything(model_name):
         except ValueError:  # it has no smoother
             continue
     slopes = [np.stack([np.eye(size), np.ones((size, size))]) for size in (model.n, model.m)]
-    found["likelihood"] = likelihood.likelihood(model, inputs, z, *slopes)
+    found["likelihood"] = sensitivity.likelihood(model, inputs, z, *slopes)
     found["bound"] = (posterior.posterior_bound(model, inputs, truths=2),)
     if len(model.constants):
         names = getattr(model.constants, "_fields", range(len(model.constants)))

@@ -24,7 +24,7 @@ from benchmarks.rates import (
     times,
 )
 from filters import make_filter, thruster_model
-from thruster_env.core import matrices as arrays
+from thruster_env.core import matrices
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import FILTER_PROCESS, normal_block
 from thruster_env.thruster.dynamics import substep
@@ -52,7 +52,7 @@ def test_operations_on_which_a_result_depends_are_counted_once(function, expecte
 def test_operations_of_matrices_and_of_whole_numbers_are_counted():
     with counting() as graph:
         a, b, words = (graph.variables(given) for given in (np.ones((7, 8)), np.ones((8, 9)), np.arange(2)))
-        made = arrays.product(a, b)
+        made = matrices.product(a, b)
         mixed = np.array([(words[0] * words[1] >> 32) ^ words[0]], dtype=object)
     assert graph.operations(made) == {MULTIPLY: 7 * 8 * 9, ADD: 7 * 7 * 9}
     assert graph.operations(mixed) == {PRODUCT: 1, INTEGER: 2}

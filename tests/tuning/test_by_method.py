@@ -11,7 +11,7 @@ from tests.linear_problem import LinearProblem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.methods.problems import linear
 from thruster_env.model.affine import affine_model
-from tuning.api import run as by_method
+from tuning.api import run
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import tune_by_gradient
@@ -79,10 +79,10 @@ def test_a_journal_that_says_way_is_continued(tmp_path, monkeypatch, as_python, 
     options = {"filter": "kf", "trials": 2, "progress": False, "storage": storage, "method": method}
     plan = Plan("kf", (problem,), objectives=("likelihood",))
     with monkeypatch.context() as before:
-        before.setattr(by_method, "ANSWER", "answer of the way")
-        name = f"{by_method.name_of(plan)}-way-{former}"
+        before.setattr(run, "ANSWER", "answer of the way")
+        name = f"{run.name_of(plan)}-way-{former}"
         first = tuning.tune(problem, name=name, **options)
-    monkeypatch.setattr(by_method, "Task", None)  # nothing is run again
+    monkeypatch.setattr(run, "Task", None)  # nothing is run again
     again = tuning.tune(problem, **options)
     assert same_filter(again.choice, first.choice) and again.tuning.study == name
     assert again.tuning.answer.runs == first.tuning.answer.runs
@@ -138,7 +138,7 @@ def test_ctrl_c_ends_a_method_with_what_it_has_found(monkeypatch, tmp_path):
         task.value(task.best)
         raise AssertionError("it went on")
 
-    monkeypatch.setattr(by_method, "find_method", lambda name: METHODS["random-only"]._replace(function=follow))
+    monkeypatch.setattr(run, "find_method", lambda name: METHODS["random-only"]._replace(function=follow))
     study = tuning.tune(SHORT, "ekf", method="random-only", trials=4, progress=False)
     assert study.interrupted and len(study.trials) == 2
     before = SHORT.untuned["process_noise_cov"]

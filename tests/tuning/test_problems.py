@@ -12,7 +12,7 @@ from tests import pendulum_problem
 from tests.models import wide_model
 from tests.small_problems import pair, thruster
 from tests.tuned_files import write_untuned
-from tuning.evaluation import summary as held_out
+from tuning.evaluation import summary
 from tuning.evaluation.baselines import Scaled
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.likelihood.family import Family
@@ -166,7 +166,7 @@ def test_policies_act_on_what_the_env_shows():
     "make", [pytest.param(MAKERS["two sensors"], marks=pytest.mark.slow), pair], ids=["two sensors", "pair"]
 )
 def test_several_sensors_are_kept_by_a_tuned_file(make, tmp_path, monkeypatch):
-    monkeypatch.setattr(held_out, "scaled_default", lambda *_: Scaled(None, None, None, "not here"))
+    monkeypatch.setattr(summary, "scaled_default", lambda *_: Scaled(None, None, None, "not here"))
     problem = make(name="mine")
     path = write_untuned(tmp_path / "t.json", problem)
     assert read_tuned(path, [problem]) == (untuned_choice("ekf", problem), problem, 0)

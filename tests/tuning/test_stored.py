@@ -8,12 +8,12 @@ import pytest
 from filters.consistency.intervals import Interval
 from filters.tuned_file import read_tuned_file
 from tests.tuned_files import rewrite, write_untuned
-from tuning.evaluation import summary as stored
+from tuning.evaluation import summary
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.summary import evaluate_held_out, sizes_as_data, stored_comparison, stored_sizes
 from tuning.evaluation.tuned import metrics, read_tuned
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
-from tuning.reporting import report as reports
+from tuning.reporting import report
 from tuning.reporting.report import write_report
 from tuning.reporting.tables import errors_table, numbers_table
 from tuning.search.plan import Plan
@@ -56,7 +56,7 @@ def test_a_report_takes_what_the_file_keeps_unless_the_problem_has_changed(tmp_p
     path = write_untuned(tmp_path / "ekf.json")
     asked = []
     monkeypatch.setattr(
-        reports, "evaluate_held_out", lambda *given: asked.append(given) or evaluate_held_out(*given)
+        report, "evaluate_held_out", lambda *given: asked.append(given) or evaluate_held_out(*given)
     )
     tables = write_report(path, "none.journal").tables.read_text()
     assert not asked
@@ -79,5 +79,5 @@ def test_ensemble_sizes_read_as_they_were_of_the_same_choice_alone(monkeypatch):
         is stored_sizes(data, choice.with_size(7), plan)
         is stored_sizes(3, choice, plan)
     )
-    monkeypatch.setattr(stored, "versions", lambda: {"numpy": "0.1"})
+    monkeypatch.setattr(summary, "versions", lambda: {"numpy": "0.1"})
     assert stored_sizes(data, choice, plan) is None

@@ -4,15 +4,14 @@ import os
 
 import pytest
 
-from thruster_env.core import threads as atomics
-from thruster_env.core import threads as wait_policy
+from thruster_env.core import threads
 from thruster_env.core.threads import VARIABLE, new_flags, spin_for_call, waiting
 
 
 @pytest.fixture(params=[None, "active", "passive"])
 def inherited(request, monkeypatch):
     """A process that was started with this in its environment, and has not asked for it yet."""
-    monkeypatch.setattr(wait_policy, "_policy", None)
+    monkeypatch.setattr(threads, "_policy", None)
     if request.param is None:
         monkeypatch.delenv(VARIABLE, raising=False)
     else:
@@ -24,10 +23,10 @@ def test_the_environment_counts_then_the_context_and_afterwards_all_is_as_it_was
     usual = inherited or "active"
     with pytest.raises(KeyboardInterrupt), waiting("passive"):
         with waiting("active"):
-            assert wait_policy.wait_policy() == "active"
-        assert wait_policy.wait_policy() == "passive"
+            assert threads.wait_policy() == "active"
+        assert threads.wait_policy() == "passive"
         raise KeyboardInterrupt
-    assert wait_policy.wait_policy() == usual and os.environ.get(VARIABLE) == inherited
+    assert threads.wait_policy() == usual and os.environ.get(VARIABLE) == inherited
 
 
 def test_an_error_within_the_context_is_not_hidden_by_a_variable_that_is_gone(inherited, monkeypatch):
@@ -39,15 +38,15 @@ def test_an_error_within_the_context_is_not_hidden_by_a_variable_that_is_gone(in
 
 def test_a_process_that_is_started_within_the_context_waits_as_it_says(inherited, monkeypatch):
     with waiting("passive"):
-        monkeypatch.setattr(wait_policy, "_policy", None)  # as it is in a new process, which has this environment
-        assert wait_policy.wait_policy() == "passive"
+        monkeypatch.setattr(threads, "_policy", None)  # as it is in a new process, which has this environment
+        assert threads.wait_policy() == "passive"
 
 
 def test_another_word_is_refused(monkeypatch):
-    monkeypatch.setattr(wait_policy, "_policy", None)
+    monkeypatch.setattr(threads, "_policy", None)
     monkeypatch.setenv(VARIABLE, "pasive")
     with pytest.raises(ValueError, match=f"{VARIABLE} must be one of active, passive, but got 'pasive'; did you"):
-        wait_policy.wait_policy()
+        threads.wait_policy()
     with pytest.raises(ValueError, match="policy must be one of active, passive, but got 0"), waiting(0):
         pass
 
@@ -55,6 +54,6 @@ def test_another_word_is_refused(monkeypatch):
 @pytest.mark.parametrize("rounds", [0, 5])
 def test_a_helper_waits_for_so_many_rounds_and_no_longer(rounds, monkeypatch):
     passed = []
-    monkeypatch.setattr(atomics, "yield_core", lambda: passed.append(1))
+    monkeypatch.setattr(threads, "yield_core", lambda: passed.append(1))
     spin_for_call(new_flags(1), 0, rounds)
     assert len(passed) == rounds

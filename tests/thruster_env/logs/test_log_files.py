@@ -5,7 +5,7 @@ import pytest
 
 from tests.thruster_env.logs.test_logs import MODEL, log_of
 from thruster_env.logs import columns as columns_module
-from thruster_env.logs import table as table_module
+from thruster_env.logs import table
 from thruster_env.logs.columns import parted
 from thruster_env.logs.read import read_log
 from thruster_env.logs.write import write_columns, write_log
@@ -112,7 +112,7 @@ def test_the_columns_of_a_wide_table_are_looked_at_a_few_times_only(monkeypatch)
     monkeypatch.setattr(columns_module, "parted", lambda header: calls.append(0) or parted(header))
     names = Names(f"column_{place}_V" for place in range(2000))
     Names.looked = 0
-    table_module._check_header(names, 1, "run.csv")
+    table._check_header(names, 1, "run.csv")
     headers = ["time_s", "voltage_V", "tach", *names]
     found = columns_module.find_columns(columns_module.quantities_of(MODEL), headers, {}, {}, "run.csv")
     assert len(found) == 3 and len(calls) < 2 * len(headers) and Names.looked < 2 * len(names)

@@ -8,17 +8,17 @@ import pytest
 from PIL import Image
 
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from thruster_env.render import renderer as video
+from thruster_env.render import renderer
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.rendering import Moment, Overlay
-from tuning.cli import play as episodes
+from tuning.cli import play
 
 
 @pytest.fixture
 def frames(monkeypatch):
     """What would go into the video."""
     kept = []
-    monkeypatch.setattr(episodes, "write_video", lambda path, pictures, rate: kept.append((path, pictures, rate)))
+    monkeypatch.setattr(play, "write_video", lambda path, pictures, rate: kept.append((path, pictures, rate)))
     return kept
 
 
@@ -37,7 +37,7 @@ def test_alone_it_plays_pi(as_json, frames):  # noqa: F811
 @pytest.mark.parametrize("option", [("--voltage", 8), ("--excitation", "prbs")])
 def test_voltages_drive_the_thruster(as_json, frames, monkeypatch, option):  # noqa: F811
     seen = []
-    monkeypatch.setattr(episodes, "_played", spy(episodes._played, seen))
+    monkeypatch.setattr(play, "_played", spy(play._played, seen))
     found = as_json("play", *option, "--steps", 8, "--preset", "t200", "--seed", 3, "--out", "x.gif")
     assert found["steps"] == 8
     env = seen[0]
@@ -114,9 +114,9 @@ def test_a_mistake_is_one_line(thruster, tmp_path, arguments, line):  # noqa: F8
 
 
 def test_a_video_that_cannot_be_drawn_is_said(monkeypatch):
-    monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(renderer.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match="drawing needs pygame, which is not installed"):
-        video.check_drawing(None)
+        renderer.check_drawing(None)
 
 
 def test_torch_is_not_imported():

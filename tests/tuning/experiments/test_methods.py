@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import ttest_1samp, ttest_rel
 
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from tuning.experiments.methods import runs as study_runs
+from tuning.experiments.methods import runs
 from tuning.experiments.methods.problems import (
     CASES,
     ENTRIES,
@@ -98,7 +98,7 @@ def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     few = FAST._replace(methods=("likelihood", "noise-estimation"), sets=2)
     first = run_protocol(few, tmp_path)
     assert len(first) == len(list(jobs_of(few))) == 1 + 2 * 2 * 2
-    monkeypatch.setattr(study_runs, "run_method", None)
+    monkeypatch.setattr(runs, "run_method", None)
     again = run_protocol(few, tmp_path)
     assert json.dumps([one._asdict() for one in again]) == json.dumps([one._asdict() for one in first])
     name = file_of(tmp_path, WALK, "likelihood", 1, few)
@@ -114,7 +114,7 @@ def test_results_that_say_way_are_read(tmp_path):
     file.parent.mkdir()
     content = result("random", 0, 1.0)._asdict()
     file.write_text(json.dumps({"way": content.pop("method"), **content}))
-    assert study_runs.read(tmp_path, few) == [result("random-only", 0, 1.0)]
+    assert runs.read(tmp_path, few) == [result("random-only", 0, 1.0)]
 
 
 def test_the_protocol_names_all_groups_and_was_predicted():

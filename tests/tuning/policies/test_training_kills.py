@@ -12,7 +12,7 @@ pytest.importorskip("sb3_contrib")
 
 from tests.fuzz.checkpoints import kill_training
 from tests.learners import contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures
-from tuning.policies import comparison as runs
+from tuning.policies import comparison
 from tuning.policies.saved import BEST, CHECKPOINTS, FINAL, SETUP, find_saved, mend
 
 
@@ -86,7 +86,7 @@ def test_a_process_of_a_comparison_ends_with_its_parent(monkeypatch):
     parent = multiprocessing.get_context("spawn").Process(target=int)
     parent.start()
     monkeypatch.setattr(multiprocessing, "parent_process", lambda: parent)
-    runs._end_with_parent()
+    comparison._end_with_parent()
     assert ended == [1] and parent.exitcode == 0
 
 

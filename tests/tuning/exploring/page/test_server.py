@@ -18,7 +18,7 @@ from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 from tuning.cli import explore
-from tuning.exploring.page import session as module
+from tuning.exploring.page import session
 from tuning.exploring.page.session import LOOPBACK, Server
 
 SCRIPT = "static/js/bokeh.min.js"
@@ -135,7 +135,7 @@ def test_it_listens_on_the_loopback_address_alone_and_tokens_are_long_and_new():
 
 @pytest.mark.slow
 def test_it_ends_when_the_last_page_was_left(monkeypatch):
-    monkeypatch.setattr(module, "LEFT_FOR", 0.2)
+    monkeypatch.setattr(session, "LEFT_FOR", 0.2)
     made = Server(page)
     thread = Thread(target=made.run, daemon=True)
     thread.start()
