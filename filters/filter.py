@@ -15,12 +15,14 @@ import numpy as np
 from filters.engine.belief import Belief, Innovation, Kernels
 from filters.engine.session import GatedSession, Running, Session
 from thruster_env.core.compiled import is_interpreting
+from thruster_env.core.modules import object_named
 from thruster_env.model.state_space import StateSpaceModel
 
 if TYPE_CHECKING:
     from filters.live import Live
 
 Q, R = "Q", "R"
+LIVE = "filters.live:Live"  # which knows this module
 SPARE, SPARE_IN_PYTHON = "_spare", "_spare_in_python"  # attributes: sessions that are not in use
 
 
@@ -175,6 +177,4 @@ class Filter:
 
     def live(self, **options: Any) -> Live:
         """This filter on real clocks, with steps of any length and each sensor at its own times; see `Live`."""
-        from filters.live import Live
-
-        return Live(self, **options)
+        return object_named(LIVE, "class")(self, **options)

@@ -15,6 +15,9 @@ from thruster_env.model.state_space import StateSpaceModel
 TRAINED = ".safetensors"  # the end of the name of a trained estimator's file
 
 
+READER = "filters.learned:read_estimator"  # of trained estimators' files; it needs torch, and knows this package
+
+
 def is_trained(argument) -> bool:
     """Whether something is the name of a file of `thruster train-estimator`."""
     return isinstance(argument, str | Path) and str(argument).endswith(TRAINED)
@@ -49,9 +52,7 @@ def is_filter_class(argument) -> bool:
 def estimator_named(argument) -> Any:
     """A user's estimator argument: what a trained one's file makes, the object of "module:object", or itself."""
     if is_trained(argument):
-        from filters.learned import read_estimator
-
-        return read_estimator(argument)
+        return object_named(READER, "reader")(argument)
     return object_named(argument, "estimator") if isinstance(argument, str) else argument
 
 

@@ -1,13 +1,8 @@
 """Estimators with a network in them, trained on runs whose states are known; this needs torch and safetensors.
 
-equations   a model's equations over whole steps, on batches of tensors
-networks    recurrent networks for gains and for roots of covariances
-estimator   what all have in common: one trajectory step by step, or many at once
-gains       `kalmannet` and `recursive-kalmannet`, which learn a filter's gain
-recurrent   `gru`, a network without a model
-ensemble    `differentiable-enkf`, an ensemble filter that learns its noise
+estimator   what all have in common, and a model's equations over whole steps, on batches of tensors
+filters     `kalmannet`, `recursive-kalmannet`, which learn a gain; `differentiable-enkf`, which learns its noise
 file        trained estimators as files of numbers
-threads     how many threads of torch evaluate and train them
 
 `tuning.train_estimator` and `thruster train-estimator` train them.
 """

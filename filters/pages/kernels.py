@@ -28,8 +28,16 @@ from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import matrix_reader, vector_reader
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from thruster_env.graphs.graphs import CONDITIONS, Graph, Number, TooLarge, needed_by, uncollected
-from thruster_env.graphs.instructions import cut
-from thruster_env.graphs.programs import ARRAYS, BY_MEMBERS, OF_MEMBERS, OF_STEPS, Place, callable_of, program_of
+from thruster_env.graphs.programs import (
+    ARRAYS,
+    BY_MEMBERS,
+    OF_MEMBERS,
+    OF_STEPS,
+    Place,
+    callable_of,
+    cut,
+    program_of,
+)
 from thruster_env.model.shape import LANES, Functions, Shape, constants_reader, number_places
 
 OF_PARAMETER = ("change", "move")  # arrays that differ between parameters

@@ -22,7 +22,8 @@ from filters.filter import Filter
 from filters.gaussian.multiple_models import MultipleModelFilter
 from filters.pages.kernels import analysis_of
 from filters.pages.page_filter import PageFilter
-from filters.smoothers.rts import passes, relation_of, smooth_backwards, smoothed_modes
+from filters.smoothers.modes import smoothed_modes
+from filters.smoothers.rts import passes, relation_of, smooth_backwards
 from filters.starts import warn_of_restarts
 from thruster_env.core.checks import at_least
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting

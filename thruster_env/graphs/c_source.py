@@ -16,8 +16,7 @@ import numpy as np
 
 from thruster_env.graphs.folding import as_single
 from thruster_env.graphs.graphs import COMPARISONS, CONDITIONS, Number
-from thruster_env.graphs.instructions import Cut
-from thruster_env.graphs.programs import CALLED_IN_ROUNDS, Place, Program
+from thruster_env.graphs.programs import CALLED_IN_ROUNDS, Cut, Place, Program
 
 OF_TWO = {name: name for name in ("+", "-", "*", "/", *COMPARISONS)} | {"and": "&&", "or": "||"}
 OTHER_NAMES = {"abs": "fabs"} | {f"arc{name}": f"a{name}" for name in ("tan", "tan2", "sinh", "cosh", "tanh")}

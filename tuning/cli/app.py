@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from tuning.cli.printing import printed_whole
+from tuning.cli.main import PrintedWhole
 
 PANELS = {
     "First steps": ("demo", "inspect", "simulate", "filters", "new"),
@@ -61,7 +61,7 @@ class Command(TyperCommand):
 
     def format_help(self, ctx, formatter) -> None:
         """Print the help."""
-        with printed_whole():
+        with PrintedWhole():
             super().format_help(ctx, formatter)
 
 
@@ -77,7 +77,7 @@ class Group(TyperGroup):
 
     def format_help(self, ctx, formatter) -> None:
         """Print the help."""
-        with printed_whole():
+        with PrintedWhole():
             super().format_help(ctx, formatter)
 
 

@@ -24,6 +24,7 @@ from thruster_env.logs.recorders.bags import HEADER, RECEIPT
 from thruster_env.logs.recorders.registry import ENDINGS, Contents, Field, contents, format_of
 from thruster_env.logs.table import SUFFIXES, read_table
 from thruster_env.logs.write import check_suffix, write_log
+from tuning.cli.main import PrintedWhole
 from tuning.cli.options import (
     A_LOG,
     INPUT,
@@ -33,7 +34,6 @@ from tuning.cli.options import (
     with_groups,
 )
 from tuning.cli.output import check_picture, check_targets, emit
-from tuning.cli.printing import printed_whole
 from tuning.logs.read import read_named
 from tuning.problems.plant_packages import logs_package
 
@@ -214,7 +214,7 @@ def command(
         check_targets((), json, read=(log,))
         selected = found_in(log, only, reading.stamps)
         output, notes = as_table(log, selected.fields, console.is_terminal), remarks(selected)
-        with printed_whole():
+        with PrintedWhole():
             emit([output, *notes] if console.is_terminal else [], as_json(log, selected), json)
             if isinstance(output, str) and json != "-":
                 typer.echo("\n".join([output, *notes]))

@@ -198,5 +198,33 @@ def leave(*_) -> None:
         os._exit(INTERRUPTED)
 
 
+class PrintedWhole:
+    """A context in which the first Ctrl-C waits for its end; the next one ends the process, as on a blocked pipe.
+
+    Outside the main thread, where Python delivers no signals, it has no effect.
+    """
+
+    def __enter__(self) -> None:
+        from threading import current_thread, main_thread
+
+        self._caught: list[int] = []
+        self._is_main = current_thread() is main_thread()
+        if self._is_main:
+            self._before = getsignal(SIGINT)
+            signal(SIGINT, self._note)
+
+    def __exit__(self, *_) -> None:
+        from signal import raise_signal
+
+        if self._is_main:
+            signal(SIGINT, self._before)
+        if self._caught:
+            raise_signal(SIGINT)
+
+    def _note(self, number, frame) -> None:
+        self._caught.append(number)
+        signal(SIGINT, leave)
+
+
 if __name__ == "__main__":
     run()

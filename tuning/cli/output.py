@@ -22,8 +22,8 @@ from thruster_env.logs.recorders.registry import ENDINGS
 from thruster_env.logs.table import SUFFIXES
 from thruster_env.logs.write import check_not_among, check_suffix
 from thruster_env.thruster.plant import largest_known_voltage
+from tuning.cli.main import PrintedWhole
 from tuning.cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
-from tuning.cli.printing import printed_whole
 
 PICTURES = (".png", ".svg", ".pdf")  # which figures are written as
 progress_console = Console(stderr=True, markup=False, highlight=False)
@@ -32,14 +32,14 @@ progress_console = Console(stderr=True, markup=False, highlight=False)
 def emit(parts: Sequence[RenderableType], data: dict, json_target: str | None) -> None:
     """Print tables and lines, unless JSON goes to standard output; write JSON where asked."""
     if json_target == "-":
-        with printed_whole():
+        with PrintedWhole():
             sys.stdout.write(as_text(data))
             sys.stdout.flush()
         return
     _check_json(json_target)
     if json_target is not None:  # first: there may be nobody left who reads what is printed
         write_whole(json_target, as_text(data))
-    with printed_whole():
+    with PrintedWhole():
         for part in parts:
             console.print(part)
 

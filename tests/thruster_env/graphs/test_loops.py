@@ -7,8 +7,7 @@ from filters.algebra.matrices import entries_product, input_matrix
 from filters.algebra.members import covariance, mean, variances
 from filters.pages.kernels import Stage, as_programs
 from thruster_env.core.compiled import compiled, interpreted
-from thruster_env.graphs.instructions import cut
-from thruster_env.graphs.programs import OF_MEMBERS, Place, callable_of
+from thruster_env.graphs.programs import OF_MEMBERS, Place, callable_of, cut
 
 N, COLUMNS, SIZE = 7, 16, 11
 
