@@ -129,9 +129,9 @@ class Live:
         """The same with the first one's update, states and likely cause; None if there was none."""
         return self._first.restarts(self.divergences)
 
-    def told(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+    def latest(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
         """Copies of mean, covariance and the last innovation with its covariance, and its log-likelihood."""
-        return self._session.told()
+        return self._session.latest()
 
     def start(self, time: float, z: Sequence[float] | np.ndarray | None = None, key=(0, 0)) -> None:
         """Begin with the prior at a time [s], updated with a measurement z (m,) if there is one."""

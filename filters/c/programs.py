@@ -134,9 +134,9 @@ class FilterPrograms(NamedTuple):
 
     Attributes:
         start: the filter's extras at the prior; of an ensemble the members.
-        begin: X, which is predicted in place of mean and covariance: points in a row, or a mean and a root.
-        advance: a substep under u of the belief or of X; of one point, x; of all members of an ensemble.
-        add_noise: the belief at the end of a step.
+        represent: X, which is predicted in place of mean and covariance: points in a row, or a mean and a root.
+        propagate: a substep under u of the belief or of X; of one point, x; of all members of an ensemble.
+        add_process_noise: the belief at the end of a step.
         update: the belief after z, the innovation, its covariance and its log-likelihood.
         summarise: mean and covariance of an ensemble.
         extras: shapes of the extras that the filter keeps, by name.
@@ -148,9 +148,9 @@ class FilterPrograms(NamedTuple):
     """
 
     start: Program
-    begin: Program
-    advance: Program
-    add_noise: Program
+    represent: Program
+    propagate: Program
+    add_process_noise: Program
     update: Program
     summarise: Program
     extras: Mapping[str, tuple[int, ...]]
@@ -168,11 +168,11 @@ class FilterPrograms(NamedTuple):
     @property
     def operations(self) -> tuple[int, int]:
         """Numbers of operations of a prediction and of an update, without those of random numbers."""
-        begin, advance, add_noise, update, summarise = (
+        represent, propagate, add_process_noise, update, summarise = (
             sum(self.members if number.member else 1 for number in program.works) for program in self[1:6]
         )
         substeps = self.model.substeps * max(self.points, 1)
-        return begin + substeps * advance + add_noise + summarise, update
+        return represent + substeps * propagate + add_process_noise + summarise, update
 
 
 def programs_of(filter_: Filter) -> FilterPrograms:
@@ -198,7 +198,7 @@ def _row_programs(paged: FilterWithPage) -> FilterPrograms:
     layout, memory = memory_places(shape.n, shape.m), RowMemory(shape, page)
     equations = Equations(model.functions, memory, constants_move=False, trace=True)
     stages = [stage.of_rows for stage in stages_of(page, memory, equations)]
-    extras = {name: matrix.shape for name, matrix in memory.kept.items()}
+    extras = {name: matrix.shape for name, matrix in memory.extras.items()}
     if wrong := [name for name in extras if name in RESERVED or not is_name(name) or is_macro(name)]:
         raise ValueError(f"a quantity of a filter in C must have an unused name, but got {wrong[0]!r}")
     predicted_size = memory.end - layout.extras - sum(prod(size) for size in extras.values())
@@ -207,16 +207,16 @@ def _row_programs(paged: FilterWithPage) -> FilterPrograms:
         stages[2] = {layout.mean: equations.f(memory.x, memory.u)}
     stages[4][NIS] = _nis(stages[4][layout.innovation], stages[4][layout.innovation_cov])
     extra_parts = [
-        *((matrix.operation.at, matrix.shape, f"filter->{name}") for name, matrix in memory.kept.items()),
+        *((matrix.operation.at, matrix.shape, f"filter->{name}") for name, matrix in memory.extras.items()),
         (memory.end - predicted_size, (predicted_size,), "X"),
     ]
     means = ["filter->x"] * 2 + ["x" if points else "filter->x"] + ["filter->x"] * 2
-    start, begin, advance, add_noise, update = (
+    start, represent, propagate, add_process_noise, update = (
         _program({Place("rows", at): matrix for at, matrix in stage.items()}, lies, numbers, Graph(MOST))
         for stage, mean, argument in zip(stages, means, "uuuuz", strict=True)
         for lies in [_where(shape, mean, argument, extra_parts, points)]
     )
-    programs = start, begin, advance, add_noise, update, Program([], [], [])
+    programs = start, represent, propagate, add_process_noise, update, Program([], [], [])
     return FilterPrograms(*programs, extras, predicted_size, points, 0, model, page.update.__module__)
 
 
@@ -229,21 +229,21 @@ def _member_programs(paged: EnsembleFilter) -> FilterPrograms:
     layout = memory_places(shape.n, shape.m)
     v, s = (outputs[Place("rows", at)] for at in (layout.innovation, layout.innovation_cov))
     stages["update"].values[Place("rows", NIS)] = _nis(v, s)
-    extras = {name: matrix.shape for name, matrix in memory.kept.items()}
-    extra_parts = [(matrix.operation.at, matrix.shape, f"filter->{name}") for name, matrix in memory.kept.items()]
-    begin = Program([], [], [])
-    start, advance, add_noise, update, summarise = (
+    extras = {name: matrix.shape for name, matrix in memory.extras.items()}
+    extra_parts = [(extra.operation.at, extra.shape, f"filter->{name}") for name, extra in memory.extras.items()]
+    represent = Program([], [], [])
+    start, propagate, add_process_noise, update, summarise = (
         _program(dict(stages[name].stores[0]), lies, numbers, Graph(MOST, size))
         for name, argument in (
             ("start", "u"),
-            ("advance", "u"),
-            ("settle", "u"),
+            ("propagate", "u"),
+            ("add_process_noise", "u"),
             ("update", "z"),
             ("summarise", "z"),
         )
         for lies in [_where(shape, "filter->x", argument, extra_parts)]
     )
-    programs = start, begin, advance, add_noise, update, summarise
+    programs = start, represent, propagate, add_process_noise, update, summarise
     return FilterPrograms(*programs, extras, 0, 0, size, model, type(paged).page.update.__module__)
 
 
@@ -266,9 +266,11 @@ def _check_traced(
         ) from error
 
 
-def _points_of(advance: Mapping[int, Matrix], equations: Equations, memory: RowMemory, predicted_size: int) -> int:
+def _points_of(
+    propagate: Mapping[int, Matrix], equations: Equations, memory: RowMemory, predicted_size: int
+) -> int:
     """How many points a substep propagates by f alone; 0 if it has other operations."""
-    (at, propagated), *rest = advance.items()
+    (at, propagated), *rest = propagate.items()
     if predicted_size == 0 or rest or not propagated.of or propagated.of[0].operation != Place("rows", at):
         return 0
     return propagated.shape[1] if propagated is equations.f(propagated.of[0], memory.u) else 0
@@ -355,7 +357,7 @@ def single_error(filter_: Filter, programs: FilterPrograms, inputs: np.ndarray, 
 
 def _means(programs: FilterPrograms, key: np.ndarray, inputs: np.ndarray, z: np.ndarray) -> np.ndarray:
     model, n, m = programs.model, programs.model.n, programs.model.m
-    start, begin, advance, add_noise, update, _ = map(_compile_program, programs.all)
+    start, represent, propagate, add_process_noise, update, _ = map(_compile_program, programs.all)
     names = {**work_names(), "float": _Single, "X": np.zeros(programs.predicted_size, np.float32)}
     names |= {"P": model.prior_cov.ravel().astype(np.float32), "S": np.zeros(m * m, np.float32)}
     names |= {name: np.zeros(prod(shape), np.float32) for name, shape in programs.extras.items()}
@@ -374,12 +376,12 @@ def _means(programs: FilterPrograms, key: np.ndarray, inputs: np.ndarray, z: np.
     for k in range(len(z)):
         if k > 0:
             names["u"] = inputs[k - 1]
-            exec(begin, names)
+            exec(represent, names)
             for _ in range(model.substeps):
                 for point in names["X"].reshape(-1, n) if programs.points else [x]:
-                    exec(advance, names | {"x": point})
+                    exec(propagate, names | {"x": point})
             draw(FILTER_PROCESS, k, n)
-            exec(add_noise, names)
+            exec(add_process_noise, names)
         names["z"] = z[k]
         draw(FILTER_MEASUREMENT, k, m)
         exec(update, names)

@@ -52,7 +52,7 @@ public:
     Real covariance(int row, int column) const noexcept {{ return filter_.P[row * states + column]; }}
 
     /* The innovation, its covariance, NIS, and whatever else {name}.h names. */
-    const {name} &told() const noexcept {{ return filter_; }}
+    const {name} &values() const noexcept {{ return filter_; }}
 
 {tests}private:
     {name} filter_;

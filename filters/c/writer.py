@@ -202,9 +202,9 @@ void {name}_update({name} *filter{z})
         advanced = f"{real} *x" if programs.points else belief + predicted
         return [
             *[self.function("start", belief, programs.start)] * bool(programs.extras),
-            *[self.function("begin", belief + predicted, programs.begin)] * bool(programs.predicted_size),
-            self.function("advance", advanced + self.of_u, programs.advance),
-            self.function("settle", belief + predicted, programs.add_noise),
+            *[self.function("represent", belief + predicted, programs.represent)] * bool(programs.predicted_size),
+            self.function("propagate", advanced + self.of_u, programs.propagate),
+            self.function("add_process_noise", belief + predicted, programs.add_process_noise),
             self.function("correct", f"{belief}, const {real} *z", programs.update),
         ]
 
@@ -224,14 +224,14 @@ void {name}_update({name} *filter{z})
         """Statements of a step."""
         programs, n = self.programs, self.model.n
         points = ", X" * bool(programs.predicted_size)
-        begin, step = "", f"        advance(filter{points}{self.by_u});\n"
+        begin, step = "", f"        propagate(filter{points}{self.by_u});\n"
         if programs.predicted_size:
-            begin = f"    {self.real} X[{programs.predicted_size}];\n\n    begin(filter, X);\n"
+            begin = f"    {self.real} X[{programs.predicted_size}];\n\n    represent(filter, X);\n"
         if programs.points:
-            move = f"            advance(X + {n} * i{self.by_u});\n"
+            move = f"            propagate(X + {n} * i{self.by_u});\n"
             step = f"        for (int i = 0; i < {programs.points}; i++) {{\n{move}        }}\n"
         loop = f"    for (int k = 0; k < {self.model.substeps}; k++) {{\n{step}    }}\n"
-        return f"{begin}{loop}    settle(filter{points});\n"
+        return f"{begin}{loop}    add_process_noise(filter{points});\n"
 
     def before_update(self) -> str:
         """Statements before a correction."""
@@ -345,8 +345,8 @@ class EnsembleWriter(Writer):
             DRAW.format(name=self.name, real=real, width=self._width, **words),
             self.function("start", belief, programs.start),
             self.function("summarise", belief, programs.summarise),
-            self.function("advance", belief + self.of_u, programs.advance),
-            self.function("settle", belief, programs.add_noise),
+            self.function("propagate", belief + self.of_u, programs.propagate),
+            self.function("add_process_noise", belief, programs.add_process_noise),
             self.function("correct", f"{belief}, const {real} *z", programs.update),
         ]
 

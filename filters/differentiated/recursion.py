@@ -91,7 +91,7 @@ class Memory(NumbersMemory):
         self.predicted = [self.x, self.P]
         if page.represent is not None:
             self.predicted = [self._moving(at, matrix) for at, matrix in zip(starts, predicted, strict=False)]
-        self.kept = {
+        self.extras = {
             name: self._moving(at, matrix) for at, (name, matrix) in zip(of_extras, started.items(), strict=False)
         }
         slopes = page.parameters(lambda offset, size: self.read("move", own_slopes + offset, *size))
@@ -233,7 +233,7 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
     def belief_stage(results: Any, more: dict | None = None, slopes: dict | None = None) -> Stage:
         """A stage that stores results of the page and its extras, with their slopes."""
         *values, changed = with_extras(results)
-        extras = {name: changed.get(name, extra) for name, extra in memory.kept.items()}
+        extras = {name: changed.get(name, extra) for name, extra in memory.extras.items()}
         starts = starts_of(*(prod(value.shape) for value in values))
         left = dict(zip(starts, values, strict=False)) | _by_offset(memory, extras)
         stage = stage_of({memory.left + at: value for at, value in left.items()} | (more or {}), left, moves)
@@ -245,7 +245,7 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
         started = _by_offset(memory, page.initial(model))
         stage = stage_of(started, started, moves)
         stages.append(stage._replace(slopes={at: value * 0.0 for at, value in started.items()} | stage.slopes))
-    model.extras = memory.kept
+    model.extras = memory.extras
     if page.represent is not None:
         stages.append(belief_stage(page.represent(model, x, p)))
     stages += [
@@ -270,7 +270,7 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
 
 
 def _by_offset(memory: Memory, extras: Mapping[str, Matrix]) -> dict[int, Matrix]:
-    return {memory.kept[name].operation.at: extra for name, extra in extras.items()}
+    return {memory.extras[name].operation.at: extra for name, extra in extras.items()}
 
 
 def _accumulator(

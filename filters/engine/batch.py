@@ -40,7 +40,7 @@ class Estimates(NamedTuple):
 
 
 def estimates_of(rows: Sequence[tuple], divergences: int) -> Estimates:
-    """`Estimates` of one trajectory, from the results of `Session.told` at each row."""
+    """`Estimates` of one trajectory, from the results of `Session.latest` at each row."""
     parts = [np.array(part)[None] for part in zip(*rows, strict=True)]
     return Estimates._make([*parts, np.array([divergences])])
 

@@ -306,7 +306,7 @@ class Session:
         kind = Belief if total < np.inf else LostBelief
         return kind(self.mean.copy(), self.cov.copy(), members, key, step, self.divergences, extras)
 
-    def told(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+    def latest(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
         """Copies of mean, covariance and the last innovation with its covariance, and its log-likelihood."""
         return self.mean.copy(), self.cov.copy(), *self.innovation_copy()
 

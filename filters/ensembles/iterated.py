@@ -89,9 +89,9 @@ def window_stages(length: int) -> Callable:
         plain = stages_of(page, memory, model)
         noise = input_matrix(Place("table", layout.iterate), (memory.shape.n,), member=True, like=memory.x)
         return {
-            **{name: plain[name] for name in ("start", "advance", "summarise")},
+            **{name: plain[name] for name in ("start", "propagate", "summarise")},
             "draw": stored((model.Q_root @ memory.w,), (noise,)),
-            "settle": stored((on_branch(memory.x + memory.w, model.state_angles),), (memory.x,)),
+            "add_process_noise": stored((on_branch(memory.x + memory.w, model.state_angles),), (memory.x,)),
             "update": stored(
                 (first, pull(first, first_v, first_S, R), first_v, first_S, first_v, first_S, level),
                 (Y, B, v, S, *outputs),
@@ -136,9 +136,8 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     """
     n, m, p, at = shape.n, shape.m, shape.inputs, window_places(shape, length)
     works = works_of(page, functions, shape, window_stages(length), at.scratch)
-    begin, propagate, draw, add_process_noise, moments_of, look, again = (
-        works[name].work for name in ("start", "advance", "draw", "settle", "summarise", "update", "again")
-    )
+    names = "start", "propagate", "draw", "add_process_noise", "summarise", "update", "again"
+    begin, propagate, draw, add_process_noise, moments_of, look, again = (works[name].work for name in names)
     row_places, substeps = memory_places(n, m), number_places(n, m).substeps
     step_place, key_0, key_1 = row_places.step, row_places.key_0, row_places.key_1
     offsets = page.parameter_offsets(own_place(shape))

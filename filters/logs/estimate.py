@@ -46,11 +46,11 @@ def by_the_clock(
     live = Live(filter_, noise=noise, resolution=log.resolution)
     times, z = log.times.tolist(), log.measurements
     live.start(0.0, z[0], key)
-    rows = [live.told()]
+    rows = [live.latest()]
     for k, u in enumerate(log.inputs, 1):
         live.predict_to(times[k], u)
         live.update(times[k], None, z[k])
-        rows.append(live.told())
+        rows.append(live.latest())
     return estimates_of(rows, live.divergences), live.restarts
 
 
@@ -213,6 +213,6 @@ def _stepped(
     for k in range(len(z)):
         if k:
             session.step(inputs[0, k - 1].tolist(), z[k])
-        rows.append(session.told())
+        rows.append(session.latest())
         first.note(session, inputs[0, k - 1] if k else None, z[k])
     return estimates_of(rows, session.divergences), first.restarts(session.divergences)

@@ -277,11 +277,11 @@ def stages_of(page: Page, memory: RowMemory, model: PagedModel) -> list[Stage]:
     advanced = as_tuple(page.propagate(model, *predicted, memory.u))
     outputs = layout.innovation, layout.innovation_cov, layout.log_likelihood
     return [
-        stored((started,), (), memory.kept),
+        stored((started,), (), memory.extras),
         Stage({}, {}) if page.represent is None else stored(begun, predicted),
-        stored(advanced, predicted, memory.kept),
-        stored(page.add_process_noise(model, *predicted), (x, p), memory.kept),
-        stored(page.update(model, x, p, memory.z), (x, p, *outputs), memory.kept),
+        stored(advanced, predicted, memory.extras),
+        stored(page.add_process_noise(model, *predicted), (x, p), memory.extras),
+        stored(page.update(model, x, p, memory.z), (x, p, *outputs), memory.extras),
     ]
 
 
@@ -291,7 +291,7 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     n, m = shape.n, shape.m
     memory, works, vectors = programs_of(page, functions, shape, partial(stages_of, page))
     start_extras, represent, advance, add_process_noise, correct = works
-    layout, extras_size = memory_places(n, m), sum(prod(matrix.shape) for matrix in memory.kept.values())
+    layout, extras_size = memory_places(n, m), sum(prod(matrix.shape) for matrix in memory.extras.values())
     prior, step_place, substeps_place = prior_start(shape), layout.step, number_places(n, m).substeps
 
     @inlined
@@ -389,8 +389,8 @@ def member_stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> di
     of_belief = memory.mean, memory.P
     return {
         "start": stored((prior, started), (x,), extras),
-        "advance": stored((page.propagate(model, x, memory.u),), (x,)),
-        "settle": stored((page.add_process_noise(model, x, memory.w),), (x,)),
+        "propagate": stored((page.propagate(model, x, memory.u),), (x,)),
+        "add_process_noise": stored((page.add_process_noise(model, x, memory.w),), (x,)),
         "analyse": stored((updated,), (x,)),
         "update": stored((updated, *rest, *moments(model, updated), changed), (x, *outputs, *of_belief), extras),
         "summarise": stored(moments(model, x), of_belief),
@@ -514,7 +514,7 @@ def extras_size(page: Page, shape: Shape) -> int:
 def predictor(works: dict[str, Works], shape: Shape) -> Callable:
     """Return `predict(memory, u, numbers, size)`: propagate members in all substeps, then add process noise."""
     layout, substeps = memory_places(shape.n, shape.m), number_places(shape.n, shape.m).substeps
-    advance, (add_process_noise, _, drawn) = works["advance"].work, works["settle"]
+    advance, (add_process_noise, _, drawn) = works["propagate"].work, works["add_process_noise"]
     step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
     @inlined

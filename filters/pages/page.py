@@ -106,14 +106,14 @@ class NumbersMemory:
         constants_slope, size: along a parameter that moves constants, if there are any.
         ratio: the last input as a number, if it is the step ratio.
         belief: places of mean and covariance.
-        told: places of the innovation, its covariance and its log density.
+        outputs: places of the innovation, its covariance and its log density.
     """
 
     def __init__(self, shape: Shape, page: Page, x: Matrix, p: Matrix, first_parameter: int):
         n, m = shape.n, shape.m
         layout, row = number_places(n, m), memory_places(n, m)
         self.belief = Place("rows", row.mean), Place("rows", row.cov)
-        self.told = tuple(Place("rows", at) for at in (row.innovation, row.innovation_cov, row.log_likelihood))
+        self.outputs = tuple(Place("rows", at) for at in (row.innovation, row.innovation_cov, row.log_likelihood))
         self.shape, self.x, self.P = shape, x, p
         self.Q = self.read("numbers", layout.q, n, n, symmetric=True)
         self.R = self.read("numbers", layout.r, m, m, symmetric=True)
@@ -126,7 +126,7 @@ class NumbersMemory:
         at = layout.constants if shape.constants else layout.substeps
         self.constants = self.read("numbers", at, shape.constants)
         self.own = page.parameters(lambda offset, size: self.read("numbers", first_parameter + offset, *size))
-        self.kept: Mapping[str, Matrix] = {}
+        self.extras: Mapping[str, Matrix] = {}
         self.end = row.extras
         self.constants_slope: Matrix | None = None
         self.ratio: Matrix | None = None
@@ -142,8 +142,8 @@ class NumbersMemory:
 
     def keep(self, started: Mapping[str, Any]) -> Mapping[str, Matrix]:
         """Lay out the extras of a filter in its row, and return them as matrices read from there."""
-        self.kept = {name: self.another(value, symmetric=value.symmetric) for name, value in started.items()}
-        return self.kept
+        self.extras = {name: self.another(value, symmetric=value.symmetric) for name, value in started.items()}
+        return self.extras
 
     def another(self, like: Matrix, *, symmetric: bool = False) -> Matrix:
         """A matrix of the same shape at the first free offset of the row."""
@@ -380,7 +380,7 @@ class PagedModel:
             self.Q = memory.Q * memory.ratio
             self.Q_root = root(self.Q)
         self.prior_mean, self.prior_root = memory.prior_mean, memory.prior_root
-        self.own, self.extras = memory.own, memory.kept
+        self.own, self.extras = memory.own, memory.extras
 
     def at(self, constants: Matrix) -> Self:
         """The same model with other constants."""

@@ -75,7 +75,7 @@ class Layout:
 
     Attributes:
         x, logarithm, weight: rows of the table: particles, log weights, and weights, which are scratch.
-        kept: the page's extras by name, in the table or the row.
+        extras: the page's extras by name, in the table or the row.
         size: the place of the ESS.
         rows, extras: how many rows of the table and numbers of the row belong to the belief.
     """
@@ -83,20 +83,20 @@ class Layout:
     def __init__(self, page: Page, memory: MembersMemory, model: PagedModel):
         n, first = memory.shape.n, memory_places(memory.shape.n, memory.shape.m).extras
         self.x, self.logarithm = memory.x, input_matrix(Place("table", n), (), member=True, like=memory.x)
-        self.size, self.kept = Place("rows", first), {}
+        self.size, self.extras = Place("rows", first), {}
         memory.end, rows = first + 1, n + 1
         self.start = with_extras(page.initial(model, memory.w))  # type: ignore[misc]
         for name, value in self.start[-1].items():
             if name in page.per_particle:
                 position = Place("table", rows)
-                self.kept[name] = input_matrix(
+                self.extras[name] = input_matrix(
                     position, value.shape, symmetric=value.symmetric, member=True, like=memory.x
                 )
                 rows += prod(value.shape)
             else:
-                self.kept[name] = memory.another(value, symmetric=value.symmetric)
+                self.extras[name] = memory.another(value, symmetric=value.symmetric)
         self.rows, self.extras, self.weight = rows, memory.end - first, Place("table", rows)
-        model.extras = self.kept
+        model.extras = self.extras
 
     def moments(self, model: PagedModel, x: Matrix, w: Matrix, P: Matrix | None) -> tuple[Matrix, ...]:
         """Particles with their angles on one branch, their mean and their covariance."""
@@ -108,12 +108,12 @@ class Layout:
 def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str, Stage]:
     """Stages of a particle filter's page, by name."""
     at = Layout(page, memory, model)
-    x, log_w, extras = at.x, at.logarithm, at.kept
-    innovation, cov, likelihood = memory.told
+    x, log_w, extras = at.x, at.logarithm, at.extras
+    innovation, cov, likelihood = memory.outputs
     of_each = {
         "start": (on_branch(at.start[0], model.state_angles), *at.start[1:]),
-        "advance": page.propagate(model, x, memory.u),
-        "settle": page.add_process_noise(model, x, memory.w),
+        "propagate": page.propagate(model, x, memory.u),
+        "add_process_noise": page.add_process_noise(model, x, memory.w),
     }
     if page.rejuvenate:
         of_each["renew"] = page.rejuvenate(model, x, memory.mean, memory.P, memory.w)

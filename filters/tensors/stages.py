@@ -403,11 +403,12 @@ class Stages:
     def __init__(self, f: Equation, h: Equation, shape: Shape, page: Page):
         self.memory = memory = RowMemory(shape, page)
         stages = stages_of(page, memory, TensorModel(f, h, memory))
-        parts = self._start, self._begin, self._advance, self._settle, self._update = [*map(_Part, stages)]
+        parts = [*map(_Part, stages)]
+        self._start, self._represent, self._propagate, self._add_process_noise, self._update = parts
         self.reads = {matrix for part in parts for matrix in part.inputs}
-        self._belief, self._outputs = memory.belief, memory.told
-        self._extras = {name: matrix.operation for name, matrix in memory.kept.items()}
-        self.extra_dimensions = {name: len(matrix.shape) for name, matrix in memory.kept.items()}
+        self._belief, self._outputs = memory.belief, memory.outputs
+        self._extras = {name: matrix.operation for name, matrix in memory.extras.items()}
+        self.extra_dimensions = {name: len(matrix.shape) for name, matrix in memory.extras.items()}
 
     def start(self, numbers: Mapping[Place, Tensor], prior: tuple[Tensor, Tensor], draw: Draw) -> tuple:
         """The belief at the prior, of its mean and covariance."""
@@ -419,7 +420,7 @@ class Stages:
     ) -> tuple:
         """The belief a step later."""
         tensors = self._tensors(numbers, belief, u)
-        for part in (self._begin, *[self._advance] * substeps, self._settle):
+        for part in (self._represent, *[self._propagate] * substeps, self._add_process_noise):
             tensors |= part(tensors, belief[0])
         return self._belief_of(tensors)
 
@@ -450,8 +451,8 @@ class EnsembleStages(Stages):
         }
         self._parts = parts
         self.reads = {matrix for part in parts.values() for matrix in part.inputs}
-        self._belief, self._outputs = memory.belief, memory.told
-        matrices = {"members": memory.x, **memory.kept}
+        self._belief, self._outputs = memory.belief, memory.outputs
+        matrices = {"members": memory.x, **memory.extras}
         self._extras = {name: matrix.operation for name, matrix in matrices.items()}
         self.extra_dimensions = {name: len(matrix.shape) + matrix.member for name, matrix in matrices.items()}
 
@@ -472,7 +473,7 @@ class EnsembleStages(Stages):
         """The belief a step later."""
         tensors = self._tensors(numbers, belief, u)
         tensors[NORMALS] = draw(FILTER_PROCESS, self.memory.shape.n)
-        return self._after(tensors, (*["advance"] * substeps, "settle", "summarise"), belief[0])
+        return self._after(tensors, (*["propagate"] * substeps, "add_process_noise", "summarise"), belief[0])
 
     def update(self, numbers: Mapping[Place, Tensor], belief: tuple, z: Tensor, draw: Draw) -> tuple[tuple, list]:
         """The belief after the measurement z; then the innovation, its covariance and its log density."""

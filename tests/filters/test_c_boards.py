@@ -28,7 +28,7 @@ int main()
     const OneFilter copy = filter;
     filter.reset();
     std::printf("%.17g %.17g %.17g %.17g\\n", double(copy.estimate(0)), double(copy.covariance(0, 0)),
-                double(copy.told().nis), double(filter.estimate(0)));
+                double(copy.values().nis), double(filter.estimate(0)));
 }
 """
 CROSS, EMULATOR = BUILD.split()[0], EMULATE.split()[0]

@@ -10,9 +10,9 @@ from filters.c.project import c_filter, write_project
 from filters.monitoring.monitor import monitor_of
 from tests.models import scalar_model, state_space
 
-TAKEN = """exp R advance NAN new class double_t correct settle filter x u z t0 i P prior_mean line math
-board is_lost update reset Real told states INFINITY isnan expf y0 gamma M_PI INT8_MAX NULL printf remove index
-string time COLUMNS uint32_t become_prior true template namespace operator x_t hypotl stdin""".split()
+TAKEN = """exp R propagate NAN new class double_t correct add_process_noise filter x u z t0 i P prior_mean line
+math board is_lost update reset Real values states INFINITY isnan expf y0 gamma M_PI INT8_MAX NULL printf
+remove index string time COLUMNS uint32_t become_prior true template namespace operator x_t hypotl stdin""".split()
 FREE = "ekf EKF tank torque stroke member R_ a test draw philox EKF_2 expo L MOTOR".split()
 
 
