@@ -36,6 +36,7 @@ NOT_RUN = {  # programs, by page and what is in them
     ("real_data.md", "import spring"): "the same, of a model of one's own",
     ("benchmarks.md", "experiments"): "needs the tuned files of the page's studies: tests/tuning/experiments",
     ("extending.md", "ScaleError"): "a fragment: the effect is the reader's",
+    ("extending.md", "scale_error"): "its test",
     ("extending.md", "fading"): "the same, of a filter that there is: tests/filters",
     ("extending.md", "Tank"): "the same, of a plant: tests/thruster_env",
     ("extending.md", "tank_model"): "the same",
