@@ -35,7 +35,7 @@ from filters.algebra.operations import (
     divide,
     exponential,
     joseph,
-    only,
+    mask_missing,
     present,
     sym,
     uncorrelated,
@@ -53,8 +53,8 @@ SEEDS = 100
 
 def update(model, x, P, z):
     measured = present(z)  # channels that are NaN are missing
-    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
-    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
+    H, R = mask_missing(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     L, M, K = root(P), root(R), divide(P @ H.T, S)
     for _ in range(3):

@@ -17,7 +17,7 @@ from filters.algebra.operations import (
     eye,
     is_number,
     joseph,
-    only,
+    mask_missing,
     present,
     sym,
     trace,
@@ -39,7 +39,7 @@ def noise_moment(measured, HPH, R, v):
     G)' + G H P H' G'; the moment is always positive definite. Missing channels carry no information; their part of
     the moment follows from the others through R.
     """
-    G = divide(only(measured, R).T, sym(HPH + uncorrelated(measured, R)))
+    G = divide(mask_missing(measured, R).T, sym(HPH + uncorrelated(measured, R)))
     A, e = eye(R) - G, G @ v
     return outer(e, e) + sym(A @ R @ A.T) + sym(G @ HPH @ G.T)
 
@@ -76,8 +76,8 @@ def initial_variational(model):
 def update_variational(model, x, P, z):
     """Update with the measurement z; NaN marks missing channels."""
     rho, V, nu, measured = model.own.forgetting_factor, model.extras["V"], model.extras["nu"], present(z)
-    H = only(measured, model.H(x))
-    v, HPH = only(measured, wrap(z - model.h(x), model.measurement_angles)), sym(H @ P @ H.T)
+    H = mask_missing(measured, model.H(x))
+    v, HPH = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles)), sym(H @ P @ H.T)
     R, later = V / nu, rho * nu + 1.0
     S = HPH + uncorrelated(measured, R)
     for _ in range(model.own.iterations):
@@ -156,11 +156,11 @@ def initial_robust(model):
 def update_robust(model, x, P, z):
     """Update with the measurement z; NaN marks missing channels."""
     d, measured, weight = model.own.degrees_of_freedom, present(z), 1.0
-    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
-    v, HPH = only(measured, wrap(z - model.h(x), model.measurement_angles)), sym(H @ P @ H.T)
+    H, R = mask_missing(measured, model.H(x)), uncorrelated(measured, model.R)
+    v, HPH = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles)), sym(H @ P @ H.T)
     S = HPH + R
     for _ in range(model.own.iterations):
-        E = only(measured, noise_moment(measured, HPH, R / weight, v))
+        E = mask_missing(measured, noise_moment(measured, HPH, R / weight, v))
         weight = (d + count(measured)) / (d + trace(divide(E, R)))
     R = R / weight
     K = divide(P @ H.T, HPH + R)
@@ -223,11 +223,11 @@ def add_process_noise_sage_husa(model, x, P):
 def update_sage_husa(model, x, P, z):
     """Update with the measurement z, then update R and Q; NaN marks missing channels."""
     measured, R, Q, old = present(z), model.extras["R"], model.extras["Q"], P
-    H, used = only(measured, model.H(x)), uncorrelated(measured, R)
-    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
+    H, used = mask_missing(measured, model.H(x)), uncorrelated(measured, R)
+    v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + used)
     K = divide(P @ H.T, S)
-    correction, P, of_seen = K @ v, joseph(P, K, H, used), sym(only(measured, only(measured, S).T))
+    correction, P, of_seen = K @ v, joseph(P, K, H, used), sym(mask_missing(measured, mask_missing(measured, S).T))
     for_r, for_q = (shifted(factor * -1.0, 1.0) for factor in model.own[:2])
     R = choose(exceeds(for_r, 0.0), bounded_step(R, outer(v, v), of_seen, for_r), R)
     if model.own.learns_q:  # K v v' K' from the correction of x, K S K' from the reduction of P

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from filters.tuned_file import OLD_FORMAT, sealed
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice

@@ -26,7 +26,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.dynamics import Constants
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, scaled_default
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.experiments.benchmark import run_in_memory
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
 from tuning.likelihood.identifiability import Identifiability, identify

@@ -118,7 +118,7 @@ def _only(result: tuple, z: tuple, shape: tuple) -> Callable:
     def entry(i, *rest) -> str:
         return f"(a[{i}]" + "".join(f"[{j}]" for j in rest) + f" if z[{i}] == z[{i}] else 0.0)"
 
-    return entrywise("only", "z, a", shape, entry, z=z, a=shape)
+    return entrywise("mask_missing", "z, a", shape, entry, z=z, a=shape)
 
 
 def _uncorrelated(result: tuple, z: tuple, shape: tuple) -> Callable:
@@ -170,7 +170,7 @@ _FUNCTIONS: dict[Operation, Callable] = {
     operations.of_best_gain: _of_best_gain,
     operations.eye: _identity,
     operations.on_one_branch: _on_one_branch,
-    operations.only: _only,
+    operations.mask_missing: _only,
     operations.uncorrelated: _uncorrelated,
     operations.factor: lambda result, shape: matrix_functions.cholesky_factor(shape[0]),
     operations.quotient: _quotient,

@@ -1,7 +1,7 @@
 """Symbolic matrices and vectors: an algorithm written with them is a graph of operations.
 
 `sym(F @ P @ F.T) + Q`, as a textbook writes it, is a function of matrices. Called with NumPy's arrays it computes;
-called with a `Matrix` it returns the graph of its operations. A graph can be differentiated (`scalars.slopes_of`),
+called with a `Matrix` it returns the graph of its operations. A graph can be differentiated (`slopes_of`),
 evaluated with Numbers in the place of floats (`evaluate`), or written out as calls of functions for its sizes
 (`calls`).
 

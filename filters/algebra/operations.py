@@ -117,7 +117,7 @@ def _masked(keep, a, shape):
 
 
 @operation(lambda measured, shape: shape)
-def only(measured, a):
+def mask_missing(measured, a):
     """A vector, or rows of a matrix, with zeros for missing channels."""
     return _masked(lambda i, *_: measured[i], a, a.shape)
 
@@ -228,7 +228,7 @@ def of_constant(result, arguments, slopes):
     return None
 
 
-for _masking in (only, uncorrelated):
+for _masking in (mask_missing, uncorrelated):
     _masking.derivative(
         lambda result, arguments, slopes: through(lambda slope: result.operation(arguments[0], slope), slopes[1])
     )

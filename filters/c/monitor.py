@@ -1,4 +1,4 @@
-"""The tests of `filters.monitoring` in C: `recursion.step_tests`, after each update of a filter."""
+"""The tests of `filters.monitoring` in C: `monitor.step_tests`, after each update of a filter."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class ConsistencyReport(NamedTuple):
     tails: tuple[float, ...] = ()  # kurtosis of each channel's whitened innovations; 3 of normal ones
     repeats: tuple[int, ...] = ()  # longest stretch of equal readings of each channel; empty if unknown
     constants: tuple[str, ...] = ()  # names of the model's constants, which may be estimated as states
-    blown: str = ""  # what `blow_up.blow_up_sentence` says of the model
+    blown: str = ""  # what `nees.blow_up_sentence` says of the model
 
 
 class Residuals(NamedTuple):

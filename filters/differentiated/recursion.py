@@ -16,7 +16,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.algebra.matrices import Matrix, input_matrix
-from filters.algebra.operations import factor, inverse, only, present, quotient, slopes_of, uncorrelated, wrap
+from filters.algebra.operations import (
+    factor,
+    inverse,
+    mask_missing,
+    present,
+    quotient,
+    slopes_of,
+    uncorrelated,
+    wrap,
+)
 from filters.algebra.points import density, density_slope, dot, heavier, outlier_weight, root
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.pages.kernels import Stage, as_calls, as_programs, as_tuple, stage_of, with_extras
@@ -41,7 +50,7 @@ class Memory(NumbersMemory):
 
         rows      x, P, extras; the same after a stage; u, z; the score; the true x; scratch of the slopes
         change    by parameter: dx, dP, d extras; d score; for the information `notes` numbers, twice
-        numbers   the model's; tails of two densities (`densities.tail_of`); the filter's own; weights of errors
+        numbers   the model's; tails of two densities (`points.tail_of`); the filter's own; weights of errors
         move      by parameter: dQ, dR, dc, the relative size of dc; dx and dP at the start; d own parameters
 
     Matrices lie by rows. `rows` and `change` hold one number for each run. During a step, a filter of points has
@@ -255,14 +264,14 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
     mean, cov, v, s, _, changed = with_extras(page.update(model, x, p, memory.z))
     if wanted.of_truth:
         known = present(memory.truth)
-        off = only(known, wrap(memory.truth - mean, model.state_angles))
+        off = mask_missing(known, wrap(memory.truth - mean, model.state_angles))
         of_truth = score_of_truth(memory, off, cov, moves, wanted.score)
         stages.append(belief_stage((mean, cov, changed), *of_truth))
         return stages
     stages.append(belief_stage((mean, cov, changed), *density_of(memory, v, s, moves, memory.tails[0], wanted)))
     if wanted.tails:
         measured = present(memory.z)
-        v = only(measured, wrap(memory.z - model.h(x), model.measurement_angles))
+        v = mask_missing(measured, wrap(memory.z - model.h(x), model.measurement_angles))
         stages.append(
             Stage(*density_of(memory, v, uncorrelated(measured, model.R), moves, memory.tails[1], wanted))
         )

@@ -17,7 +17,7 @@ import numpy as np
 
 from filters.algebra.matrices import input_matrix
 from filters.algebra.members import mean
-from filters.algebra.operations import only, present, uncorrelated, wrap
+from filters.algebra.operations import mask_missing, present, uncorrelated, wrap
 from filters.algebra.points import root
 from filters.algebra.roots import forward_quotient
 from filters.engine.belief import Kernels, memory_places, own_place
@@ -125,7 +125,7 @@ def with_unit_noise(page: Page, memory: MembersMemory, model) -> dict[str, Stage
     """M^-1 (y - mean(y)) of members and M^-1 (z - mean(y)), with M M' = R: channels with independent noise."""
     measured, n, m = present(memory.z), memory.shape.n, memory.shape.m
     y, M = expect(model, memory.x, memory.z), root(uncorrelated(measured, model.R))
-    v = only(measured, wrap(memory.z - mean(y), model.measurement_angles))
+    v = mask_missing(measured, wrap(memory.z - mean(y), model.measurement_angles))
     rows = input_matrix(Place("table", n), (m,), member=True, like=memory.x)
     target = memory.read("rows", scratch_place(page, memory.shape), m)
     return {"update": stored((forward_quotient(M, y - mean(y)), forward_quotient(M, v)), (rows, target))}

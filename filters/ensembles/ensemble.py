@@ -52,7 +52,7 @@ from filters.algebra.operations import (
     exceeds,
     factor,
     inverse,
-    only,
+    mask_missing,
     present,
     sym,
     uncorrelated,
@@ -143,7 +143,7 @@ def add_process_noise(model, x, w):
 
 def expect(model, x, z):
     """The predicted measurement of a member, zero in channels that are NaN in z."""
-    return on_branch(only(present(z), model.h(x)), model.measurement_angles)
+    return on_branch(mask_missing(present(z), model.h(x)), model.measurement_angles)
 
 
 def compare(model, x, z):
@@ -153,7 +153,7 @@ def compare(model, x, z):
     """
     measured, y = present(z), expect(model, x, z)
     R = uncorrelated(measured, model.R)
-    v = only(measured, wrap(z - mean(y), model.measurement_angles))
+    v = mask_missing(measured, wrap(z - mean(y), model.measurement_angles))
     C, A = covariance(x, y), covariance(y, y)
     if hasattr(model.own, "between"):
         C, A = C * model.own.taper, sym(A * model.own.between)

@@ -17,7 +17,7 @@ from typing import ClassVar, NamedTuple
 
 from filters.algebra.matrices import input_matrix
 from filters.algebra.members import covariance, mean, on_branch
-from filters.algebra.operations import divide, geometric_mean, only, present, wrap
+from filters.algebra.operations import divide, geometric_mean, mask_missing, present, wrap
 from filters.engine.belief import Kernels, memory_places, own_place
 from filters.ensembles.by_parts import relax_row, row_moments, stretch_row
 from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, expect, propagate
@@ -37,7 +37,7 @@ def linearised_again(model, y, z, Y, v, S, R):
     E = covariance(y, Y)
     D = divide(E, R + geometric_mean(R, S))
     shift = divide(E + D @ (S - R), S) @ v
-    v = only(present(z), wrap(z - mean(y), model.measurement_angles)) + shift
+    v = mask_missing(present(z), wrap(z - mean(y), model.measurement_angles)) + shift
     return y - mean(y) + D @ Y, v
 
 

@@ -122,7 +122,7 @@ def seed_of(key) -> int:
 
 
 class EstimatorBeliefs:
-    """An estimator on N copies of a vector env, a copy of it for each; see `batch_session.Beliefs`."""
+    """An estimator on N copies of a vector env, a copy of it for each; see `batch.Beliefs`."""
 
     def __init__(self, filter_, count: int):
         """Of a `ForeignFilter`; `start` comes next."""

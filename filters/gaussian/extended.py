@@ -1,6 +1,6 @@
 """The extended Kalman filter and its kin: iterated, with a fading memory, Schmidt's, and the H-infinity filter.
 
-The square-root and the UD form of the extended Kalman filter, which keep twice the digits of P.
+All linearise the model along their own estimate. The square-root and the UD form keep twice the digits of P.
 
 An orthogonal Theta from the right makes a matrix lower triangular:
 
@@ -35,13 +35,37 @@ from typing import Any, ClassVar
 import numpy as np
 
 from filters.algebra import roots
-from filters.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
+from filters.algebra.operations import divide, eye, joseph, mask_missing, present, sym, uncorrelated, wrap
 from filters.algebra.points import density, log_density, root, square
 from filters.algebra.roots import factor_of, forward_quotient, hstack, part, triangle, vstack, zeros
 from filters.baselines import places_of
 from filters.pages.page import Page
 from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import at_least, between, one_of, positive, vector
+
+# The extended Kalman filter: the Kalman filter of the model linearised along its own estimate.
+
+
+def propagate(model, x, P, u):
+    """Propagate mean and covariance by one substep."""
+    F = model.F(x, u)
+    return wrap(model.f(x, u), model.state_angles), sym(F @ P @ F.T)
+
+
+def add_process_noise(model, x, P):
+    """Add Q at the end of a step."""
+    return x, sym(P + model.Q)
+
+
+def update(model, x, P, z):
+    """Update with the measurement z; NaN marks missing channels."""
+    measured = present(z)
+    H, R = mask_missing(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
+    S = sym(H @ P @ H.T + R)
+    K = divide(P @ H.T, S)
+    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
+
 
 # The square-root form of the Kalman filter: the root L of P = L L' is carried, by orthogonal steps.
 
@@ -70,8 +94,8 @@ def add_process_noise_root(model, x, L):
 def update_root(model, x, P, z):
     """Update with the measurement z; NaN marks missing channels."""
     n, m, measured, L = len(x), len(z), present(z), model.extras["L"]
-    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
-    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
+    H, R = mask_missing(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     both = triangle(vstack(hstack(root(R), H @ L), hstack(zeros(L, n, m), L)))
     return root_result(model, x, both, v, measured)
 
@@ -114,8 +138,8 @@ def add_process_noise_ud(model, x, U):
 def update_ud(model, x, P, z):
     """Update with the measurement z; NaN marks missing channels."""
     measured, UD = present(z), model.extras["UD"]
-    H, R_root = only(measured, model.H(x)), root(uncorrelated(measured, model.R))
-    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
+    H, R_root = mask_missing(measured, model.H(x)), root(uncorrelated(measured, model.R))
+    v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     white = forward_quotient(R_root, H)
     of_s = triangle(hstack(R_root, H @ roots.upper_root(UD)))
     x = wrap(x + roots.measured_gain(UD, white) @ forward_quotient(R_root, v), model.state_angles)
@@ -124,29 +148,6 @@ def update_ud(model, x, P, z):
 
 
 UD = Page(propagate_ud, add_process_noise_ud, update_ud, represent_ud, initial_ud)
-
-# The extended Kalman filter: the Kalman filter of the model linearised along its own estimate.
-
-
-def propagate(model, x, P, u):
-    """Propagate mean and covariance by one substep."""
-    F = model.F(x, u)
-    return wrap(model.f(x, u), model.state_angles), sym(F @ P @ F.T)
-
-
-def add_process_noise(model, x, P):
-    """Add Q at the end of a step."""
-    return x, sym(P + model.Q)
-
-
-def update(model, x, P, z):
-    """Update with the measurement z; NaN marks missing channels."""
-    measured = present(z)
-    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
-    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
-    S = sym(H @ P @ H.T + R)
-    K = divide(P @ H.T, S)
-    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -158,7 +159,7 @@ class ExtendedKalmanFilter(PageFilter):
                  x += K v,  P = (I - K H) P (I - K H)' + K R K'  (Joseph)
 
     Attributes:
-        form: form of the recursion: "covariance" as above, "square-root" or "ud" (`gaussian.forms`), which keep
+        form: form of the recursion: "covariance" as above, "square-root" or "ud" (`this module`), which keep
             twice the digits of P. The estimates are equal to rounding.
 
     Raises:
@@ -185,9 +186,9 @@ def update_iterated(model, x, P, z):
     """Update with the measurement z, linearised again in each iteration; NaN marks missing channels."""
     measured, R, at, innovations = present(z), uncorrelated(present(z), model.R), x, []
     for i in range(model.own.iterations):
-        H, y = only(measured, model.H(at)), model.h(at)
+        H, y = mask_missing(measured, model.H(at)), model.h(at)
         on_tangent = y + H @ (x - at) if i else y
-        v = only(measured, wrap(z - on_tangent, model.measurement_angles))
+        v = mask_missing(measured, wrap(z - on_tangent, model.measurement_angles))
         S = sym(H @ P @ H.T + R)
         K = divide(P @ H.T, S)
         at = x + K @ v
@@ -270,8 +271,8 @@ class FadingMemoryFilter(PageFilter):
 def update_schmidt(model, x, P, z):
     """Update with the measurement z; NaN marks missing channels."""
     measured = present(z)
-    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
-    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
+    H, R = mask_missing(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     K = model.own.corrected @ divide(P @ H.T, S)
     return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)

@@ -23,7 +23,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from filters.algebra.operations import divide, joseph, mask_missing, present, sym, uncorrelated, wrap
 from filters.algebra.points import hats, log_density
 from filters.algebra.roots import inverse_of, zeros
 from filters.gaussian import extended
@@ -37,8 +37,8 @@ from thruster_env.model.affine import AffineModel, linearize
 def update_information(model, x, P, z):
     """Update with the measurement z, by the inverse of the covariance; NaN marks missing channels."""
     measured = present(z)
-    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
-    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
+    H, R = mask_missing(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     W = divide(H.T, R)  # H' R^-1
     P = inverse_of(sym(inverse_of(P) + W @ H))
@@ -115,7 +115,7 @@ class KalmanFilter(AffineFilter):
 
     Attributes:
         form: form of the recursion: "covariance" as above, "information" (`update_information`), "square-root" or
-            "ud" (`gaussian.forms`). The estimates are equal to rounding.
+            "ud" (`gaussian.extended`). The estimates are equal to rounding.
         schedule: number of operating points, spread over the range of the input; 1 for the model's own point.
 
     Raises:
@@ -179,8 +179,12 @@ STABLE = 1.0 - 1e-7  # upper limit of |eigenvalues| of A (I - K C): errors decay
 def update_steady(model, x, P, z):
     """Update with the measurement z; missing channels (NaN) have no innovation and no column of the gain."""
     measured = present(z)
-    H, R, K = only(measured, model.H(x)), uncorrelated(measured, model.R), only(measured, model.own.gain.T).T
-    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
+    H, R, K = (
+        mask_missing(measured, model.H(x)),
+        uncorrelated(measured, model.R),
+        mask_missing(measured, model.own.gain.T).T,
+    )
+    v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
 

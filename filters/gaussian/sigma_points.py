@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from filters.algebra.matrices import operation
-from filters.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
+from filters.algebra.operations import divide, mask_missing, of_best_gain, present, sym, uncorrelated, wrap
 from filters.algebra.points import first, log_density, on_circle, ones, outer, root, square, units, without_first
 from filters.algebra.roots import hstack, part, triangle, vstack, zeros
 from filters.baselines import place_of
@@ -46,7 +46,7 @@ def propagate_points(model, X, u):
     return model.f(X, u)
 
 
-# The square-root form of the unscented filter: P, S and the gain follow from one triangle (`forms.root_result`).
+# The square-root form of the unscented filter: P, S and the gain follow from a triangle (`extended.root_result`).
 
 
 def represent_unscented_root(model, x, P):
@@ -70,8 +70,8 @@ def update_unscented_root(model, x, P, z):
     """Update with the measurement z; NaN marks missing channels."""
     n, m, measured, L = len(x), len(z), present(z), model.extras["L"]
     y, s, D = unscented_moments(model, model.h(unscented_points(model, x, L)), model.measurement_angles)
-    s, D, R = only(measured, s), only(measured, D), uncorrelated(measured, model.R)
-    v = only(measured, wrap(z - y, model.measurement_angles))
+    s, D, R = mask_missing(measured, s), mask_missing(measured, D), uncorrelated(measured, model.R)
+    v = mask_missing(measured, wrap(z - y, model.measurement_angles))
     of_x = (L * model.own.spread) @ without_first(units(x)) * model.own.weight_root
     both = vstack(hstack(deviations(model, D, s), root(R)), hstack(of_x, zeros(L, n, m + 1)))
     return root_result(model, x, triangle(both), v, measured)
@@ -105,8 +105,8 @@ def update_unscented(model, x, P, z):
     g, w = model.own.spread, model.own.weight
     L, U, measured = root(P), without_first(units(x)), present(z)
     y, s, D = unscented_moments(model, model.h(unscented_points(model, x, L)), model.measurement_angles)
-    s, D, R = only(measured, s), only(measured, D), uncorrelated(measured, model.R)
-    v = only(measured, wrap(z - y, model.measurement_angles))
+    s, D, R = mask_missing(measured, s), mask_missing(measured, D), uncorrelated(measured, model.R)
+    v = mask_missing(measured, wrap(z - y, model.measurement_angles))
     C = (L @ (U @ D.T)) * (w * g)
     S = scatter(model, D, s) + R
     K = divide(C, S)
@@ -212,8 +212,8 @@ def update_cubature(model, x, P, z):
     """Update with the measurement z; NaN marks missing channels."""
     (g, w), L, U, measured = model.own, root(P), without_first(units(x)), present(z)
     y, D = cubature_moments(model, model.h(cubature_points(model, x, L)), model.measurement_angles)
-    D, R = only(measured, D), uncorrelated(measured, model.R)
-    v = only(measured, wrap(z - y, model.measurement_angles))
+    D, R = mask_missing(measured, D), uncorrelated(measured, model.R)
+    v = mask_missing(measured, wrap(z - y, model.measurement_angles))
     C = (L @ (U @ D.T)) * (w * g)
     S = square(D) * w + R
     K = divide(C, S)

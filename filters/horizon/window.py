@@ -40,7 +40,7 @@ from filters.algebra.operations import (
     eye,
     joseph,
     logarithm,
-    only,
+    mask_missing,
     present,
     quotient,
     sym,
@@ -153,8 +153,8 @@ def correct(model, x, d, P, z, fresh, loss):
     The weight follows from the residual at x; for a fresh step, without an estimate, from the innovation.
     """
     measured = present(z)
-    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
-    residual = only(measured, wrap(z - model.h(x), model.measurement_angles))
+    H, R = mask_missing(measured, model.H(x)), uncorrelated(measured, model.R)
+    residual = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     v, square = residual - H @ d, dot(residual, divide(residual, R))
     limit = model.own.threshold * model.own.threshold
     cost = loss_of(square, measured, limit, loss)

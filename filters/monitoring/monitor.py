@@ -321,7 +321,7 @@ class Monitor:
         return self.steps_between * STATISTICAL * channels
 
     def limits(self, channels: int) -> np.ndarray:
-        """The thresholds as `recursion.step_tests` takes them."""
+        """The thresholds as `step_tests` takes them."""
         return _limits(self, channels)
 
     def watch(self, channels: int) -> Watch:
@@ -382,7 +382,7 @@ def _limits(monitor: Monitor, channels: int) -> np.ndarray:
 
 @cache
 def _compiled() -> tuple[CompiledOrPython, CompiledOrPython]:
-    """`recursion.step_tests` and `run_tests`, compiled at their first call."""
+    """`step_tests` and `run_tests`, compiled at their first call."""
     inlined(squared_innovation)
     inlined(step_tests)
     return CompiledOrPython(step_tests), CompiledOrPython(run_tests)

@@ -1,11 +1,9 @@
 """Filters as pages of a textbook, pure functions of small matrices, and what runs them.
 
-page         a page, its parameters, and the layout of its matrices in memory
+page         a page, its parameters, its matrices in memory, and the model that it gets: f, F, h, H, Q, R
 page_filter  a filter that has a page
-equations    the model that pages get: f, F, h, H, Q, R of matrices; central differences of called functions
 traced       a model's functions and their derivatives as graphs of numbers
-kernels      the stages of a page, as programs or calls, and as kernels of the engine
-members      the same of an ensemble filter, whose equations of a member are evaluated for each member
+kernels      the stages of a page, also of an ensemble's members, as programs or calls: kernels of the engine
 
 From a page to machine code, in steps:
 

@@ -36,7 +36,7 @@ from typing import Any, ClassVar
 from filters.algebra.matrices import Matrix, input_matrix
 from filters.algebra.members import mean as mean_of
 from filters.algebra.members import on_branch
-from filters.algebra.operations import at_least, only, present, uncorrelated, wrap
+from filters.algebra.operations import at_least, mask_missing, present, uncorrelated, wrap
 from filters.algebra.points import (
     effective_size,
     log_density,
@@ -77,7 +77,7 @@ class Layout:
         x, logarithm, weight: rows of the table: particles, log weights, and weights, which are scratch.
         extras: the page's extras by name, in the table or the row.
         size: the place of the ESS.
-        rows, extras: how many rows of the table and numbers of the row belong to the belief.
+        rows, numbers: how many rows of the table and numbers of the row belong to the belief.
     """
 
     def __init__(self, page: Page, memory: MembersMemory, model: PagedModel):
@@ -95,7 +95,7 @@ class Layout:
                 rows += prod(value.shape)
             else:
                 self.extras[name] = memory.another(value, symmetric=value.symmetric)
-        self.rows, self.extras, self.weight = rows, memory.end - first, Place("table", rows)
+        self.rows, self.numbers, self.weight = rows, memory.end - first, Place("table", rows)
         model.extras = self.extras
 
     def moments(self, model: PagedModel, x: Matrix, w: Matrix, P: Matrix | None) -> tuple[Matrix, ...]:
@@ -313,7 +313,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     rows = max(scratch + SCRATCH_ROWS, *(work.rows for work in works.values()))
     return Kernels(
         *(n, m, rows, max(n, m), start, predict if page.lookahead else predict_chosen, update, summarise),
-        extras=layout.extras,
+        extras=layout.numbers,
         extra_kept_rows=layout.rows - n,
     )
 
@@ -366,15 +366,15 @@ def initial_weighted(model, w):
 def expect(model, x, log_w, z):
     """The predicted measurement of a particle, zero in channels that are NaN in z; innovation and S of all."""
     measured, w = present(z), weights(log_w)
-    y = on_branch(only(measured, model.h(x)), model.measurement_angles, w)
-    v = only(measured, wrap(z - weighted_mean(y, w), model.measurement_angles))
+    y = on_branch(mask_missing(measured, model.h(x)), model.measurement_angles, w)
+    v = mask_missing(measured, wrap(z - weighted_mean(y, w), model.measurement_angles))
     return y, v, weighted_covariance(y, w) + uncorrelated(measured, model.R)
 
 
 def fit(model, y, z):
     """The logarithm of p(z | x) of a particle with the predicted measurement y."""
     measured = present(z)
-    rest = only(measured, wrap(z - y, model.measurement_angles))
+    rest = mask_missing(measured, wrap(z - y, model.measurement_angles))
     return log_density(rest, uncorrelated(measured, model.R), measured)
 
 

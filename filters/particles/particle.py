@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from filters.algebra.members import on_branch
-from filters.algebra.operations import divide, only, present, sym, uncorrelated, wrap
+from filters.algebra.operations import divide, mask_missing, present, sym, uncorrelated, wrap
 from filters.algebra.points import (
     log_density,
     outer,
@@ -60,9 +60,9 @@ def lookahead(model, x, log_w, z):
     """A particle without its noise, mu, then log N(z; h(mu), R + V), and innovation and S of all with noise."""
     measured, mu = present(z), x - model.extras["noise"]
     y, v, S = expect(model, x, log_w, z)
-    without = only(measured, model.h(mu))
+    without = mask_missing(measured, model.h(mu))
     V = weighted_square(wrap(y - without, model.measurement_angles), weights(log_w))
-    rest = only(measured, wrap(z - without, model.measurement_angles))
+    rest = mask_missing(measured, wrap(z - without, model.measurement_angles))
     return mu, log_density(rest, V + uncorrelated(measured, model.R), measured), v, S
 
 
@@ -72,7 +72,7 @@ def update_auxiliary(model, x, log_w, z, e):
     `log_w` is the logarithm of the mean of all lambda, over N(z; h(mu), R + V).
     """
     x = x + model.extras["noise"]  # the noise is not resampled
-    return x, log_w + fit(model, only(present(z), model.h(x)), z), {"noise": zeros(model.Q, len(x))}
+    return x, log_w + fit(model, mask_missing(present(z), model.h(x)), z), {"noise": zeros(model.Q, len(x))}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -143,12 +143,12 @@ def propose(model, x, d, Q, z, e):
     turns a sample of the prior into one of the proposal. With Q = 0 nothing moves.
     """
     measured, mu = present(z), x - d
-    H, R = only(measured, model.H(mu)), uncorrelated(measured, model.R)
-    v = only(measured, wrap(z - model.h(mu), model.measurement_angles))
+    H, R = mask_missing(measured, model.H(mu)), uncorrelated(measured, model.R)
+    v = mask_missing(measured, wrap(z - model.h(mu), model.measurement_angles))
     S = sym(H @ Q @ H.T + R)
-    d = d + divide(Q @ H.T, S) @ (v - H @ d - only(measured, model.R_root @ e))
+    d = d + divide(Q @ H.T, S) @ (v - H @ d - mask_missing(measured, model.R_root @ e))
     x = mu + d
-    rest = only(measured, wrap(z - model.h(x), model.measurement_angles))
+    rest = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     return x, d, log_density(v, S, measured) + log_density(rest, R, measured) - log_density(v - H @ d, R, measured)
 
 

@@ -266,7 +266,7 @@ CONSTANT = {operations.eye, points.units, points.ones}  # depend on the sizes of
 OF_SHAPE: dict[Operation, Callable] = {
     matrices.multiply: _product,
     operations.quotient: _quotient,
-    operations.only: lambda size, mask, a: torch.where(mask if size == 1 else mask[..., None], a, 0.0),
+    operations.mask_missing: lambda size, mask, a: torch.where(mask if size == 1 else mask[..., None], a, 0.0),
     operations.on_one_branch: _on_one_branch,
     points.on_one_side: _on_one_side,
     members.on_one_branch: _on_one_side,

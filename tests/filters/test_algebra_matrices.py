@@ -14,7 +14,7 @@ from filters.algebra.operations import (
     exceeds,
     eye,
     joseph,
-    only,
+    mask_missing,
     present,
     slopes_of,
     sym,
@@ -61,11 +61,11 @@ def values_of_sizes(n, m):
 
 def innovation_covariance(g):
     seen = present(g["z"])
-    return sym(only(seen, g["H"]) @ g["P"] @ only(seen, g["H"]).T + uncorrelated(seen, g["R"]))
+    return sym(mask_missing(seen, g["H"]) @ g["P"] @ mask_missing(seen, g["H"]).T + uncorrelated(seen, g["R"]))
 
 
 def posterior(g):
-    h, r = only(present(g["z"]), g["H"]), uncorrelated(present(g["z"]), g["R"])
+    h, r = mask_missing(present(g["z"]), g["H"]), uncorrelated(present(g["z"]), g["R"])
     return joseph(g["P"], divide(g["P"] @ h.T, sym(h @ g["P"] @ h.T + r)), h, r)
 
 
@@ -75,7 +75,7 @@ FORMULAS = {
     "seen": innovation_covariance,
     "gain": lambda g: divide(g["P"] @ g["H"].T, sym(g["H"] @ g["P"] @ g["H"].T + g["R"])),
     "corrected": lambda g: (
-        g["x"] + divide(g["P"] @ g["H"].T, innovation_covariance(g)) @ only(present(g["z"]), g["v"])
+        g["x"] + divide(g["P"] @ g["H"].T, innovation_covariance(g)) @ mask_missing(present(g["z"]), g["v"])
     ),
     "posterior": posterior,
     "any gain": lambda g: joseph(g["P"], g["H"].T, g["H"], g["R"]),
@@ -88,7 +88,9 @@ FORMULAS = {
     "circle": lambda g: on_circle(g["F"], (True, False) + (True,) * (len(g["x"]) - 2)),
     "entries": lambda g: abs(g["x"]) * g["x"] ** 3.0 / (1.0 + g["x"] ** 2.0) - 0.3 + at_least(g["x"], 0.0) ** 4.0,
     "chosen": lambda g: choose(exceeds(g["F"], 0.0), 2.0 - g["F"] ** 4.0, 2.0 + g["F"] * g["F"] ** 3.0),
-    "density": lambda g: log_density(only(present(g["z"]), g["v"]), innovation_covariance(g), present(g["z"])),
+    "density": lambda g: log_density(
+        mask_missing(present(g["z"]), g["v"]), innovation_covariance(g), present(g["z"])
+    ),
 }
 ENTRIES = ("P", "R", "H", "F", "x", "v", "z")
 
@@ -173,7 +175,7 @@ def test_densities_are_those_of_scipy():
     s, v = covariance_of(3), RNG.normal(size=3)
     there, z = [0, 2], np.array([0.0, np.nan, 1.0])
     seen = present(z)
-    masked, innovation = uncorrelated(seen, s), only(seen, v)
+    masked, innovation = uncorrelated(seen, s), mask_missing(seen, v)
     part = s[np.ix_(there, there)]
     normal = log_density(innovation, masked, seen)
     assert normal == pytest.approx(multivariate_normal(cov=part).logpdf(v[there]), rel=1e-12)

@@ -20,7 +20,7 @@ from tests.models import affine, state_space
 from thruster_env.env.model_env import ModelEnv, Split
 from thruster_env.logs.log import Log
 from tuning.evaluation.evaluate import evaluate, restart_sentences
-from tuning.evaluation.summary import Comparison, summarised, summary
+from tuning.evaluation.held_out import Comparison, summarised, summary
 from tuning.problems.data import Data
 from tuning.problems.model_problem import RunsProblem
 from tuning.reporting.page import html_page

@@ -9,7 +9,7 @@ import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
 from thruster_env.thruster.model import thruster_model
 from tuning.evaluation.evaluate import evaluate
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.problems.data import checked_first_scored_step
 from tuning.search.among_types import RESCALED

@@ -128,6 +128,21 @@ def test_imports_go_in_no_circle_of_more_than_two_files_not_even_within_function
     TopologicalSorter({name: known - {name} for name, known in contracted.items()}).prepare()  # raises CycleError
 
 
+def test_the_index_in_a_package_s_docstring_names_its_files():
+    listed = 0
+    for path in FILES:
+        if path.name == "__init__.py":
+            text = ast.get_docstring(ast.parse(path.read_text())) or ""
+            lines = [re.match(r"([a-z_]+(?:, [a-z_]+)*)  +[a-zA-Z`]", line) for line in text.splitlines()]
+            names = [name for line in lines if line for name in line[1].split(", ")]
+            missing = [
+                name for name in names if not ({name, f"{name}.py"} & {p.name for p in path.parent.iterdir()})
+            ]
+            assert not missing, (name_of(path), missing)
+            listed += len(names)
+    assert listed > 30
+
+
 def test_only_tuning_imports_optuna():
     assert not those(lambda path: "optuna" in packages_of(path) and floor_of(path) != 2)
 

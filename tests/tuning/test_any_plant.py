@@ -15,8 +15,8 @@ from tuning.cli import evaluate as consistency
 from tuning.cli.tables import choice_table
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
+from tuning.evaluation.held_out import Comparison, summary
 from tuning.evaluation.sizes import ensemble_sizes
-from tuning.evaluation.summary import Comparison, summary
 from tuning.evaluation.worth import tuning_effect
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import score_label

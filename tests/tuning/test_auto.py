@@ -17,7 +17,7 @@ from filters.registry import FILTERS
 from tuning.api.run import warn_of_few_trials
 from tuning.cli.main import main
 from tuning.evaluation.baselines import noise_estimated
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem, RunsProblem
@@ -322,7 +322,7 @@ def test_cost_is_of_one_core_and_grows_with_the_ensemble():
 @pytest.mark.usefixtures("undrawn")
 def test_the_command_says_which_filters_it_tried_and_reports_on_the_winner(priced, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tuning.evaluation.summary.HELD_OUT_SEEDS", 8)
+    monkeypatch.setattr("tuning.evaluation.held_out.HELD_OUT_SEEDS", 8)
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["thruster", *arguments])

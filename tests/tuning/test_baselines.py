@@ -32,8 +32,8 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.compare import contender
 from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.held_out import Comparison, evaluate_held_out, summarised, summary
 from tuning.evaluation.residuals import noise_estimation, residuals
-from tuning.evaluation.summary import Comparison, evaluate_held_out, summarised, summary
 from tuning.evaluation.worth import gain, tuning_effect, warnings_of
 from tuning.experiments import lorenz63
 from tuning.experiments.benchmark import noise_free_problem

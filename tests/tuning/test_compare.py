@@ -14,7 +14,7 @@ from thruster_env.model.affine import affine_model
 from tuning.cli.main import main
 from tuning.evaluation.compare import Leaderboard, Row, belief_sentences, compare, contender, sized, winners
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
-from tuning.evaluation.summary import Comparison
+from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import write_tuned
 from tuning.problems.assumed import beliefs_of, default_belief
 from tuning.problems.data import held_out_seeds

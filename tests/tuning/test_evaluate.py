@@ -9,8 +9,8 @@ from filters.consistency.nees import normalized_squares
 from thruster_env.core.compiled import interpreted
 from thruster_env.model import simulate
 from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
+from tuning.evaluation.held_out import summary
 from tuning.evaluation.runs import _means_over_steps
-from tuning.evaluation.summary import summary
 from tuning.problems import data as in_parts
 from tuning.problems.data import held_out_seeds
 from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice

@@ -15,8 +15,8 @@ from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
 from tuning.evaluation.baselines import rule_label
 from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.sizes import close_size
-from tuning.evaluation.summary import evaluate_held_out
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.experiments import hidden_truth
 from tuning.experiments.hidden_truth import hide_truth

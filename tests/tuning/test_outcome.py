@@ -25,7 +25,7 @@ PLAN = Plan("ekf", (find_scenario("mismatch"),))  # whose untuned filter has a m
 @pytest.fixture
 def thruster(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tuning.evaluation.summary.HELD_OUT_SEEDS", 8)
+    monkeypatch.setattr("tuning.evaluation.held_out.HELD_OUT_SEEDS", 8)
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["thruster", *map(str, arguments)])

@@ -12,7 +12,7 @@ from tests import pendulum_problem
 from tests.models import wide_model
 from tests.small_problems import pair, thruster
 from tests.tuned_files import write_untuned
-from tuning.evaluation import summary
+from tuning.evaluation import held_out as summary
 from tuning.evaluation.baselines import Scaled
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.likelihood.family import Family

@@ -12,7 +12,7 @@ import pytest
 from filters.consistency.intervals import Interval
 from tuning.cli.main import main
 from tuning.evaluation.evaluate import evaluate, score_ratio
-from tuning.evaluation.summary import Comparison, evaluate_held_out
+from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.reporting.page import Code, Picture, Section, Table, Words, html_page, markdown_page
 from tuning.reporting.report import write_report

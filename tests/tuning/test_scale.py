@@ -8,7 +8,7 @@ import optuna
 import pytest
 
 from tuning.evaluation.evaluate import evaluate
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import verify, write_tuned
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice

@@ -20,7 +20,7 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.compare import contender
 from tuning.evaluation.evaluate import evaluate, score_ratio
-from tuning.evaluation.summary import Comparison, evaluate_held_out
+from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.problems.data import held_out_seeds, training_seeds
 from tuning.problems.excitation import Steps

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tuning.evaluation.evaluate import evaluate
-from tuning.evaluation.summary import Comparison
+from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.problems.excitation import BinarySequence, Steps
 from tuning.search.plan import Plan

@@ -10,7 +10,7 @@ from optuna.trial import TrialState
 
 from tests.slow import slow_but
 from tuning.evaluation.evaluate import evaluate, score_ratio
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
 from tuning.search import trials
 from tuning.search.among_types import MAXIMUM_LIKELIHOOD_AFTER, RESCALED

@@ -8,9 +8,9 @@ import pytest
 from filters.consistency.intervals import Interval
 from filters.tuned_file import read_tuned_file
 from tests.tuned_files import rewrite, write_untuned
-from tuning.evaluation import summary
+from tuning.evaluation import held_out as summary
+from tuning.evaluation.held_out import evaluate_held_out, sizes_as_data, stored_comparison, stored_sizes
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.summary import evaluate_held_out, sizes_as_data, stored_comparison, stored_sizes
 from tuning.evaluation.tuned import metrics, read_tuned
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.reporting import report

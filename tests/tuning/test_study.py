@@ -9,7 +9,7 @@ import pytest
 from optuna.trial import TrialState
 
 from filters.tuned_file import sealed
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.search.plan import Plan
 from tuning.search.space import parameters_of, untuned_choice

@@ -22,7 +22,7 @@ from tests.tuned_files import rewrite
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from thruster_env.core.compiled import interpreted
 from tuning.evaluation.baselines import SCALED
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_choice, read_tuned, verify, write_tuned
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.check import checked_problem

@@ -8,7 +8,7 @@ import pytest
 
 from filters.tuned_file import sealed
 from tuning.cli.main import main
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import Difference, verify, write_tuned
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, run_study

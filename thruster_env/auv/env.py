@@ -53,7 +53,7 @@ class ModelledVehicle(ModelledEnv):
         return split(model, len(self.plant.inputs), self.plant.channels)
 
     def tuned_differences(self, tuned_for: Mapping, file: str) -> list[str]:
-        """See `plant_data.check_same_plant`."""
+        """See `plant.check_same_plant`."""
         from thruster_env.auv.plant import check_same_plant
 
         return check_same_plant(tuned_for, self.plant, file)

@@ -44,7 +44,7 @@ mass matrix, the surge acceleration by a unit of surge force.
 def forces(nu, g, inputs, c):
     """Forces X, Y, Z [N] and moments K, M, N [N m] on a vehicle of velocities nu, without those of acceleration.
 
-    g is the direction downwards in the body's axes (`kinematics.down`), inputs = (X_prop, K_prop, delta_s,
+    g is the direction downwards in the body's axes (`dynamics.down`), inputs = (X_prop, K_prop, delta_s,
     delta_r).
     """
     u, v, w, p, q, r = nu

@@ -211,7 +211,7 @@ def make_task(
     """Make a task from plain arguments, the same ones that the env takes.
 
     Args:
-        path: "I", "II", "III", "IV" or "dynamic", the courses of `manoeuvres.MANOEUVRES`; or points (north, east,
+        path: "I", "II", "III", "IV" or "dynamic", the courses of `MANOEUVRES`; or points (north, east,
             down) [m] that straight lines join. It continues straight beyond its ends. By default straight north.
         depth: of the path's origin [m].
         speed: u to keep [m/s].

@@ -280,7 +280,7 @@ def make_plant(
         measurement_noise_cov: R, covariance (m, m) or m variances; zero allowed. None for those of the sensors.
         initial_state: None for about a cruise at 1 m/s, a fixed state (12,), or a mapping: {"speed": U} for a
             fixed speed straight ahead from the origin, 0 for rest, or {"mean": [..], "cov": [..]}.
-        sensors: None for the suite "default", the name of a suite of `channels.SUITES`, a list of channels of
+        sensors: None for the suite "default", the name of a suite of `SUITES`, a list of channels of
             `channels.CHANNELS`, or a mapping from channels to lists of effects. Suites and lists come at the rates
             of their instruments, satellites near the surface; in a mapping, effects "sample-every" and
             "near-surface" say so.

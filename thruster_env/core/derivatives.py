@@ -91,7 +91,7 @@ def _stores(rows: int, entry: Callable) -> list[str]:
 
 @inlined
 def slope_by_complex_step(y):
-    """Im y / h, or 0 where it is that of a root at zero: the slope of a traced root there (`algebra.slopes`)."""
+    """Im y / h, or 0 where it is that of a root at zero: the slope of a traced root there (`filters.algebra`)."""
     slope = (0j + y).imag / COMPLEX_STEP
     return 0.0 if abs(slope) > STEEPEST else slope
 

@@ -2,7 +2,7 @@
 
     x_{k+1} = f(x_k, u_k, r_k dt) + w_k,  w_k ~ N(0, r_k Q);   r_k dt is the length of step k
 
-The Q of a model is that of a step of dt; that of another one is in proportion (`diffusion.noise_for_dt`). A log on
+The Q of a model is that of a step of dt; another one's is in proportion (`continuous.noise_for_dt`). A log on
 its own stamps is then rows of numbers, and what takes such rows takes the log.
 """
 

@@ -55,7 +55,7 @@ class ModelledThruster(ModelledEnv):
         return model_of_plant
 
     def tuned_differences(self, tuned_for: Mapping, file: str) -> list[str]:
-        """See `plant_data.check_same_plant`."""
+        """See `plant.check_same_plant`."""
         from thruster_env.thruster.plant import check_same_plant
 
         return check_same_plant(tuned_for, self.plant, file)

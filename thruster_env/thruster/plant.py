@@ -128,7 +128,7 @@ def make_plant(
             channels to lists of effects, {"thrust": [{"name": "dropout", "probability": 0.1}]}.
         flow: signals of `effects.FLOW_SIGNALS` that add to ambient_velocity.
         amplifier: effects of `effects.AMPLIFIER_EFFECTS` between the commanded voltage and the motor.
-        substeps: Runge-Kutta steps per sample time; None for the fewest that reach `linear.ONE_STEP_ACCURACY`.
+        substeps: Runge-Kutta steps per sample time; None for the fewest that reach `analysis.ONE_STEP_ACCURACY`.
         uncertainty: distributions of factors on parameters, {"load_gain": {"name": "log-normal", "std": 0.1}}.
 
     Raises:

@@ -247,10 +247,10 @@ def compare(
         knows: the Q and R of named filters: "true" (the plant's own, the oracle), "scaled" (the scaled default),
             "untuned" (the rule of thumb), "given" (the model's own), "noise" (noise estimation) or "study" (the
             best on the training seeds of a study of 20 trials and all of these but the oracle; ensemble sizes are
-            not tuned). By default "true", but "study" if the model's residuals on true states are not white with
-            the plant's Q and R, for nobody would use these with a wrong model; rows that estimate further
-            constants keep "true". If the plant's Q and R are unknown, "scaled", or for a filter without a scaled
-            default the first that it has of "given", "noise" and "untuned".
+            not tuned). Default: "true"; "study" where the model is wrong (its residuals on true states are not
+            white with the plant's Q and R), except for rows that estimate further constants; "scaled" where the
+            plant's Q and R are unknown, or, without a scaled default, the first available of "given", "noise" and
+            "untuned".
         augment: constants of the model, such as "ambient_velocity", that each filter also estimates in a further
             row; by name with an `Unknown`, or (std, walk).
         ensemble_size: of all filters, or by name.

@@ -17,7 +17,7 @@ from thruster_env.core.text_tables import plain_text
 from tuning.api.progress import about, drawn, frame, html, number, working
 from tuning.evaluation.baselines import RULE, TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency, restart_sentences
-from tuning.evaluation.summary import Comparison, evaluate_held_out
+from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import metrics
 from tuning.evaluation.worth import memory_sentence, scaling_sentence, warnings_of, without_truth
 from tuning.problems.problem import Problem

@@ -15,7 +15,7 @@ from thruster_env.core.files import check_target, write_whole
 from tuning.api.problems import given_for, problems_of
 from tuning.api.progress import console_for, working
 from tuning.api.study import Study
-from tuning.evaluation.summary import sizes_as_data
+from tuning.evaluation.held_out import sizes_as_data
 from tuning.problems.problem import Problem
 from tuning.reporting.report import Source, write_report, write_two_studies
 from tuning.reporting.subject import is_file

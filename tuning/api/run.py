@@ -20,7 +20,7 @@ from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.files import check_target
 from tuning.api.progress import trial_bar, working
 from tuning.evaluation.baselines import noise_estimated, same_filter
-from tuning.evaluation.summary import Comparison, evaluate_held_out
+from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.evaluation.worth import all_warnings
 from tuning.likelihood.family import check_gradient

@@ -35,7 +35,7 @@ from tuning.cli.problems import PROBLEMS
 from tuning.cli.tables import choice_table
 from tuning.evaluation.baselines import GIVEN, ORACLE, TUNED, given_noise
 from tuning.evaluation.evaluate import check_consistency
-from tuning.evaluation.summary import Comparison
+from tuning.evaluation.held_out import Comparison
 from tuning.problems.problem import Problem
 from tuning.reporting.leaderboard import comparison_table
 from tuning.reporting.search_figures import consistency_figure

@@ -25,8 +25,8 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.blow_up import blow_up_on
 from tuning.evaluation.evaluate import likelihood_gain, score_ratio
+from tuning.evaluation.held_out import Comparison, numbers
 from tuning.evaluation.sizes import SIZE_TOLERANCE, left_out
-from tuning.evaluation.summary import Comparison, numbers
 from tuning.evaluation.tuned import consistency, metrics
 from tuning.evaluation.worth import memory_numbers, memory_sentence
 from tuning.likelihood.family import has_gradient

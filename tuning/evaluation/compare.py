@@ -65,11 +65,10 @@ TUNING = "tuning"  # how the progress of such a study begins
 KNOWS = (
     "the Q and R of named filters: true (the plant's own, the oracle), scaled (the scaled default), untuned (the "
     "rule of thumb), given (the model's own), noise (noise estimation) or study (the best on the training seeds "
-    f"of a study of {STUDY_TRIALS} trials and all of these but the oracle; ensemble sizes are not tuned). By "
-    "default true, but study if the model's residuals on true states are not white with the plant's Q and R, for "
-    "nobody would use these with a wrong model; rows that estimate further constants keep true. If the plant's Q "
-    "and R are unknown, scaled, or for a filter without a scaled default the first that it has of given, noise "
-    "and untuned."
+    f"of a study of {STUDY_TRIALS} trials and all of these but the oracle; ensemble sizes are not tuned). "
+    "Default: true; study where the model is wrong (its residuals on true states are not white with the plant's Q "
+    "and R), except for rows that estimate further constants; scaled where the plant's Q and R are unknown, or, "
+    "without a scaled default, the first available of given, noise and untuned."
 )
 SAID = {
     "true": "the plant's own (oracle; {option} true)",

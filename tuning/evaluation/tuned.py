@@ -35,7 +35,7 @@ from thruster_env.core.files import write_whole
 from thruster_env.core.modules import is_code
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
-from tuning.evaluation.summary import (
+from tuning.evaluation.held_out import (
     ROLES,
     Comparison,
     comparison_as_data,

@@ -19,8 +19,8 @@ from filters.engine.batch import run
 from filters.filter import Filter
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.text_tables import markdown_table
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.runs import state_errors
-from tuning.evaluation.summary import evaluate_held_out
 from tuning.experiments import BENCHMARKS
 from tuning.problems.data import Data, held_out_seeds
 from tuning.problems.model_problem import ModelProblem

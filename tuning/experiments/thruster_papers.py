@@ -531,7 +531,7 @@ def series(case: str, q: float, *, members: int = MEMBERS, seed: int = 0) -> Ser
 
 
 def all_series(*, members: int = MEMBERS, seed: int = 0) -> list[Series]:
-    """`series` for every case and noise level, in the order of `comparison.compare_all`."""
+    """`series` for every case and noise level, in the order of `compare_all`."""
     return [series(case, q, members=members, seed=seed) for case in SYSTEMS for q in NOISE_LEVELS]
 
 

@@ -25,7 +25,7 @@ from thruster_env.core.checks import at_least, one_of, short_repr
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import rule_of_thumb
 from tuning.evaluation.evaluate import values_of
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.exploring.view import (
     AMPLIFIER,

@@ -162,7 +162,7 @@ def identify(
             measurements; with them, for the best prediction of these channels.
         gate: leave out samples whose innovations exceed so many standard deviations of a robust filter, and
             identify again, until the samples stay the same; infinite to keep all. Squares of what is left are
-            divided by their share of the variance (`gates.kept_variance`), so that Q and R do not shrink. (With
+            divided by their share of the variance (`kept_variance`), so that Q and R do not shrink. (With
             Student-t innovations alone the scale is robust, but the filter still follows outliers, and constants
             get a bias.)
         simulation_first: see above.

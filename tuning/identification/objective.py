@@ -90,7 +90,7 @@ class Objective:
         simulation: whether Q is set to zero: the filter then simulates, and -log L is a sum of squares.
         starts: of runs that do not begin as the model's prior says; None if all do.
         gate: number of standard deviations beyond which samples were left out; infinite if none were. The squares
-            of what is left are then smaller than S by `gates.kept_variance`, and are divided by that.
+            of what is left are then smaller than S by `kept_variance`, and are divided by that.
 
     Raises:
         ValueError: where models or data do not fit.

@@ -355,7 +355,7 @@ def identification_of(
 def covariances_of(objective: Objective, best: Ascent) -> tuple[np.ndarray, np.ndarray]:
     """Covariances (p, p) of the estimates at a maximum: as stated, and by Fisher's information alone.
 
-    Both include the information lost with the samples beyond a gate (`gates.lost_information`).
+    Both include the information lost with the samples beyond a gate (`objective.lost_information`).
     """
     width, lost = objective.coordinates.high - objective.coordinates.low, lost_information(objective.gate)
     information, scores = best.found.information, best.found.scores

@@ -18,7 +18,7 @@ from thruster_env.core.text_tables import table
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.compare import Leaderboard, Row, belief_sentences, noise_sentence, winners
 from tuning.evaluation.evaluate import Evaluation, restart_sentences
-from tuning.evaluation.summary import summary
+from tuning.evaluation.held_out import summary
 from tuning.evaluation.worth import slowest_sentence, without_truth
 
 ABOVE = "above\n[%]"  # head of the columns that need a bound

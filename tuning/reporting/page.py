@@ -20,8 +20,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.engine.batch import Estimates
 from filters.filter import Filter
+from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.summary import Comparison
 from tuning.problems.data import Data
 from tuning.reporting.choice_words import typeset
 from tuning.reporting.style import SCRIPT, STYLE

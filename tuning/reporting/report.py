@@ -13,8 +13,8 @@ from filters.consistency.report import rounded
 from filters.registry import filter_type
 from thruster_env.core.files import check_target, write_whole
 from tuning.evaluation.evaluate import evaluate, likelihood_gain, score_ratio
+from tuning.evaluation.held_out import Comparison, evaluate_held_out, stored_comparison, stored_sizes
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
-from tuning.evaluation.summary import Comparison, evaluate_held_out, stored_comparison, stored_sizes
 from tuning.likelihood.identifiability import identify, sentences, too_many
 from tuning.problems.problem import Problem
 from tuning.reporting.page import Pair, Section, Table, Words, html_page, markdown_page

@@ -36,8 +36,8 @@ from thruster_env.core.files import (
 )
 from thruster_env.core.text_tables import TITLE, verbatim
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED
+from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.summary import Comparison
 from tuning.reporting.page import Picture, figure_svg
 from tuning.reporting.time_figures import COLUMNS, plotted_states
 from tuning.search.objectives import SCORE, reported

@@ -19,8 +19,8 @@ from thruster_env.core.sources import is_array
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import check_consistency, restart_sentences
+from tuning.evaluation.held_out import Comparison, versions
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.summary import Comparison, versions
 from tuning.evaluation.worth import all_warnings, memory_sentence, scaling_sentence, tuning_effect, without_truth
 from tuning.problems.assumed import within
 from tuning.problems.log_problem import LogProblem

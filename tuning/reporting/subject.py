@@ -11,7 +11,7 @@ import optuna
 
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import at_least, short_repr
-from tuning.evaluation.summary import versions
+from tuning.evaluation.held_out import versions
 from tuning.evaluation.tuned import problem_in, read_tuned
 from tuning.problems.find import find_given
 from tuning.problems.problem import Problem

@@ -10,7 +10,7 @@ from filters.consistency.intervals import Interval
 from filters.consistency.report import rounded
 from tuning.evaluation.baselines import TUNED, Scaled, baseline_size, baselines
 from tuning.evaluation.evaluate import NOTHING
-from tuning.evaluation.summary import Comparison
+from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import number_rows, power_of_ten, scaled_unit

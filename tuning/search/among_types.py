@@ -19,8 +19,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.registry import filter_type
 from tuning.evaluation.baselines import competing_baselines, noise_estimated
+from tuning.evaluation.held_out import sizes_as_data, stored_sizes
 from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
-from tuning.evaluation.summary import sizes_as_data, stored_sizes
 from tuning.likelihood.gradient import OF_STATES
 from tuning.problems.data import Data
 from tuning.search.gradient_noise import BY_GRADIENT, MAXIMUM_LIKELIHOOD, MOST_FOR_STARTS, noise_by_gradient

@@ -46,7 +46,7 @@ class ProcessVariance:
 
 @dataclass(frozen=True)
 class Correlation:
-    """One of the correlations from which `correlations.full_covariance` makes a full Q or R."""
+    """One of the correlations from which `relations.full_covariance` makes a full Q or R."""
 
     covariance: str  # argument of the model
     index: int
@@ -109,7 +109,7 @@ def model_parameters(
     Args:
         problem: the ranges follow from its untuned values.
         hold_r: keep R from the sensor's data sheet.
-        full_q: choose the correlations of Q, too (`correlations.full_covariance`).
+        full_q: choose the correlations of Q, too (`relations.full_covariance`).
         full_r: choose those of R, too.
         prior: choose the scale of P_0, too.
         where: relations among them (`tuning.search.relations`), which reduce the free ones.
@@ -200,7 +200,7 @@ def places_in(choice) -> dict[str, Place]:
 
 
 def correlation_names(size: int, covariance: str = Q) -> list[str]:
-    """Names of the correlations of Q or R as trial parameters, in the order of `correlations.full_covariance`."""
+    """Names of the correlations of Q or R as trial parameters, in the order of `relations.full_covariance`."""
     stem, between = "correlation" if covariance == Q else "R_correlation", "" if size < 10 else "_"
     return [f"{stem}_{j}{between}{i}" for i in range(2, size + 1) for j in range(1, i)]
 

@@ -6,7 +6,7 @@ from tests import altitude_problem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.logs.write import write_log
 from tuning.evaluation.baselines import given_noise
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.experiments.identification import TRUTH, record
 
 ALTITUDE = "tests.altitude_problem:problem"

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from filters import EstimateState, make_filter, run
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
-from tuning.evaluation.summary import evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.experiments import BENCHMARKS, benchmark, lorenz63, lorenz96, pendulum, range_bearing
 from tuning.experiments.benchmark import (

@@ -180,7 +180,7 @@ def linear_model(p: ThrusterParameters, x, voltage: float = 0.0, ambient_velocit
 
         B = [[K2, 0], [0, 2 (K4/K3) |U_a - U_0|]]
 
-    Beside `linear.jacobians` it has the ambient flow as second input: the form in which the papers print theirs.
+    Beside `jacobians` it has the ambient flow as second input: the form in which the papers print theirs.
     """
     a, b, c = jacobians(p, x, voltage, ambient_velocity)
     by_ambient = 2.0 * p.momentum_drag / p.added_mass * abs(float(x[1]) - ambient_velocity)

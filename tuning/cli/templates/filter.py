@@ -16,7 +16,7 @@ from filters.algebra.operations import (
     divide,
     exponential,
     joseph,
-    only,
+    mask_missing,
     present,
     sym,
     uncorrelated,
@@ -32,13 +32,13 @@ from filters.pages.page_filter import PageFilter
 def update(model, x, P, z):
     """The measurement z (m,) of a state of mean x (n,) and covariance P (n, n).
 
-    A page computes with small matrices: + - @ *, .T and the functions of `filters.algebra`. It
-    cannot branch (`if`) on their values, only choose (`scalars.choose`). The model has f(x, u), F, h(x), H, Q and
-    R; `model.own` has the fields below. Channels of z that are NaN are missing: `only` makes their rows zero.
+    A page computes with small matrices: + - @ *, .T and the functions of `filters.algebra`. It cannot branch
+    (`if`) on their values, only choose (`operations.choose`). The model has f(x, u), F, h(x), H, Q and R;
+    `model.own` has the fields below. Channels of z that are NaN are missing: `mask_missing` makes their rows zero.
     """
     measured = present(z)
-    H, R = only(measured, model.H(x)), uncorrelated(measured, model.R)
-    v = only(measured, wrap(z - model.h(x), model.measurement_angles))
+    H, R = mask_missing(measured, model.H(x)), uncorrelated(measured, model.R)
+    v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     L, M, step = root(P), root(R), None
     for _ in range(model.own.iterations):

@@ -281,7 +281,7 @@ def estimates_of(runs: Sequence[Recording], held_out: Mapping[str, Mapping] | No
 
     Args:
         runs: recorded.
-        held_out: tasks by name (`results.identify_all`): our estimate of a run then has the parameters that were
+        held_out: tasks by name (`identify_all`): our estimate of a run then has the parameters that were
             identified without this run. If None those of `identified.toml`.
     """
     ours = thrusts(model(), runs) if held_out is None else left_out(CHOSEN, runs, held_out)

@@ -1,10 +1,8 @@
-"""Evaluations as plain numbers, as stored in files and studies, and back.
+"""Held-out evaluation: a choice and its baselines on seeds that no trial saw, with the bound on these seeds.
 
-They are stored with a digest of their inputs (the choice, the problems and the versions of all packages), and
-    used only if that is the same. The digest does not prove who wrote them: `tuning.evaluation.tuned` recomputes
-    held-out metrics.
-
-Held-out evaluation: a choice and its baselines on seeds that no trial saw, with the bound on these seeds.
+Evaluations are stored as plain numbers in files and studies, with a digest of their inputs (the choice, the
+problems and the versions of all packages), and used only if that is the same. The digest does not prove who
+wrote them: `tuning.evaluation.tuned` recomputes held-out metrics.
 """
 
 from __future__ import annotations
