@@ -39,7 +39,7 @@ class Filter:
     has_covariance: ClassVar[bool] = True  # if not, covariances and log-likelihoods are zero and say nothing
     one_model: ClassVar[bool] = True  # if not, it has others beside `model`, with their own sample times and Q
     mixable: ClassVar[bool] = True  # whether a step may begin with another mean and P than those the last one left
-    any_step: ClassVar[bool] = True  # whether it multiplies Q by the step ratio of `thruster_env.logs.steps`
+    any_step: ClassVar[bool] = True  # whether it multiplies Q by the step ratio of `thruster_env.logs.log`
     gaussian_likelihood: ClassVar[bool] = True  # whether the log-likelihood is that of N(innovation; 0, S)
     model: StateSpaceModel
 

@@ -33,7 +33,7 @@ from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanF
 from filters.horizon.moving_horizon import MovingHorizonFilter
 from filters.particles.particle import AuxiliaryParticleFilter, ParticleFilter, RaoBlackwellisedParticleFilter
 from thruster_env.core.checks import one_of
-from thruster_env.logs.steps import AnyStepModel
+from thruster_env.logs.log import AnyStepModel
 from thruster_env.model.state_space import StateSpaceModel
 
 LISTED = "thruster filters"  # the command that lists all

@@ -17,7 +17,7 @@ from typing import Any
 
 from filters.registry import FILTERS, LISTED, filter_type
 from thruster_env.core.checks import finite, one_of, positive, short_repr
-from thruster_env.logs.steps import of_one_step
+from thruster_env.logs.log import of_one_step
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from filters import StateSpaceModel
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 DT = 0.05
 TRUE = {"sigma_a": 0.3, "sigma_b": 1e-3, "r_baro": 0.25, "r_range": 4e-4}

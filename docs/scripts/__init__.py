@@ -34,7 +34,7 @@ PAGES: Mapping[str, tuple[str, ...]] = {  # and the modules that make their tabl
     "plant": ("docs.scripts.plant",),
     "ranking": ("docs.scripts.ranking", "docs.scripts.estimators"),
     "readme": ("docs.scripts.pictures",),
-    "real_data": ("tuning.experiments.recordings.tables",),
+    "real_data": ("tuning.experiments.recordings.identification",),
     "tuning": ("docs.scripts.tuning", "docs.scripts.tuning_choice", "tuning.experiments.users"),
     "workers": ("docs.scripts.workers",),
 }

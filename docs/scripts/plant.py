@@ -14,16 +14,10 @@ from thruster_env.core.files import BLUE, DARK, RUST, SKY, save_figure, write_wh
 from thruster_env.core.streams import episode_keys
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.env.commands import ObserveStateVector
-from thruster_env.thruster.control.controllers import LQRController, PIController
+from thruster_env.thruster.analysis import jacobians, required_substeps, run_substeps, state_range, steady_state
+from thruster_env.thruster.controllers import LQRController, PIController
 from thruster_env.thruster.dynamics import rates
 from thruster_env.thruster.effects import AMPLIFIER_EFFECTS, FLOW_SIGNALS, REFERENCE_SIGNALS
-from thruster_env.thruster.linear.analysis import (
-    jacobians,
-    required_substeps,
-    run_substeps,
-    state_range,
-    steady_state,
-)
 from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, derive_constants
 from thruster_env.thruster.plant import (
     DEFAULT_DT,

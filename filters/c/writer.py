@@ -16,8 +16,14 @@ from filters.c.programs import FilterPrograms
 from filters.engine.belief import LARGEST
 from thruster_env.core.angles import wrapped_where
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS
-from thruster_env.graphs.c_source import functions_called_by, literal, statements_of, statements_of_members
-from thruster_env.graphs.programs import Program, cut
+from thruster_env.graphs.programs import (
+    Program,
+    cut,
+    functions_called_by,
+    literal,
+    statements_of,
+    statements_of_members,
+)
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import LANES, padded
 

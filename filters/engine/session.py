@@ -23,7 +23,7 @@ from filters.engine.belief import (
 from filters.engine.compile import PREDICT, REFUSED, START, UPDATE, new_memory, operation
 from thruster_env.core.checks import covariance, finite, positive
 from thruster_env.core.compiled import direct
-from thruster_env.logs.steps import sample_time_place
+from thruster_env.logs.log import sample_time_place
 from thruster_env.model.continuous import same_dt
 from thruster_env.model.shape import number_places, with_root
 

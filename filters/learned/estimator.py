@@ -20,7 +20,7 @@ from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, i
 from thruster_env.core.derivatives import jacobian
 from thruster_env.core.sources import matrix_writer, vector_reader, vector_writer
 from thruster_env.core.threads import one_thread
-from thruster_env.logs.steps import AnyStepModel
+from thruster_env.logs.log import AnyStepModel
 from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
 from thruster_env.model.state_space import StateSpaceModel
 

@@ -15,10 +15,9 @@ from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
 from filters.filter import Filter
 from filters.pages.page_filter import with_page
 from filters.sensitivity import likelihood
-from filters.tensors.draws import round_keys
 from filters.tensors.equations import OfGraph, equation_of
 from filters.tensors.recursion import CompiledRecursion, Estimate, Numbers, Recursion
-from filters.tensors.stages import EnsembleStages, Stages, root, wrapped_where
+from filters.tensors.stages import EnsembleStages, Stages, root, round_keys, wrapped_where
 from thruster_env.core.checks import as_floats, one_of, short_repr, switch
 from thruster_env.core.sources import lower_pairs
 from thruster_env.core.streams import filter_keys

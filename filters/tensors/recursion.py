@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
-from filters.tensors.draws import Draw, normals_of
-from filters.tensors.stages import Stages, where
+from filters.tensors.stages import Draw, Stages, normals_of, where
 from thruster_env.graphs.programs import Place
 
 

@@ -23,9 +23,8 @@ from thruster_env.auv.model import auv_model
 from thruster_env.core.angles import difference
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
-from thruster_env.graphs.c_source import literal, statements_of
 from thruster_env.graphs.graphs import Graph, arctan2, where
-from thruster_env.graphs.programs import Place, program_of
+from thruster_env.graphs.programs import Place, literal, program_of, statements_of
 from thruster_env.logs.read import read_log
 from tuning.cli.templates.filter import Template
 

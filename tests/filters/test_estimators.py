@@ -20,7 +20,7 @@ from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import check_keepable
 from tuning.problems.data import held_out_seeds
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 from tuning.search.space import choice_of, distributions
 from tuning.thruster.scenario import find_scenario
 

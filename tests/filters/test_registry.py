@@ -8,7 +8,7 @@ from filters import FILTERS, EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanF
 from filters.registry import filter_type
 from filters.tuned_file import read_tuned_file, sealed
 from tests.models import TUNED
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 
 def changed(**entries):

@@ -8,7 +8,7 @@ from tests.models import held_voltages, state_space
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
-from thruster_env.thruster.linear.analysis import steady_state
+from thruster_env.thruster.analysis import steady_state
 from thruster_env.thruster.plant import make_plant
 
 KEYS = np.zeros((1, 2))

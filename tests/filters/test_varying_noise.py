@@ -16,7 +16,7 @@ from tests.fuzz import unequal_steps
 from tests.kalman_by_hand import LIKE_KALMAN, KalmanByHand, LinearModel, close, covariance_of, smoothed_by_hand
 from tests.models import affine, plane_model, simulated, small
 from tests.slow import slow_but
-from thruster_env.logs.steps import in_any_steps
+from thruster_env.logs.log import in_any_steps
 
 pytestmark = pytest.mark.usefixtures("as_python")
 

@@ -24,9 +24,16 @@ from filters.tensors.equations import values_of as tensors_of
 from tests.fuzz.python_interface import _line, _until
 from thruster_env.core.compiled import compiled
 from thruster_env.core.streams import filter_keys
-from thruster_env.graphs.c_source import statements_of
 from thruster_env.graphs.graphs import Graph, Number, needed_by
-from thruster_env.graphs.programs import Place, Program, callable_of, program_of, values_of, work_names
+from thruster_env.graphs.programs import (
+    Place,
+    Program,
+    callable_of,
+    program_of,
+    statements_of,
+    values_of,
+    work_names,
+)
 from thruster_env.graphs.python_floats import with_python_floats
 from thruster_env.graphs.tracing import traced
 from thruster_env.model.state_space import StateSpaceModel

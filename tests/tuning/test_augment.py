@@ -15,7 +15,7 @@ from tuning.policies.setup import make_configuration
 from tuning.problems.assumed import AugmentedProblem, augmented, name_and_unknown, unknowns_of
 from tuning.problems.find import find_given, find_problem
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 FLOW = {"ambient_velocity": Unknown(0.4, 0.01)}
 NAME = "ambient+ambient_velocity:0.4:0.01"

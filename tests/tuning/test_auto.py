@@ -32,10 +32,10 @@ from tuning.search.among_types import (
     UNTUNED,
     filter_types_tried,
     next_in_race,
+    noise_by_gradient,
     race_of,
     trials_of_type,
 )
-from tuning.search.gradient_noise import noise_by_gradient
 from tuning.search.plan import Plan
 from tuning.search.space import (
     AUTO_FILTER_TYPES,

@@ -14,7 +14,7 @@ from tuning.problems.env_problem import EnvProblem
 from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 from tuning.search.plan import Plan
 
 pytestmark = pytest.mark.usefixtures("as_python")

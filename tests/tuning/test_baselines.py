@@ -37,7 +37,7 @@ from tuning.evaluation.residuals import noise_estimation, residuals
 from tuning.evaluation.worth import gain, tuning_effect, warnings_of
 from tuning.experiments import lorenz63
 from tuning.experiments.benchmark import noise_free_problem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 from tuning.reporting.choice_words import consistency_sentence, gains
 from tuning.search.relations import correlations_of, full_covariance
 

@@ -11,7 +11,7 @@ from tuning.search.study import open_study
 
 CODE = """
 import numpy as np
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 class Still:
     def __init__(self, model, gain):

@@ -6,7 +6,7 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.streams import episode_keys
-from thruster_env.thruster.control.controllers import PIController
+from thruster_env.thruster.controllers import PIController
 from thruster_env.thruster.plant import make_plant
 from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, MultiSine, Steps
 from tuning.thruster.scenario import ClosedLoop, find_scenario, voltages_of

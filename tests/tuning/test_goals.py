@@ -9,7 +9,7 @@ from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import goal_of, tune_by_gradient
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 from tuning.search.objectives import LIKELIHOOD, OBJECTIVES
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of

@@ -7,8 +7,7 @@ from tests.linear_problem import LinearProblem
 from tests.slow import slow_but
 from tuning.evaluation.evaluate import evaluate
 from tuning.likelihood.gradient import tune_by_gradient
-from tuning.search.among_types import MAXIMUM_LIKELIHOOD_AFTER
-from tuning.search.gradient_noise import BY_GRADIENT
+from tuning.search.among_types import BY_GRADIENT, MAXIMUM_LIKELIHOOD_AFTER
 from tuning.search.objectives import OBJECTIVES
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of

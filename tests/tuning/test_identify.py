@@ -20,7 +20,7 @@ from tuning.identification.profiles import fall_sentence
 from tuning.identification.result import covariance, read_values, with_values, write_values
 from tuning.identification.starts import runs_of
 from tuning.problems.data import Data
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 TRUTH = {"stiffness": 11.0, "damping": 0.5, "offset": -0.3, "q": 0.02, "r": 0.03}
 FREE = (

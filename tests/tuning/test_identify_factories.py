@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from thruster_env.core.streams import filter_keys
-from thruster_env.logs.steps import in_any_steps
+from thruster_env.logs.log import in_any_steps
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification import identify
 from tuning.identification.objective import Objective
 from tuning.problems.data import Data
-from tuning.problems.parameter import Coordinates, Parameter
+from tuning.problems.problem import Coordinates, Parameter
 
 DT = 0.1
 FREE = (

@@ -15,16 +15,15 @@ from filters.logs.estimate import by_the_clock
 from filters.sensitivity import likelihood
 from tests.filters.test_live import A, oscillator
 from thruster_env.core.streams import filter_keys
-from thruster_env.logs.log import Log
+from thruster_env.logs.log import Log, in_any_steps, in_steps
 from thruster_env.logs.read import read_log
-from thruster_env.logs.steps import in_any_steps, in_steps
 from thruster_env.model.continuous import noise_of_densities
 from tuning.evaluation.evaluate import evaluate
 from tuning.identification.objective import Objective
 from tuning.identification.profiles import validate
 from tuning.logs.problem import family_of
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.parameter import Coordinates
+from tuning.problems.problem import Coordinates
 from tuning.search.space import untuned_choice
 
 DT = 0.1

@@ -18,7 +18,7 @@ from tuning.identification import identify, validate
 from tuning.identification.starts import starts_of
 from tuning.problems.data import Data
 from tuning.problems.excitation import held_levels
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 from tuning.thruster.logs import ThrusterFamily
 
 OWN = ("motor_damping", "voltage_gain", "lift_coefficient")

@@ -13,7 +13,7 @@ from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.sizes import ensemble_sizes, few_seeds_first
 from tuning.evaluation.tuned import verify
 from tuning.problems.model_problem import RunsProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, untuned_choice
 from tuning.search.trials import BLOCK, measure, shares

@@ -13,7 +13,7 @@ from thruster_env.thruster.plant import make_plant
 from tuning.identification import identify
 from tuning.identification.objective import kept_variance, lost_information
 from tuning.identification.result import NullTest
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 from tuning.thruster.logs import ThrusterFamily
 
 EFFECTS = (

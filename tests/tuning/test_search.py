@@ -13,8 +13,7 @@ from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
 from tuning.search import trials
-from tuning.search.among_types import MAXIMUM_LIKELIHOOD_AFTER, RESCALED
-from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
+from tuning.search.among_types import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED
 from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
 from tuning.search.plan import Plan
 from tuning.search.samplers import SAMPLERS, box, make_sampler

@@ -27,7 +27,7 @@ from tuning.evaluation.tuned import read_choice, read_tuned, verify, write_tuned
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, find_same
-from tuning.search.gradient_noise import noise_by_gradient
+from tuning.search.among_types import noise_by_gradient
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters
 from tuning.search.study import open_study, run_study

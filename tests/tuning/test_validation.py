@@ -33,11 +33,10 @@ from tuning.evaluation.tuned import read_tuned
 from tuning.problems.excitation import Steps
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 from tuning.reporting.choice_words import apart, choice_sentences
 from tuning.search import validation
-from tuning.search.among_types import BASELINE
-from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
+from tuning.search.among_types import BASELINE, MAXIMUM_LIKELIHOOD
 from tuning.search.measures import Measured, measured, over
 from tuning.search.parameters import FACTORS, model_parameters
 from tuning.search.plan import (

@@ -20,7 +20,7 @@ import numpy as np
 
 from filters import affine_model
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 DT = 0.02  # [s]
 

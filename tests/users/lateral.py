@@ -18,7 +18,7 @@ from typing import NamedTuple
 from filters import StateSpaceModel
 from thruster_env.core.derivatives import runge_kutta
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 DT = 0.02  # [s]
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from filters import StateSpaceModel
 from tuning.problems.env_problem import EnvProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 ENCODER = 0.05  # deviation [rad]
 

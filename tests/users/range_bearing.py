@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from filters import StateSpaceModel
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 DT = 3.0  # a turn of the antenna [s]
 DEGREE = math.pi / 180.0

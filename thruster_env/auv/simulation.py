@@ -19,11 +19,21 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.auv.dynamics import angle_rates, attitude_of, current_substep, in_earth_axes
-from thruster_env.auv.effects import CURRENT_SIGNALS, DIRECTIONS, VEHICLE_SENSOR_EFFECTS, VehicleContext
 from thruster_env.auv.forces import Constants
 from thruster_env.auv.paths import PIECE as LENGTH
 from thruster_env.auv.paths import Task, make_task, step_cost
-from thruster_env.auv.plant import CHANNELS, MAX_CHANNELS, MEASURED, STATES, SYMBOLS, Plant
+from thruster_env.auv.plant import (
+    CHANNELS,
+    CURRENT_SIGNALS,
+    DIRECTIONS,
+    MAX_CHANNELS,
+    MEASURED,
+    STATES,
+    SYMBOLS,
+    VEHICLE_SENSOR_EFFECTS,
+    Plant,
+    VehicleContext,
+)
 from thruster_env.core.checks import covariance_root
 from thruster_env.core.compiled import CompiledOrPython, inlined
 from thruster_env.core.memory import FIRST_REPORTED, FRONT, KEY_0, KEY_1, REWARD, STEP, TERMINATED, TIME

@@ -2,8 +2,8 @@
 
 graphs, folding  numbers that record operations, their derivatives, and simplification
 tracing          the graph of a function; branches: of a function that decides
-programs         a graph as a program for some runs side by side, and for an ensemble's members, cut into loops
-instructions     a program as machine code; c_source: as C99
+programs         a graph as a program for some runs side by side, or for members, cut into loops; its C99
+instructions     a program as machine code
 python_floats    functions that run as Python, and those that numba refuses, written out
 
 What can be traced, and the arithmetic of programs: docs/machine_code.md. A program is compared with its function

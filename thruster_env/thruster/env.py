@@ -14,9 +14,9 @@ from thruster_env.core.memory import KEY_0, KEY_1, TIME
 from thruster_env.env.env import PlantEnv, PlantVectorEnv, ReportRows
 from thruster_env.env.model_env import ModelledEnv
 from thruster_env.render.renderer import MODES
+from thruster_env.thruster.analysis import state_range
 from thruster_env.thruster.effects import Constant, drawn_parameters
-from thruster_env.thruster.linear.analysis import state_range
-from thruster_env.thruster.linear.published import PUBLISHED_NOISE, make_linear_plant
+from thruster_env.thruster.linear import PUBLISHED_NOISE, make_linear_plant
 from thruster_env.thruster.parameters import INPUTS, ThrusterParameters
 from thruster_env.thruster.plant import Plant, make_plant
 from thruster_env.thruster.rendering import Moment, Renderer
@@ -260,7 +260,7 @@ class BowThrusterLinearEnv(BowThrusterEnv):
     unstable.)
 
     ## Arguments
-    The list is that of `thruster_env.thruster.linear.published.make_linear_plant` (`system` is "tunnel" or
+    The list is that of `thruster_env.thruster.linear.make_linear_plant` (`system` is "tunnel" or
     "open_bladed"; `process_noise_cov` and `measurement_noise_cov` are the published 0.5 of each state and
     measurement by default) and of `thruster_env.thruster.task.make_task`; `render_mode` and `render_size` come on
     top.

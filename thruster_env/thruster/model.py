@@ -32,6 +32,7 @@ from thruster_env.model.affine import affine_model
 from thruster_env.model.continuous import ContinuousModel, noise_for_dt, same_dt
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster.analysis import LinearModel, steady_state
 from thruster_env.thruster.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.thruster.dynamics import (
     Constants,
@@ -42,7 +43,6 @@ from thruster_env.thruster.dynamics import (
     thrust_and_torque_tangent,
 )
 from thruster_env.thruster.effects import outside
-from thruster_env.thruster.linear.analysis import LinearModel, steady_state
 from thruster_env.thruster.parameters import (
     BY_CHANNEL,
     INPUTS,

@@ -20,6 +20,7 @@ from thruster_env.effects.effects import Effect, dropping_channels
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 from thruster_env.env import plant_data as data_of_plants
 from thruster_env.env.plant_data import Entries, checked_noise, data_of, initial_distribution, sensor_effects
+from thruster_env.thruster.analysis import LinearModel, required_substeps_of_all, steady_state
 from thruster_env.thruster.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.thruster.dynamics import Constants
 from thruster_env.thruster.effects import (
@@ -31,7 +32,6 @@ from thruster_env.thruster.effects import (
     extreme_parameters,
     make_uncertainty,
 )
-from thruster_env.thruster.linear.analysis import LinearModel, required_substeps_of_all, steady_state
 from thruster_env.thruster.parameters import (
     LARGEST_VOLTAGE,
     PRESETS,

@@ -38,6 +38,7 @@ from thruster_env.effects.effects import SPACING, Effect, chain_of, encoded_chai
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 from thruster_env.env.copies import Channel, PlantCopies, reader_of
 from thruster_env.env.record import check_finite, record
+from thruster_env.thruster.analysis import LinearModel
 from thruster_env.thruster.channels import CHANNELS, MAX_CHANNELS, thrust
 from thruster_env.thruster.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.thruster.effects import (
@@ -48,7 +49,6 @@ from thruster_env.thruster.effects import (
     ThrusterContext,
     drawn_parameters,
 )
-from thruster_env.thruster.linear.analysis import LinearModel
 from thruster_env.thruster.parameters import derive_constants
 from thruster_env.thruster.plant import Plant
 from thruster_env.thruster.task import Task, state_limits, step_cost, thrust_scale

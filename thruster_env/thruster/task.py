@@ -9,8 +9,8 @@ import numpy as np
 from thruster_env.core.compiled import inlined
 from thruster_env.effects.effects import Effect
 from thruster_env.env.plant_data import checked_weights
+from thruster_env.thruster.analysis import equilibrium, state_range, steady_state
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
-from thruster_env.thruster.linear.analysis import equilibrium, state_range, steady_state
 from thruster_env.thruster.plant import Plant
 
 DEFAULT_WEIGHTS = (1.0, 0.0, 0.01)  # tracking, energy, voltage rate

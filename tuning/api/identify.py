@@ -23,7 +23,7 @@ from tuning.identification.profiles import Validation, fall_sentence, profile_fi
 from tuning.identification.result import Identification
 from tuning.logs.problem import AnyStepFamily, check_offsets, family_of, remarks, split_runs, write_found
 from tuning.logs.read import model_of_logs
-from tuning.problems.parameter import Coordinates, Parameter
+from tuning.problems.problem import Coordinates, Parameter
 
 # `Identified`: parameters identified from recorded runs, as a value.
 

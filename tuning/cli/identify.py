@@ -49,7 +49,7 @@ from tuning.identification.profiles import Profile, Validation, fall_sentence, p
 from tuning.identification.result import Identification
 from tuning.logs.problem import family_of, remarks, split_runs, write_found
 from tuning.logs.read import pairs, read_named
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 from tuning.search.parameters import index_pairs
 from tuning.thruster.logs import ThrusterFamily
 

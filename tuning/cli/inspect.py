@@ -11,7 +11,7 @@ import typer
 from thruster_env.core.checks import within
 from thruster_env.core.files import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.core.text_tables import table
-from thruster_env.thruster.linear.analysis import (
+from thruster_env.thruster.analysis import (
     INPUTS,
     STATES,
     Analysis,
@@ -26,12 +26,7 @@ from thruster_env.thruster.linear.analysis import (
     steady_state,
     step_response,
 )
-from thruster_env.thruster.linear.published import (
-    NO_LINEARISATION,
-    SAMPLE_TIME,
-    PublishedLinearModel,
-    published_for,
-)
+from thruster_env.thruster.linear import NO_LINEARISATION, SAMPLE_TIME, PublishedLinearModel, published_for
 from thruster_env.thruster.parameters import is_file
 from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, Plant, make_plant
 from tuning.cli.options import INPUT, OUTPUT, JsonOption, PresetOption

@@ -22,7 +22,7 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.env.env import LARGEST, SMALLEST
 from thruster_env.logs.log import Log
 from thruster_env.render.renderer import OnStep, Played, check_drawing, steps_a_frame, write_video
-from thruster_env.thruster.control.controllers import PIController
+from thruster_env.thruster.controllers import PIController
 from thruster_env.thruster.env import renderer_of
 from thruster_env.thruster.rendering import Moment, Overlay
 from tuning.cli.options import (

@@ -1,11 +1,14 @@
 """`thruster reproduce`: published tables, and those of standard problems, compared with many runs of ours.
 
 The papers on the underwater vehicle on the terminal: their tables beside ours, and conclusions.
+
+Standard problems on the terminal: published results beside ours, and why they differ.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,13 +23,13 @@ from filters.consistency.intervals import Interval, mean_interval
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.files import check_target
-from thruster_env.core.text_tables import table
+from thruster_env.core.text_tables import console, table
 from tuning.cli import options
-from tuning.cli.benchmark import fitted, list_of, reproduce_benchmark
 from tuning.cli.options import JsonOption, SeedOption
 from tuning.cli.output import announce_compilation, check_picture, emit, progress_console
 from tuning.experiments import BENCHMARKS, STUDIES, VEHICLE_STUDIES
 from tuning.experiments.benchmark import RUNS as BENCHMARK_RUNS
+from tuning.experiments.benchmark import WHY, Benchmark, Row, find_benchmark
 from tuning.experiments.thruster_papers import (
     MEMBERS,
     MOST_RUNS,
@@ -55,10 +58,70 @@ from tuning.experiments.vehicle.papers import PARTICULARS, POSE, PRINTED_PATHS, 
 from tuning.experiments.vehicle.papers import RUNS as VEHICLE_RUNS
 from tuning.experiments.vehicle.tables import ENKF, FKF, Finding, digits, findings, statements, with_interval
 
+
+def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list[RenderableType], dict]:
+    """Solve a standard problem; return what to show, as a list and as plain data."""
+    announce_compilation()
+    benchmark = find_benchmark(name)
+    with progress_console.status("...") as status:
+        rows = benchmark.reproduce(runs, seed, lambda row: status.update(f"done: {row.label}"))
+    output: list[RenderableType] = [_table(benchmark, rows, runs), Text(""), Text(f"{name}: {benchmark.source}")]
+    if benchmark.remarks:
+        output.append(list_of(benchmark.remarks))
+    return output, {
+        "settings": {"runs": runs, "seed": seed},
+        "source": benchmark.source,
+        "score": benchmark.score,
+        "theirs": benchmark.theirs,
+        "rows": [row._asdict() | {"ratio": row.ratio, "why": row.why} for row in rows],
+        "statements": list(benchmark.remarks),
+    }
+
+
+def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> Table:
+    columns = benchmark.header
+    columns[2] = f"ours ({runs} runs)"
+    cells = [row.cells() for row in rows]
+    for row in cells:
+        row[2] = row[2].replace(" [", "\n[")
+    compared = f"The table compares {benchmark.score}, ours with its 95 % interval."
+    caption = f"{compared} Median run: median score of single runs. Pooled: the RMSE of our tables."
+    out = fitted(table(benchmark.about, columns, cells, caption=caption), cells, flexible=WHY)
+    out.columns[0].width = None
+    return out
+
+
+LEAST = 12  # width of a column of words
+
+
+def fitted(out: Table, rows: list[list[str]], flexible: str = "") -> Table:
+    """The table with a blank line between rows of two lines, and numbers that do not wrap where there is room."""
+    out.leading = 1
+    fixed = [i for i, column in enumerate(out.columns) if str(column.header) != flexible]
+    widths = [max(len(line) for row in rows for line in row[i].split("\n")) for i in fixed]
+    if sum(widths) + 2 * len(out.columns) + (LEAST if flexible else 0) > console.width:
+        return out
+    for i, column in enumerate(out.columns):
+        if str(column.header) == flexible:
+            column.justify = "left"
+        else:
+            lines = [line for row in rows for line in row[i].split("\n")]
+            column.width = max(len(text) for text in lines + str(column.header).split())
+    return out
+
+
+def list_of(statements: Sequence[str]) -> Table:
+    """Statements as a list."""
+    out = Table.grid(padding=(0, 1))
+    for statement in statements:
+        out.add_row("-", Text(statement))
+    return out
+
+
 # Tables of the papers on the underwater vehicle.
 
 
-WHY = "why they differ"
+WHY_PAPERS = "why they differ"
 POSES = "In each cell x, y, z [m] and psi [rad], one below the other."
 FIELDS = {"planar": "by yaw alone", "planar_both": "both by yaw", "full": "full"}
 
@@ -94,14 +157,14 @@ def published_table(paper: str, result: PathResult, findings: list[Finding]) -> 
         )
     bound = "\n".join(digits(value) for value in result.bound.pose)
     rows.append(["bound", "", "", "", bound, "", ""])
-    columns = ["filter", "published", *FIELDS.values(), "s", WHY]
+    columns = ["filter", "published", *FIELDS.values(), "s", WHY_PAPERS]
     caption = (
         f"{POSES} By yaw alone: the papers' transformation, against the true path. Both by yaw: against the "
         "path that true velocities give by yaw alone. Full: with roll and pitch. s: seconds of a run, "
         'published above ours, of one core. "Similar" means within a factor of 3.'
     )
     title = f"{paper}, path {_name(result)}: published RMSE against ours"
-    return fitted(table(title, columns, rows, caption=caption), rows, flexible=WHY)
+    return fitted(table(title, columns, rows, caption=caption), rows, flexible=WHY_PAPERS)
 
 
 def velocity_table(result: PathResult) -> Table:

@@ -165,9 +165,8 @@ def recordings(
 
     Example: thruster study recordings --data rov_thruster
     """
-    from tuning.experiments.recordings.identification import estimates_of, identify_all
+    from tuning.experiments.recordings.identification import estimates_of, identify_all, sentences, tables_of
     from tuning.experiments.recordings.model import read_recordings
-    from tuning.experiments.recordings.tables import sentences, tables_of
 
     runs = read_recordings(data)
     if identify:

@@ -23,8 +23,7 @@ from tuning.evaluation.residuals import noise_estimation
 from tuning.problems.assumed import as_argument, rows_argument
 from tuning.problems.check import data_of
 from tuning.problems.data import Data
-from tuning.problems.parameter import Coordinates
-from tuning.problems.problem import Problem
+from tuning.problems.problem import Coordinates, Problem
 from tuning.search.objectives import LARGEST, nis_ratio
 from tuning.search.parameters import ensemble_sizes_of
 from tuning.search.plan import TRAINING_SEEDS

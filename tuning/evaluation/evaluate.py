@@ -31,7 +31,7 @@ from tuning.evaluation.runs import RunMetrics, metrics_of_all, variance_ratios
 from tuning.problems.data import Data, estimates_in_parts
 
 if TYPE_CHECKING:
-    from tuning.evaluation.outliers import UnevenNis
+    from tuning.evaluation.residuals import UnevenNis
 
 MEMBER_RUNS, MEMBER_STEPS = 40, 5  # runs and step interval of rank histograms
 NOTHING = Interval(np.nan, np.nan, np.nan)

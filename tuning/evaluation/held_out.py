@@ -46,7 +46,7 @@ from tuning.evaluation.evaluate import (
     likelihood_gain,
     score_ratio,
 )
-from tuning.evaluation.outliers import UnevenNis, uneven_nis
+from tuning.evaluation.residuals import UnevenNis, uneven_nis
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.check import data_of
 from tuning.problems.problem import Problem

@@ -14,7 +14,7 @@ from filters.consistency.time_constants import TimeConstants
 from tuning.evaluation.baselines import GIVEN, NO_RANGES, NOISE, ORACLE, RULE, SCALED, called
 from tuning.evaluation.evaluate import Evaluation, farthest, is_beyond
 from tuning.evaluation.held_out import Comparison
-from tuning.evaluation.outliers import uneven_sentence
+from tuning.evaluation.residuals import uneven_sentence
 from tuning.problems.problem import Problem
 from tuning.search.forgetting import TOLERANCE
 

@@ -40,8 +40,8 @@ import numpy as np
 
 from thruster_env.core.checks import short_repr
 from thruster_env.core.files import write_whole
+from thruster_env.thruster.analysis import steady_state
 from thruster_env.thruster.dynamics import thrust_and_torque
-from thruster_env.thruster.linear.analysis import steady_state
 from thruster_env.thruster.parameters import T200, ThrusterParameters, derive_constants
 
 # Reads a thruster's bollard table: thrust, speed and current for pulse widths and supply voltages.

@@ -44,7 +44,7 @@ from tuning.experiments.benchmark import (
     tune_inflation,
 )
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 SUBSTEP, SUBSTEPS = 0.01, 25  # an analysis every 0.25
 STEPS, BURN_IN = 1000, 64  # analyses, and those that do not count: the first 16 units of time

@@ -12,7 +12,7 @@ import math
 from filters import StateSpaceModel
 from tuning.problems.env_problem import EnvProblem
 from tuning.problems.excitation import Steps
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 DT = 0.05
 VARIANCES = (0.01, 0.01, 0.25)  # of cosine, sine and rate

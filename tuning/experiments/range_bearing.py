@@ -28,7 +28,7 @@ from filters.engine.batch import run
 from thruster_env.model.quantities import Quantity
 from tuning.experiments.benchmark import Benchmark, OnRow, Row, run_in_memory
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 from tuning.search.plan import Plan
 from tuning.search.trials import best_trial
 

@@ -45,8 +45,8 @@ from thruster_env.core.matrices import zero_order_hold
 from thruster_env.core.streams import COMPARISON_STUDY, derived_generator
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.simulate import Truth, simulate
-from thruster_env.thruster.linear.analysis import STATES
-from thruster_env.thruster.linear.published import PUBLISHED, SAMPLE_TIME
+from thruster_env.thruster.analysis import STATES
+from thruster_env.thruster.linear import PUBLISHED, SAMPLE_TIME
 
 # The runs of the bow thruster papers: systems, settings, and the form of a table.
 

@@ -44,9 +44,8 @@ from tuning.exploring.view import (
 from tuning.problems.data import Data
 from tuning.problems.find import find_problem
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.parameter import Parameter
 from tuning.problems.plant_packages import built_in
-from tuning.problems.problem import Problem
+from tuning.problems.problem import Parameter, Problem
 from tuning.problems.scenario import plain
 from tuning.search.objectives import LIKELIHOOD, SCORE, find_objective, nis_ratio
 from tuning.search.plan import Plan

@@ -27,8 +27,7 @@ from tuning.evaluation.runs import RunMetrics, metrics_by_run, metrics_of_all
 from tuning.problems.check import data_of
 from tuning.problems.data import Data, estimates_on, mask_of, only, padded
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.parameter import Parameter
-from tuning.problems.problem import Problem, score_label
+from tuning.problems.problem import Parameter, Problem, score_label
 from tuning.problems.scenario import BaseScenario, plain
 from tuning.search.parameters import PRIOR, Correlation, FilterParameter, MeasurementVariance, ProcessVariance, Q
 from tuning.search.space import Choice, everything_of, neutral, parameters, parameters_of

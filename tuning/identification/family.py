@@ -22,9 +22,9 @@ from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.equal_functions import bound_call, captured_numbers, differ_in_numbers_alone, with_numbers
 from thruster_env.graphs.graphs import Number
 from thruster_env.graphs.tracing import traced
-from thruster_env.logs.steps import AnyStepModel, in_any_steps
+from thruster_env.logs.log import AnyStepModel, in_any_steps
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.problems.parameter import Parameter, squared
+from tuning.problems.problem import Parameter, squared
 from tuning.search.parameters import r_name
 
 FACTOR = 10.0  # range of a positive parameter about its start

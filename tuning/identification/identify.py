@@ -32,7 +32,7 @@ from tuning.identification.result import (
 )
 from tuning.identification.starts import estimates_of, runs_of, starts_of
 from tuning.problems.data import Data
-from tuning.problems.parameter import Coordinates, Parameter
+from tuning.problems.problem import Coordinates, Parameter
 from tuning.search.study import stop_on_interrupt
 
 ROUNDS = 30  # of leaving out and identifying again, at most; a narrow gate takes many

@@ -25,7 +25,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.family import CapturedConstants
 from tuning.identification.starts import runs_of
 from tuning.problems.data import Data
-from tuning.problems.parameter import Coordinates
+from tuning.problems.problem import Coordinates
 
 
 def kept_variance(gate: float) -> float:

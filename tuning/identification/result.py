@@ -27,7 +27,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.family import ModelFamily
 from tuning.identification.objective import Ascent, Objective, climb, lost_information
 from tuning.likelihood.identifiability import COMPANION, KNOWN_WITHIN, TWO_SIDED
-from tuning.problems.parameter import Coordinates
+from tuning.problems.problem import Coordinates
 
 LEGS = 25  # iterations of the other parameters, at most
 ROUNDS = 4  # of going on from a better place that a test has found, at most

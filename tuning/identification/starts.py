@@ -16,8 +16,7 @@ from filters.starts import Starts, as_the_prior_says, wide_cov
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import short_repr
 from thruster_env.core.streams import filter_keys
-from thruster_env.logs.log import Log
-from thruster_env.logs.steps import in_steps
+from thruster_env.logs.log import Log, in_steps
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data, mask_of, padded
 from tuning.problems.log_parts import LEAD, check_times
@@ -181,7 +180,7 @@ def _is_elsewhere(model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> 
 def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
     """Data and logs as one `Data`; keys and seeds are those of the runs' indices 0, 1, ...
 
-    Logs on their own stamps have step ratios as their last input (`thruster_env.logs.steps`).
+    Logs on their own stamps have step ratios as their last input (`thruster_env.logs.log`).
 
     Raises:
         ValueError: for anything else, for no run, for runs with different inputs, measurements or sample times.

@@ -15,8 +15,7 @@ from filters.registry import filter_type, make_filter
 from thruster_env.core.checks import one_of
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
-from tuning.problems.parameter import Coordinates, Parameter
-from tuning.problems.problem import Problem
+from tuning.problems.problem import Coordinates, Parameter, Problem
 from tuning.search.parameters import (
     CORRELATIONS,
     Correlation,

@@ -22,8 +22,7 @@ from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.family import Family, check_gradient
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
 from tuning.problems.data import Data
-from tuning.problems.parameter import Coordinates, Parameter
-from tuning.problems.problem import Problem
+from tuning.problems.problem import Coordinates, Parameter, Problem
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
 from tuning.search.space import Choice, neutral, untuned_choice

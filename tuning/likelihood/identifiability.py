@@ -10,7 +10,7 @@ from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_type
 from filters.tuned_file import NOISE
-from tuning.evaluation.outliers import heavy_innovations, tails_in_words
+from tuning.evaluation.residuals import heavy_innovations, tails_in_words
 from tuning.likelihood.family import known_information
 from tuning.problems.data import Data, estimates_in_parts, where_true
 from tuning.problems.problem import Problem

@@ -17,8 +17,7 @@ from thruster_env.core.checks import short_repr
 from thruster_env.core.modules import object_named
 from thruster_env.env.record import read_for
 from thruster_env.logs.findings import has_outliers, remarks_on
-from thruster_env.logs.log import Log, cut_at_gaps
-from thruster_env.logs.steps import in_any_steps
+from thruster_env.logs.log import Log, cut_at_gaps, in_any_steps
 from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.family import ModelFamily
@@ -28,9 +27,8 @@ from tuning.problems.assumed import name_and_unknown
 from tuning.problems.find import named
 from tuning.problems.log_parts import check_apart, check_times
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.parameter import Parameter
 from tuning.problems.plant_packages import logs_package
-from tuning.problems.problem import Problem
+from tuning.problems.problem import Parameter, Problem
 
 OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid", "stamps")  # of `read_named`
 

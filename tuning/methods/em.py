@@ -15,7 +15,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import with_covariances
 from tuning.likelihood.gradient import DIVERGED, Goal, minimum_within
 from tuning.methods.task import FEW, Spent, Task, way_out
-from tuning.problems.parameter import Coordinates
+from tuning.problems.problem import Coordinates
 from tuning.search.objectives import LIKELIHOOD
 from tuning.search.parameters import MeasurementVariance, ProcessVariance
 

@@ -18,7 +18,7 @@ from tuning.evaluation.baselines import with_covariances
 from tuning.likelihood.gradient import optimum, start_at, starts_of
 from tuning.methods.scoring import INFLATION
 from tuning.methods.task import Task
-from tuning.problems.parameter import Coordinates
+from tuning.problems.problem import Coordinates
 from tuning.search.parameters import FILTER_PARAMETERS
 from tuning.search.samplers import make_sampler
 from tuning.search.space import Choice

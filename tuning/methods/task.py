@@ -21,8 +21,7 @@ from tuning.evaluation.evaluate import compute_metrics
 from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.gradient import Goal
 from tuning.problems.data import FIRST_SCORED_STEP, Data
-from tuning.problems.parameter import Parameter
-from tuning.problems.problem import Problem
+from tuning.problems.problem import Parameter, Problem
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORES, NEES, SCORE, VARIANCES, find_objective, penalised
 from tuning.search.parameters import model_parameters
 from tuning.search.space import Choice, neutral, parameters, untuned_choice

@@ -3,7 +3,7 @@
 `NativeVecEnv` is what Stable-Baselines3 takes: a vector env of this package, all copies stepped in one call.
 
 Learned and classical policies share `predict`, run on the same envs and are scored by the same code (`score`).
-Controllers plan with the plant's own code (`thruster_env.thruster.control.planning`), so their cost cannot drift
+Controllers plan with the plant's own code (`thruster_env.thruster.planning`), so their cost cannot drift
 from the reward. A policy may correct a controller: a wrapper of VecEnvs adds the two actions. Views of the state
 are wrappers of VecEnvs (`views`), which serve native and single envs alike. Infos are empty but at the end of an
 episode: a dictionary a copy and step costs more than the plant. Torch is set up for small networks

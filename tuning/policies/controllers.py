@@ -17,9 +17,9 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from thruster_env.core.checks import one_of
-from thruster_env.thruster.control.controllers import LQRController, PIController
-from thruster_env.thruster.control.planning import HORIZONS, PredictiveController
+from thruster_env.thruster.controllers import LQRController, PIController
 from thruster_env.thruster.dynamics import Constants
+from thruster_env.thruster.planning import HORIZONS, PredictiveController
 from tuning.policies.observations import TrainingReturns, size_of
 
 

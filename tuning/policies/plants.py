@@ -23,9 +23,9 @@ from thruster_env.auv.plant import make_plant as make_vehicle
 from thruster_env.core.checks import one_of
 from thruster_env.env.commands import ObserveState
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.thruster.control.planning import HORIZONS
 from thruster_env.thruster.env import BowThrusterEnv
 from thruster_env.thruster.model import MODEL_ARGUMENTS, thruster_model
+from thruster_env.thruster.planning import HORIZONS
 from thruster_env.thruster.plant import Plant, make_plant
 from thruster_env.thruster.task import thrust_scale
 from tuning.auv.scenario import SCENARIOS as VEHICLE_SCENARIOS

@@ -30,8 +30,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.check import check_data
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step
 from tuning.problems.digest import digest_of
-from tuning.problems.parameter import Parameter
-from tuning.problems.problem import GIVEN, SPREAD, Problem
+from tuning.problems.problem import GIVEN, SPREAD, Parameter, Problem
 
 RANGE_SEEDS = range(8)  # seeds whose runs determine each state's range, unless the model has it
 RANGE_FRACTION = 0.01  # standard deviation of the rule of thumb's Q, as a fraction of each state's range
@@ -261,7 +260,7 @@ def _checked_parameters(parameters) -> tuple[Parameter, ...] | None:
     )
     if not checked or not all(isinstance(parameter, Parameter) for parameter in checked):
         raise ValueError(
-            f"parameters must be some of tuning.problems.parameter.Parameter, but got {short_repr(parameters)}"
+            f"parameters must be some of tuning.problems.problem.Parameter, but got {short_repr(parameters)}"
         )
     names = [parameter.name for parameter in checked]
     if len(set(names)) < len(names):

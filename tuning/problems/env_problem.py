@@ -33,7 +33,7 @@ from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.digest import digest_of, env_identity
 from tuning.problems.excitation import Excitation, excitation_of
 from tuning.problems.model_problem import NamedArguments
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 # `Episodes`: the env of an `EnvProblem`, which offers the problem's model and shows what its data hold.
 

@@ -16,15 +16,14 @@ from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.findings import OUTLIERS, has_outliers, remarks_on
 from thruster_env.logs.findings import outliers as rows_of_outliers
-from thruster_env.logs.log import Log
-from thruster_env.logs.steps import as_rows, in_any_steps
+from thruster_env.logs.log import Log, as_rows, in_any_steps
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
 from tuning.problems.data import Data, mask_of, only, padded
 from tuning.problems.digest import digest_of
 from tuning.problems.log_parts import Parts, check_apart, checked_logs, parts_of
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 ROBUST = ("ekf-robust",)  # filters that take measurements far from the prior for outliers
 
@@ -61,7 +60,7 @@ class LogProblem(AssumedProblem):
     blocks may differ in length, and each counts in full; where true states are known at some steps only, these
     are scored.
 
-    Logs on their own stamps are rows with the step ratio as one more input (`thruster_env.logs.steps`), without
+    Logs on their own stamps are rows with the step ratio as one more input (`thruster_env.logs.log`), without
     true states, and a tuned file is for the model of a step of dt.
 
     Without true states there is no scale, and the negative log-likelihood of the innovations is minimised. The

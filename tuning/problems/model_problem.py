@@ -30,8 +30,7 @@ from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_s
 from tuning.problems.digest import digest_of
 from tuning.problems.excitation import Excitation, excitation_of
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.parameter import Parameter
-from tuning.problems.problem import BOUND, OPEN_LOOP
+from tuning.problems.problem import BOUND, OPEN_LOOP, Parameter
 
 SCALE_SEEDS = range(200)  # seeds of the inputs for which the scale is the bound, where none is given
 Inputs = np.ndarray | Sequence | Mapping | Excitation | Callable | None

@@ -21,8 +21,7 @@ from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import FULL_Q, FULL_QR, TUNED, called, is_far_below
 from tuning.evaluation.evaluate import is_beyond
 from tuning.evaluation.held_out import Comparison
-from tuning.evaluation.outliers import tails_in_words
-from tuning.evaluation.residuals import noise_estimation
+from tuning.evaluation.residuals import noise_estimation, tails_in_words
 from tuning.evaluation.worth import LARGEST_RATIO, scaling_sentence, sized, times, without_truth
 from tuning.problems.assumed import may_estimate_constants, within
 from tuning.problems.plant_packages import logs_package

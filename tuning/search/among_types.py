@@ -3,6 +3,8 @@
 NIS is the normalised innovation squared.
 
 Trials enqueued after a finished trial: a sampler would find them only late and by chance.
+
+The Q and R to which gradients lead, as parameters of a trial.
 """
 
 from __future__ import annotations
@@ -21,15 +23,63 @@ from filters.registry import filter_type
 from tuning.evaluation.baselines import competing_baselines, noise_estimated
 from tuning.evaluation.held_out import sizes_as_data, stored_sizes
 from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
-from tuning.likelihood.gradient import OF_STATES
+from tuning.likelihood.family import has_gradient, keeps_more
+from tuning.likelihood.gradient import OF_STATES, Goal, goal_of, optimum, start_at, starts_of
 from tuning.problems.data import Data
-from tuning.search.gradient_noise import BY_GRADIENT, MAXIMUM_LIKELIHOOD, MOST_FOR_STARTS, noise_by_gradient
-from tuning.search.objectives import SCORE, reported
+from tuning.search.objectives import LIKELIHOOD, SCORE, reported
 from tuning.search.parameters import R, model_parameters
 from tuning.search.plan import Plan
 from tuning.search.samplers import is_local, near
 from tuning.search.space import FILTER_TYPE, Choice, ends_of, trial_parameters, untuned_choice, within_ranges
 from tuning.search.trials import COST, NIS, best_trial, enqueue_new, is_consistent, is_near, is_over_budget
+
+# Attributes of studies and trials, which stay as they were first written.
+MAXIMUM_LIKELIHOOD = "likeliest noise"  # Q and R have maximum likelihood; of a study what they are
+BY_GRADIENT = "gradient of"  # the objective on the true states, of which Q and R are the minimum; of a study they
+MOST_FOR_STARTS = 8  # parameters, of which an ascent has more than one start
+MOST_STATES = 8  # of a model, in which filters but the linear and the extended one follow their own gradients
+MOST_FOR_ALL = 24  # parameters, of which an ascent has all runs
+MAXIMUM_LIKELIHOOD_RUNS = 8  # of a model with many states or parameters, and to compare starts: they tell enough
+
+
+def noise_by_gradient(study: optuna.Study, plan: Plan, objective: str = LIKELIHOOD) -> dict[str, float] | None:
+    """The Q and R, or own parameters, found by gradients of an objective, stored with the study.
+
+    They are those of the tuned filter if it has gradients, learns no noise, and the model has few states,
+    otherwise of an extended Kalman filter; models of few states get three starts. Near the best Q and R the score
+    is so flat that a sampler finds the optimum late, and with many correlations never; with a wrong model the
+    trial is one among many. None for parameters that change functions of the model, which have no such gradient.
+    """
+    if not all(filter_type(name).has_covariance for name in plan.filter_types):
+        return None
+    key = MAXIMUM_LIKELIHOOD if objective == LIKELIHOOD else f"{BY_GRADIENT} {objective}"
+    known = study.user_attrs.get(key)
+    if known is not None:
+        return known or None
+    small = len(plan.scenarios[0].quantities.states) <= MOST_STATES
+    has_own_gradient = small and has_gradient(plan.filter) and not keeps_more(plan.filter)
+    name = plan.filter if plan.filter == "kf" or has_own_gradient else "ekf"
+    try:
+        goal = goal_of(name, plan.scenarios, plan.training_data(), objective, plan.options)
+        on_few = goal.is_large or len(goal.coordinates.free) > MOST_FOR_ALL
+        goal = goal.of_few(MAXIMUM_LIKELIHOOD_RUNS) if on_few else goal
+        best = optimum(goal, _best_start(goal))
+    except ValueError:  # more than numbers changes, or whole numbers
+        study.set_user_attr(key, {})
+        return None
+    noise = within_ranges(dict(zip(goal.coordinates.names, best.parameters.tolist(), strict=True)), plan.space())
+    study.set_user_attr(key, noise)
+    return noise
+
+
+def _best_start(goal: Goal) -> np.ndarray:
+    """The start of an ascent: of a model with few numbers where the best of three starts leads on a few runs."""
+    free, few = goal.coordinates.free, goal.of_few(MAXIMUM_LIKELIHOOD_RUNS)
+    if goal.is_large or len(free) > MOST_FOR_STARTS:
+        return start_at(goal, [1.0] * len(free))
+    best = max((optimum(few, start_at(goal, start)) for start in starts_of(free)), key=lambda ascent: ascent.value)
+    return goal.coordinates.of(best.parameters)
+
 
 # Attributes of trials. Their texts are in journals and databases, so they stay as they were first written.
 UNTUNED = "untuned"  # the filter whose parameters before any tuning these are

@@ -16,8 +16,7 @@ from filters.registry import FilterType, filter_type
 from filters.tuned_file import NOISE
 from filters.tuned_file import PRIOR as PRIOR_FACTOR
 from thruster_env.core.checks import covariance
-from tuning.problems.parameter import Argument, Parameter, Place, squared
-from tuning.problems.problem import Problem
+from tuning.problems.problem import Argument, Parameter, Place, Problem, squared
 from tuning.search.relations import correlations_of, full_covariance, related
 
 Q, R = NOISE  # arguments of the model

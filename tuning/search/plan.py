@@ -22,8 +22,7 @@ from tuning.problems.assumed import may_estimate_constants
 from tuning.problems.check import checked_problem, data_of
 from tuning.problems.data import Data
 from tuning.problems.digest import digest_of
-from tuning.problems.parameter import Argument, Parameter
-from tuning.problems.problem import Problem
+from tuning.problems.problem import Argument, Parameter, Problem
 from tuning.search.forgetting import TOLERANCE, forgetting, raised_noise, reachable
 from tuning.search.objectives import COVARIANCE, LOG_SCORE, Objective, check_objectives, find_objective
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, index_pairs

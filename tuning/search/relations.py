@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import short_repr
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 FORM = re.compile(

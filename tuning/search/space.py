@@ -14,8 +14,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from filters.estimators.find import estimator_named, is_trained
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_type, make_filter
-from tuning.problems.parameter import Parameter
-from tuning.problems.problem import Problem
+from tuning.problems.problem import Parameter, Problem
 from tuning.search.parameters import (
     FilterParameter,
     default_numbers,

@@ -29,7 +29,7 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.evaluate import is_beyond
 from tuning.problems.data import Data
-from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
+from tuning.search.among_types import MAXIMUM_LIKELIHOOD
 from tuning.search.measures import (
     LEVEL,
     Measured,

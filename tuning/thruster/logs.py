@@ -22,8 +22,7 @@ from thruster_env.thruster.model import NO_BAND, Recorder, lag_weights, logged_p
 from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, checked, is_file, read_preset
 from thruster_env.thruster.plant import Plant
 from tuning.problems.find import FILE_SEQUENCES
-from tuning.problems.parameter import Parameter, squared
-from tuning.problems.problem import Problem
+from tuning.problems.problem import Parameter, Problem, squared
 from tuning.problems.scenario import BaseScenario
 from tuning.search.parameters import r_name
 

@@ -26,11 +26,11 @@ from thruster_env.core.checks import at_least, one_of, positive, short_repr, vec
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.effects.effects import Effect, set_field
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster.analysis import equilibrium, jacobians, state_range, steady_state
 from thruster_env.thruster.channels import CHANNELS
-from thruster_env.thruster.control.controllers import PIController, lambda_gains
+from thruster_env.thruster.controllers import PIController, lambda_gains
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
-from thruster_env.thruster.linear.analysis import equilibrium, jacobians, state_range, steady_state
-from thruster_env.thruster.linear.published import make_linear_plant, operating_points
+from thruster_env.thruster.linear import make_linear_plant, operating_points
 from thruster_env.thruster.model import model_of_plant
 from thruster_env.thruster.parameters import is_file, preset_mapping
 from thruster_env.thruster.plant import (

@@ -8,8 +8,7 @@ import pytest
 
 import thruster_env.auv  # noqa: F401 - registers the envs
 from docs.scripts import made_by
-from thruster_env.auv.effects import CURRENT_SIGNALS
-from thruster_env.auv.plant import SUITES
+from thruster_env.auv.plant import CURRENT_SIGNALS, SUITES
 from tuning.auv.scenario import SCENARIOS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "auv.md").read_text()

@@ -8,7 +8,7 @@ import pytest
 from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.quantities import Output, Quantity
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.thruster.linear.analysis import steady_state
+from thruster_env.thruster.analysis import steady_state
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.parameters import PRESETS
 

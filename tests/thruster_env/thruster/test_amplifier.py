@@ -9,7 +9,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.memory import row
 from thruster_env.core.streams import episode_keys
-from thruster_env.thruster.linear.analysis import run_substeps
+from thruster_env.thruster.analysis import run_substeps
 from thruster_env.thruster.parameters import PRESETS, TUNNEL_PHYSICAL
 from thruster_env.thruster.plant import make_plant
 from thruster_env.thruster.simulation import COMMAND, FLOW, OMEGA, VOLTAGE, Copies

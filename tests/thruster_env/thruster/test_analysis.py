@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from thruster_env.core.matrices import zero_order_hold
-from thruster_env.thruster.dynamics import rates, thrust_and_torque_tangent
-from thruster_env.thruster.linear.analysis import (
+from thruster_env.thruster.analysis import (
     INPUTS,
     LinearModel,
     analyse,
@@ -22,7 +21,8 @@ from thruster_env.thruster.linear.analysis import (
     step_response,
     transfer_function,
 )
-from thruster_env.thruster.linear.published import PUBLISHED, SAMPLE_TIME, published_for
+from thruster_env.thruster.dynamics import rates, thrust_and_torque_tangent
+from thruster_env.thruster.linear import PUBLISHED, SAMPLE_TIME, published_for
 from thruster_env.thruster.parameters import ANGLES, PRESETS, TUNNEL, derive_constants
 from tuning.cli.inspect import response_figure
 

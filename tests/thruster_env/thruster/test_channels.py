@@ -9,7 +9,7 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.env.copies import Channel, reader_of
 from thruster_env.model.quantities import Quantity
 from thruster_env.thruster.channels import CHANNELS
-from thruster_env.thruster.linear.published import make_linear_plant
+from thruster_env.thruster.linear import make_linear_plant
 from thruster_env.thruster.model import model_of_plant, thruster_model
 from thruster_env.thruster.plant import make_plant
 from thruster_env.thruster.simulation import simulate

@@ -8,9 +8,9 @@ import pytest
 
 from thruster_env import PRESETS
 from thruster_env.env.commands import ObserveState, ObserveStateVector
-from thruster_env.thruster.control.controllers import LQRController, PIController, lambda_gains, quadratic_gain
-from thruster_env.thruster.control.planning import PredictiveController
-from thruster_env.thruster.linear.analysis import steady_state
+from thruster_env.thruster.analysis import steady_state
+from thruster_env.thruster.controllers import LQRController, PIController, lambda_gains, quadratic_gain
+from thruster_env.thruster.planning import PredictiveController
 from thruster_env.thruster.task import make_task, thrust_scale
 
 NOISE_FREE = {"process_noise_cov": (0.0, 0.0), "measurement_noise_cov": 0.0, "initial_state": (0.0, 0.0)}

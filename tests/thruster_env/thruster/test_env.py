@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 import thruster_env
 from thruster_env import PRESETS, BowThrusterEnv
-from thruster_env.thruster.linear.analysis import run_substeps, state_range, steady_state
+from thruster_env.thruster.analysis import run_substeps, state_range, steady_state
 from thruster_env.thruster.parameters import TUNNEL, TUNNEL_PHYSICAL
 from thruster_env.thruster.plant import make_plant
 

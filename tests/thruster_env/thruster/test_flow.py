@@ -11,8 +11,8 @@ import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.memory import row
 from thruster_env.core.streams import episode_keys
 from thruster_env.effects.signals import RecordedSeries
+from thruster_env.thruster.analysis import run_substeps, state_range
 from thruster_env.thruster.effects import FLOW_SIGNALS
-from thruster_env.thruster.linear.analysis import run_substeps, state_range
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
 from thruster_env.thruster.plant import make_plant
 from thruster_env.thruster.simulation import AMBIENT, Copies

@@ -4,14 +4,9 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
 from thruster_env import PRESETS
-from thruster_env.thruster.control.controllers import (
-    LQRController,
-    lambda_gains,
-    quadratic_gain,
-    quadratic_problem,
-)
-from thruster_env.thruster.linear.analysis import equilibrium, steady_state
-from thruster_env.thruster.linear.published import make_linear_plant, operating_points, sampled_plant
+from thruster_env.thruster.analysis import equilibrium, steady_state
+from thruster_env.thruster.controllers import LQRController, lambda_gains, quadratic_gain, quadratic_problem
+from thruster_env.thruster.linear import make_linear_plant, operating_points, sampled_plant
 from thruster_env.thruster.plant import make_plant
 from thruster_env.thruster.task import make_task, thrust_scale
 

@@ -5,14 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from thruster_env.core.matrices import observability, zero_order_hold
+from thruster_env.thruster.analysis import jacobians, required_substeps, run_substeps, state_range, steady_state
 from thruster_env.thruster.dynamics import rates, thrust_and_torque
-from thruster_env.thruster.linear.analysis import (
-    jacobians,
-    required_substeps,
-    run_substeps,
-    state_range,
-    steady_state,
-)
 from thruster_env.thruster.parameters import (
     OPEN_BLADED,
     OPEN_BLADED_CORRECTED,

@@ -9,15 +9,9 @@ from scipy.optimize import minimize
 
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.compiled import interpreted
-from thruster_env.thruster.control import planning
-from thruster_env.thruster.control.planning import (
-    HORIZONS,
-    PredictiveController,
-    Problem,
-    best_voltages,
-    improve_plans,
-)
+from thruster_env.thruster import planning
 from thruster_env.thruster.parameters import preset_parameters
+from thruster_env.thruster.planning import HORIZONS, PredictiveController, Problem, best_voltages, improve_plans
 from thruster_env.thruster.plant import make_plant
 
 WEIGHTS = {"tracking_weight": 1.0, "energy_weight": 0.05, "voltage_rate_weight": 0.1}  # so that each one counts

@@ -9,9 +9,9 @@ from scipy import signal, stats
 
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.streams import episode_keys
+from thruster_env.thruster.analysis import steady_state
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
 from thruster_env.thruster.env import BowThrusterReversalEnv, BowThrusterTrackingEnv
-from thruster_env.thruster.linear.analysis import steady_state
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
 from thruster_env.thruster.plant import make_plant
 from thruster_env.thruster.simulation import NEXT_REFERENCE, REFERENCE, Copies

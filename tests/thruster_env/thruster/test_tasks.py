@@ -18,7 +18,7 @@ from thruster_env.effects.sensors import Dropout
 from thruster_env.effects.signals import Sinusoid
 from thruster_env.thruster.effects import LogNormal
 from thruster_env.thruster.env import BowThrusterLinearEnv
-from thruster_env.thruster.linear.published import PUBLISHED, make_linear_plant
+from thruster_env.thruster.linear import PUBLISHED, make_linear_plant
 from thruster_env.thruster.parameters import TUNNEL_PHYSICAL
 from thruster_env.thruster.simulation import simulate
 

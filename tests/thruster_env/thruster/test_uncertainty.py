@@ -11,6 +11,13 @@ from scipy.integrate import solve_ivp
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.memory import row
 from thruster_env.core.streams import episode_keys
+from thruster_env.thruster.analysis import (
+    required_substeps,
+    required_substeps_of_all,
+    run_substeps,
+    state_range,
+    steady_state,
+)
 from thruster_env.thruster.dynamics import Constants, rates, thrust_and_torque
 from thruster_env.thruster.effects import (
     UNCERTAIN,
@@ -21,13 +28,6 @@ from thruster_env.thruster.effects import (
     make_uncertainty,
 )
 from thruster_env.thruster.env import BowThrusterVectorEnv
-from thruster_env.thruster.linear.analysis import (
-    required_substeps,
-    required_substeps_of_all,
-    run_substeps,
-    state_range,
-    steady_state,
-)
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.thruster.plant import make_plant
 from thruster_env.thruster.simulation import CONSTANT_ROWS, Copies, simulate

@@ -23,7 +23,7 @@ from tuning.api.progress import trial_bar
 from tuning.api.run import file_name
 from tuning.cli import output
 from tuning.cli.app import COMMANDS, PANELS, listed
-from tuning.cli.benchmark import fitted
+from tuning.cli.reproduce import fitted
 from tuning.cli.tuning_report import way_out
 from tuning.evaluation.baselines import ORACLE, RULE, rule_of_thumb
 from tuning.problems.find import find_problem

@@ -10,7 +10,7 @@ from thruster_env.thruster.plant import make_plant
 from tuning.experiments import identification
 from tuning.experiments.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study
 from tuning.identification.objective import Objective
-from tuning.problems.parameter import Coordinates
+from tuning.problems.problem import Coordinates
 from tuning.thruster.logs import ThrusterFamily
 
 

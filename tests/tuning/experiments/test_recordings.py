@@ -23,6 +23,8 @@ from tuning.experiments.recordings.identification import (
     estimates_of,
     identified,
     identify_all,
+    ladder_rows,
+    number_rows,
     ratios,
     regimes,
     rmse,
@@ -31,7 +33,6 @@ from tuning.experiments.recordings.identification import (
     thrusts,
 )
 from tuning.experiments.recordings.model import DT, clock_offset, model, read_recordings, to_identify
-from tuning.experiments.recordings.tables import ladder_rows, number_rows
 from tuning.identification.result import valued
 
 RECORDED = Path(__file__).parents[4] / "shared" / "data" / "rov_thruster"
@@ -167,7 +168,7 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
     assert len(number_rows(runs, tasks)) == len(STRUCTURES[CHOSEN].free)
     assert len(estimates_of(runs, tasks)[OURS]) == 2
     few = {name: one for name, one in STRUCTURES.items() if name in (CHOSEN, "ambient")}
-    monkeypatch.setattr("tuning.experiments.recordings.tables.STRUCTURES", few)
+    monkeypatch.setattr("tuning.experiments.recordings.identification.STRUCTURES", few)
     assert [row[0] for row in ladder_rows(runs, tasks)] == [one.about for one in few.values()]
 
 

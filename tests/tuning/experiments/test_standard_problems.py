@@ -189,7 +189,7 @@ def small(why=""):
 @pytest.mark.usefixtures("as_python")
 class TestReproduce:
     def test_the_command_shows_published_scores_and_why_ours_differ(self, thruster, monkeypatch):  # noqa: F811
-        monkeypatch.setattr("tuning.cli.benchmark.find_benchmark", lambda name: small("unlike"))
+        monkeypatch.setattr("tuning.cli.reproduce.find_benchmark", lambda name: small("unlike"))
         done = thruster("reproduce", "lorenz63", "--runs", 2, "--json", "-")
         assert done.returncode == 0, done.stderr
         found = json.loads(done.stdout)

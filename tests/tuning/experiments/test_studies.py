@@ -9,7 +9,7 @@ from filters import KalmanFilter, run
 from tests.oracles import kalman_update
 from thruster_env.core.text_tables import console
 from thruster_env.model.simulate import simulate
-from thruster_env.thruster.linear.published import PUBLISHED
+from thruster_env.thruster.linear import PUBLISHED
 from tuning.cli.main import main
 from tuning.experiments import STUDIES
 from tuning.experiments.thruster_papers import (

@@ -23,7 +23,7 @@ from tuning.methods.registry import find_method
 from tuning.methods.searches import updated
 from tuning.methods.task import Budget, Task
 from tuning.problems.model_problem import ModelProblem, RunsProblem
-from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Parameter
 from tuning.search.objectives import LIKELIHOOD
 
 # Flow of the Nile at Aswan, 1871 to 1970 [1e8 m^3]: Durbin, Koopman (2012), "Time series analysis by state space

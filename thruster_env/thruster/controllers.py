@@ -16,13 +16,7 @@ import numpy as np
 
 from thruster_env.core.checks import finite, positive
 from thruster_env.env.model_env import remembered
-from thruster_env.thruster.linear.published import (
-    OperatingPoints,
-    operating_points,
-    sampled_plant,
-    slopes,
-    thrust_of,
-)
+from thruster_env.thruster.linear import OperatingPoints, operating_points, sampled_plant, slopes, thrust_of
 from thruster_env.thruster.plant import Plant
 from thruster_env.thruster.task import Task, thrust_scale
 

@@ -18,7 +18,7 @@ import numpy as np
 from thruster_env.core.checks import at_least
 from thruster_env.core.compiled import compiled, function_fingerprint, inlined, is_interpreting
 from thruster_env.env.model_env import remembered
-from thruster_env.thruster.control.controllers import constant_reference, read, read_state
+from thruster_env.thruster.controllers import constant_reference, read, read_state
 from thruster_env.thruster.dynamics import (
     Constants,
     driven_substep,

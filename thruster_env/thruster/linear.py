@@ -38,8 +38,8 @@ import numpy as np
 
 from thruster_env.core.checks import one_of, takes_arguments_of
 from thruster_env.core.matrices import zero_order_hold
+from thruster_env.thruster.analysis import LinearModel, SteadyState, equilibrium, jacobians, steady_state
 from thruster_env.thruster.dynamics import thrust_and_torque
-from thruster_env.thruster.linear.analysis import LinearModel, SteadyState, equilibrium, jacobians, steady_state
 from thruster_env.thruster.plant import Plant, make_plant
 
 SAMPLE_TIME = 0.01  # [s], of the printed zero-order hold

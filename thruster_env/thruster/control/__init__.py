@@ -1,1 +1,0 @@
-"""Controllers of the thruster: PI, LQR, and those that plan with its own equations."""

@@ -1,1 +1,0 @@
-"""Steady states, linearisation, its analysis, and the published linear systems."""
