@@ -65,7 +65,9 @@ def test_where_there_is_no_scaled_default_it_says_why():
     assert scaling_sentence(comparison).startswith(
         "There is no scaled default, so the rule of thumb comes first: no factor"
     )
-    assert tuning_effect(comparison) == "makes no significant difference on 4 seeds against the rule of thumb"
+    assert tuning_effect(comparison) == (
+        "makes no significant difference on 4 seeds against the rule of thumb and against the noise estimation"
+    )
     with pytest.raises(ValueError, match="ekf must have a scaled default on startup, but no factor on Q from"):
         contender("ekf", "scaled").filter(startup)
 
@@ -107,7 +109,8 @@ def test_a_proof_holds_all_baselines_on_the_same_seeds_and_names_the_one_that_co
         comparison.ratios[RULE].high < comparison.ratios[SCALED].low
     )  # the rule of thumb is the easier one to beat
     said = tuning_effect(comparison, "the error")
-    assert said.startswith("lowers the error by ") and " against the scaled default and by " in said
+    assert said.startswith("lowers the error by ") and " against the scaled default, by " in said
+    assert " against the rule of thumb and raises the error by " in said and said.endswith("noise estimation")
     assert f"its Q times {comparison.default.factor:.4g}" in scaling_sentence(comparison)
 
 
