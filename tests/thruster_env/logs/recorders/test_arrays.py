@@ -307,3 +307,15 @@ def test_units_may_be_one_for_each_column(tmp_path):
     with pytest.raises(ValueError, match="the unit of column 'two' .* but got 'mV, kV'.*name another in brackets"):
         read_log(path, MODEL, {"V_s": "two", "tach": "m[1]"})
     assert read_log(path, MODEL, {"V_s": "two[V]", "tach": "m[1]"}).inputs[1, 0] == np.sin(t[1])
+
+
+def test_numbers_come_from_the_reading_process_in_their_own_kind(tmp_path):
+    sent = {"d": RNG.normal(size=5), "f": RNG.normal(size=5).astype(np.float32), "i": np.arange(5, dtype=np.int16)}
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, values in sent.items():
+            file[name] = values
+    with process.opened("hdf5", tmp_path / "a.h5") as file:
+        received = [file.read(i) for i in range(len(sent))]
+    for values, expected in zip(received, sent.values(), strict=True):
+        assert values.dtype == expected.dtype
+        np.testing.assert_array_equal(values, expected)
