@@ -31,6 +31,7 @@ from thruster_env.core.streams import CHANCE, DISTURBANCE, normal_block, uniform
 EFFECT_KIND, EFFECT_TARGET, EFFECT_ROWS, EFFECT_NUMBER, EFFECT_PARAMETERS = range(1, 6)
 MAGNITUDES = (1e-100, 1e100)  # of an effect's arguments and of what follows from them
 LONGEST = 1e9  # [s], and in steps: what an effect may hold
+PLANT_ROWS, TRIED_ROW = 4096, 2048  # more rows than a plant has, and one of them: where an effect is tried
 SPACING = 64  # effects of each chain have numbers of their own, whatever the other chains hold
 
 
@@ -93,6 +94,7 @@ def checked_probability(name: str, value) -> float:
 
 
 Kind = TypeVar("Kind", bound=Effect)
+_tried: set[tuple[type[Effect], int]] = set()  # types of effects, and their rows, that stay within their memory
 
 
 class Registry:
@@ -181,6 +183,7 @@ def encoded(
     rows = 0
     for index, effect in enumerate(effects):
         parameters = _representable(effect, effect.parameters(context))
+        _check_reach(effect, parameters, context)
         number = index + (lost_with if effect.loses and lost_with is not None else first_number)
         header = [5 + len(parameters), kinds.index(type(effect)), target, first_row + rows, number]
         numbers += [*header, *parameters]
@@ -223,6 +226,28 @@ def _representable(effect: Effect, parameters: list[float]) -> list[float]:
         rule = f"arguments of {effect.name!r} must be zero, or from {smallest:g} to {largest:g} in magnitude"
         raise ValueError(f"{rule}, and so must what follows from them, but got {short_repr(effect)}")
     return [float(value) for value in parameters]
+
+
+def _check_reach(effect: Effect, parameters: list[float], context: Context) -> None:
+    """Raise ValueError if `act` goes beyond the effect's rows or parameters, which compiled code would not notice.
+
+    It is tried as Python, once for each type and number of rows, at the end of a memory that NumPy guards.
+    """
+    rows = effect.rows(context)
+    if (type(effect), rows) in _tried:
+        return
+    memory, numbers = np.zeros((1, PLANT_ROWS + rows, 1)), np.array([0.0] * EFFECT_PARAMETERS + parameters)
+    memory[0, [KEY_0, KEY_1], 0] = 1.0, 2.0
+    try:
+        for step in range(3):
+            memory[0, STEP, 0] = step
+            effect.act(memory, 0, TRIED_ROW, PLANT_ROWS, 1, numbers, EFFECT_PARAMETERS, step == 0)
+    except IndexError as error:
+        rule = (
+            f"act of {effect.name!r} must stay within its {rows} rows (row_count) and {len(parameters)} parameters"
+        )
+        raise ValueError(f"{rule}, but goes beyond them: {error}") from None
+    _tried.add((type(effect), rows))
 
 
 def _numbers(values: tuple) -> list:

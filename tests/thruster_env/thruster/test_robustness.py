@@ -12,21 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import thruster_env
+from tests.thruster_env.thruster.test_sensors import EVERY_EFFECT as SENSORS
 from thruster_env.core.compiled import interpreted
 from thruster_env.thruster.effects import UNCERTAIN
 from thruster_env.thruster.env import BowThrusterTrackingVectorEnv, BowThrusterVectorEnv
 from thruster_env.thruster.parameters import PRESETS
 
 IDS = ["BowThruster-v0", "BowThrusterTracking-v0", "BowThrusterReversal-v0", "BowThrusterLinear-v0"]
-SENSORS = [
-    {"name": "student-t", "scale": 0.3},
-    {"name": "outliers", "std": 5.0},
-    {"name": "bias", "value": 0.1, "std": 0.1, "drift": 0.01},
-    {"name": "quantisation", "step": 0.1},
-    {"name": "saturation", "low": -20.0, "high": 20.0},
-    {"name": "dropout", "probability": 0.3},
-    {"name": "delay", "steps": 3},
-]
 FLOW = [
     {"name": "sinusoid", "amplitude": 0.3},
     {"name": "gauss-markov", "std": 0.2},

@@ -1,6 +1,7 @@
 """Every channel and every sensor effect against its definition, written here once more or as statistics."""
 
 import math
+from dataclasses import dataclass
 
 import gymnasium as gym
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 from scipy import stats
 
 import thruster_env  # noqa: F401 - registers the envs
+from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import episode_keys
-from thruster_env.effects.sensors import Bias, Quantisation
+from thruster_env.effects.effects import Effect
+from thruster_env.effects.sensors import SENSOR_EFFECTS, Bias, Quantisation
 from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.dynamics import thrust_and_torque
 from thruster_env.thruster.parameters import PRESETS, TUNNEL_PHYSICAL, derive_constants
@@ -25,6 +28,7 @@ EVERY_EFFECT = [
     {"name": "saturation", "low": -9.0, "high": 9.0},
     {"name": "dropout", "probability": 0.3},
     {"name": "delay", "steps": 3},
+    {"name": "sample-every", "steps": 3},
 ]
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds
 
@@ -252,6 +256,33 @@ def test_noise_of_the_channels_has_covariance_r():
     assert_white((noisy - exact)[..., 1])
     defaults = make_plant(sensors=["speed", "thrust"]).measurement_noise_cov
     np.testing.assert_array_equal(defaults, np.diag([CHANNELS["speed"].variance, CHANNELS["thrust"].variance]))
+
+
+def test_every_effect_is_tried():
+    assert {effect["name"] for effect in EVERY_EFFECT} == set(SENSOR_EFFECTS.effects)
+
+
+@pytest.mark.parametrize("written, at", [("rows", 0), ("rows + 1", 0), ("target", 1)])
+def test_an_effect_that_goes_beyond_its_rows_or_parameters_is_refused(monkeypatch, written, at):
+    """Compiled code would overwrite the next effect's state without a word."""
+    row = {"rows": 0, "rows + 1": 1}.get(written)
+
+    @dataclass(frozen=True)
+    class Reaching(Effect):
+        factor: float
+        row_count = row or 0
+
+        @staticmethod
+        @inlined
+        def act(memory, b, target, rows, number, numbers, first, begin):
+            for j in range(memory.shape[2]):
+                memory[b, target if row is None else rows + row, j] = numbers[first + at]
+
+    monkeypatch.setitem(SENSOR_EFFECTS.effects, "reaching", Reaching)
+    monkeypatch.setattr(Reaching, "name", "reaching", raising=False)
+    rule = r"act of 'reaching' must stay within its . rows \(row_count\) and 1 parameters, but goes beyond them"
+    with pytest.raises(ValueError, match=rule):
+        gym.make("BowThruster-v0", sensors={"thrust": [{"name": "reaching", "factor": 1.0}]})
 
 
 @pytest.mark.parametrize("effect", EVERY_EFFECT, ids=lambda effect: effect["name"])
