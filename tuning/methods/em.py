@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from contextlib import suppress
 
 import numpy as np
 
@@ -293,7 +292,7 @@ def nuts(task: Task) -> None:
     goal = task.goal(LIKELIHOOD, keeps=False)
     low, high = goal.coordinates.low, goal.coordinates.high
     centre = np.clip(goal.coordinates.of(goal.untuned), low, high)
-    p, draws = len(centre), list[np.ndarray]()
+    p, draws, evaluated = len(centre), list[np.ndarray](), set[bytes]()
 
     def point_at(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         s = 0.5 * (1.0 + np.tanh(0.5 * y))
@@ -304,6 +303,7 @@ def nuts(task: Task) -> None:
         try:
             task.check()
             likelihood, away = goal(point), (point - centre) / DEVIATION**2
+            evaluated.add(y.tobytes())
         except Spent:  # an exception would end the process: the other draws are of something cheap, and not kept
             return -0.5 * float(y @ y), -y
         except ValueError:  # the filter diverges
@@ -320,10 +320,10 @@ def nuts(task: Task) -> None:
         return float(value), slope
 
     def keep(y: np.ndarray) -> dict[str, np.ndarray]:
-        draws.append(point_at(y)[0])
-        counted = draws[NUTS_WARM_UP:] or draws[len(draws) // 2 :]
-        with suppress(Spent):
-            task.keep(goal.choice_at(np.mean(counted, axis=0)))
+        if y.tobytes() in evaluated:  # within the budget: it comes from another thread, which may be late
+            draws.append(point_at(y)[0])
+            counted = draws[NUTS_WARM_UP:] or draws[len(draws) // 2 :]
+            task.keep(goal.choice_at(np.mean(counted, axis=0)), late=True)
         return {"y": y}
 
     inside = np.clip((centre - low) / (high - low), EDGE, 1.0 - EDGE)

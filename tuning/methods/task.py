@@ -161,9 +161,10 @@ class Task:
             choice = parameter.set(choice, float(value))
         return choice
 
-    def keep(self, choice: Choice) -> None:
-        """From now on this is what the method would give; Spent once the budget is over."""
-        self.check()
+    def keep(self, choice: Choice, *, late: bool = False) -> None:
+        """From now on this is what the method would give; Spent once the budget is over, unless it comes late."""
+        if not late:
+            self.check()
         if not same_filter(choice, self.best):
             self.kept.append(Kept(self.runs, self.seconds, choice))
 
