@@ -2,7 +2,7 @@
 
 Change what differs in yours. It is compiled, runs over batches and beside envs, and studies tune it:
 
-thruster compare --filter ekf --filter template:Template --scenario outliers
+thruster compare --filter ekf --filter template:Template --scenario outliers --knows true
 thruster tune --filter template:Template --scenario outliers --trials 30
 env = EstimateState(env, filter="template:Template")     # a wrapper around an env, in Python
 """
