@@ -141,6 +141,7 @@ def test_draws_by_gradients_have_the_mean_of_a_random_walk_and_end_with_the_budg
     few = []
     for runs in (1, 300, 300):
         task = task_of(problem, 4, budget=Budget(runs=runs))
+        task._prices[LIKELIHOOD] = 4.0  # which is measured by a clock otherwise
         find_method("nuts").run("nuts", task)
         assert task.runs <= runs + 4 * task._prices[LIKELIHOOD] and (len(task.kept) > 1) == (runs > 1)
         few.append(task.values_of(task.best, task.free))
