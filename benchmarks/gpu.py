@@ -465,7 +465,7 @@ def released() -> None:
 def _cached_jax(case: Case) -> None:
     """JAX, with programs that processes compiled before in the cache on the disk."""
     jax = _jax(case)
-    jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", "/tmp/jax_cache"))
+    jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", "build/jax_cache"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 

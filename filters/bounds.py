@@ -1,7 +1,8 @@
-"""Attainable accuracy: Riccati covariances, steady-state and along a path; `filters.bounds` has the bound.
+"""Attainable accuracy: Riccati covariances, steady-state and along a path, and the posterior Cramer-Rao bound.
 
-Bounds on the errors of angles: a wrapped error is at most half a turn, so a bound on plain errors is none.
-The posterior Cramer-Rao bound on any estimate, from simulated true trajectories under each input.
+The posterior bound holds for any estimate and is computed from simulated true trajectories under each input. A
+wrapped error of an angle is at most half a turn, so a bound on its plain error is converted
+(`wrapped_variances`).
 """
 
 from __future__ import annotations

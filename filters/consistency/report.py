@@ -3,9 +3,7 @@
 NEES is the normalised estimation error squared, NIS the normalised innovation squared, CRPS the continuous ranked
 probability score.
 
-A consistency report in sentences, each a function of the numbers that it states.
-
-NEES is the normalised estimation error squared, NIS the normalised innovation squared.
+Its sentences are each a function of the numbers that they state.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""`kalmannet` and `recursive-kalmannet`: filters whose gain a network learns.
+"""Learned estimators by name, and their recurrent networks.
 
-Recurrent networks of learned estimators. `differentiable-enkf`: an ensemble Kalman filter that learns its
-noise by gradients through all its steps.
+`kalmannet` and `recursive-kalmannet` learn a filter's gain, `gru` estimates without a model, and
+`differentiable-enkf` learns an ensemble Kalman filter's noise by gradients through all its steps.
 """
 
 from __future__ import annotations

@@ -7,12 +7,12 @@
 The bracket is computed as a covariance, so that P_k is one. A `Relation`, the page of a smoother, relates two
 successive states by the filter's own linearisation or sigma points.
 
-Sigma-point smoothers, and which smoother belongs to which filter.
+Of a sigma-point filter, with
 
     points X = x 1' + g L U,  L L' = P;  predicted x and P as the filter predicts,
     G = cov(x, f(X)) (predicted P)^-1,  bracket = cov(X - G f(X)) + G Q G'
 
-The bracket equals P - G (predicted P) G' and is a sum of squares.
+the bracket equals P - G (predicted P) G' and is a sum of squares.
 
 Source: Sarkka (2008), "Unscented Rauch-Tung-Striebel smoother", algorithm 1, with additive noise; for cubature
 points Arasaratnam, Haykin (2011), "Cubature Kalman smoothers".

@@ -7,19 +7,6 @@ compiler has to find out whether a loop can be vectorised.
 Numbers that are the same for all members are evaluated once, before the loop that needs them. Each lane has its
 own sum, and the loop's end adds the lanes. The table has columns for full vectors: those behind the last member
 are evaluated, too, but count in no sum.
-
-A program with numbers of each member of an ensemble, cut into loops over the members.
-
-Numbers that are the same for all members are evaluated once. A sum over members (`graphs.over_members`) ends a
-loop: numbers that depend on it belong to the next turn.
-
-    turn 0   y = h(x),  the sum of y                               a loop
-             mean = sum/size                                       once
-    turn 1   the sum of (y - mean)^2                               a loop
-    ...
-
-A loop evaluates a few sums at a time, so that these stay in registers. If a later loop needs a member's number,
-too, it evaluates it again if that takes one operation on numbers of the table; else the table keeps it in a row.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The cost is the env's own, `task.step_cost`, of the thrust that the model predicts. Compiled, copy by copy.
 
-They have the `predict` of `control.controllers` and the inputs of the LQR there: state, true or estimated, and the
+They have the `predict` of `controllers` and the inputs of the LQR there: state, true or estimated, and the
 reference of the next step. They plan with a thruster's nominal equations, without noise, dead bands, a changing
 flow or a changing reference.
 """

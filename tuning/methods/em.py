@@ -1,6 +1,7 @@
-"""Expectation-maximisation without a smoother: by Fisher's identity slopes of the likelihood give its steps.
+"""Expectation-maximisation without a smoother, and the posterior mean of a model's numbers.
 
-The posterior of a model's numbers by a random walk, of which the mean is taken.
+By Fisher's identity the slopes of the likelihood give the steps of expectation-maximisation. The posterior is
+drawn by a random walk (`posterior`) or by the no-U-turn sampler (`nuts`).
 """
 
 from __future__ import annotations

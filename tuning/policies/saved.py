@@ -6,7 +6,7 @@ Such a folder is written under another name and then renamed, so that a reader n
 by a killed process have names that begin with a dot; `mend` removes them. Do not load files of unknown origin:
 Stable-Baselines3 and this module use pickle.
 
-Classical policies on the sets of `tuning.policies.plants`, beside learnt ones.
+Classical policies on the sets of `tuning.policies.observations`, beside learnt ones.
 
 Scores of policies on held-out episodes: return, and tracking errors.
 

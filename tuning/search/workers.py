@@ -1,9 +1,8 @@
 """Several processes on one host that run trials of one study.
 
-Each runs `tuning.search.workers`. When it is asked to end (`tuning.search.workers`), it does so after its trial.
-
-Each runs in its own session, so that Ctrl-C reaches only its parent. It reads its task from its standard input,
-and ends when that is closed: by its parent, or because its parent has ended.
+Each runs this module, in its own session, so that Ctrl-C reaches only its parent. It reads its task from its
+standard input and ends when that is closed: by its parent, or because its parent has ended. When it is asked to
+end, it does so after its trial.
 """
 
 from __future__ import annotations
