@@ -1,5 +1,8 @@
 """Kalman-type filters: as values with `init`, `predict`, `update`, over batches, and as Gymnasium wrappers."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from filters.adaptive import RobustExtendedKalmanFilter, SageHusaFilter, VariationalBayesFilter
 from filters.augmented import Unknown, augmented_model, transformed_model
 from filters.baselines import Inversion, LowPass, OpenLoop
@@ -32,10 +35,14 @@ from filters.smoothers.modes import SmoothedModes, smooth_modes
 from filters.smoothers.smooth import Smoothed, smooth
 from filters.starts import Restarts, RestartWarning, restarts_of, run
 from filters.tensors import torch
-from filters.wrappers.envs import EstimateState, EstimateStates, register_filtered_envs
+from filters.wrappers import register_filtered_envs
 from thruster_env.core.compiled import may_be_inlined
+from thruster_env.core.modules import when_imported
 from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.state_space import StateSpaceModel
+
+if TYPE_CHECKING:
+    from filters.wrappers.envs import EstimateState, EstimateStates
 
 __all__ = [
     "FILTERS",
@@ -94,13 +101,13 @@ __all__ = [
 ]
 
 may_be_inlined(__name__, "thruster_env.env", "thruster_env.graphs")
-register_filtered_envs()
+when_imported("gymnasium", register_filtered_envs)
 
 
 def __getattr__(name: str):
-    """`thruster_model` moved to its plant; for one release it is found here too."""
-    if name == "thruster_model":
-        from importlib import import_module
-
-        return import_module("thruster_env.thruster.model").thruster_model
-    raise AttributeError(f"module 'filters' has no attribute {name!r}")
+    """The wrappers, at their first use, because they import Gymnasium; for one release also `thruster_model`."""
+    modules = dict.fromkeys(("EstimateState", "EstimateStates"), "filters.wrappers.envs")
+    modules["thruster_model"] = "thruster_env.thruster.model"
+    if name in modules:
+        return getattr(import_module(modules[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -126,7 +126,9 @@ def trajectories(
         shape = np.shape(measurements)
         count, steps = shape[:2] if len(shape) == 3 else (0, 1)
         inputs = np.zeros((count, steps - 1, 0)) if inputs is None else inputs
-        keys = filter_keys(range(count)).reshape(count, 2) if keys is None else keys
+        if keys is None:
+            draws = filter_.size > 0 or isinstance(filter_, ForeignFilter)
+            keys = filter_keys(range(count)).reshape(count, 2) if draws else np.zeros((count, 2))
     arguments = {"keys": keys, "inputs": inputs, "measurements": measurements}
     keys, inputs, z = (
         np.require(_floats(name, value), np.float64, requirements) for name, value in arguments.items()

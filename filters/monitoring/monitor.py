@@ -16,8 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.special import chdtri, ndtr
 
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import as_floats, at_least, one_of, positive, short_repr
@@ -151,6 +149,8 @@ LARGEST_THRESHOLD = 60.0  # of thresholds, in standard deviations
 
 def chi_square(steps: float, degrees: int) -> float:
     """What chi^2 of so many degrees of freedom exceeds once in so many steps."""
+    from scipy.special import chdtri  # here, as below, because SciPy takes long to import
+
     return float(chdtri(degrees, min(1.0 / steps, 1.0)))
 
 
@@ -175,6 +175,8 @@ def cusum_run_length(threshold: float, reference: float, shift: float = 0.0, sid
 
 
 def _one_sided(h: float, k: float, shift: float) -> float:
+    from scipy.special import ndtr
+
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     y, w = 0.5 * h * (nodes + 1.0), 0.5 * h * weights
     k = k - shift
@@ -201,6 +203,8 @@ def glr_run_length(threshold: float, window: int) -> float:
     Probability 16; Siegmund, Venkatraman (1995), "Using the generalized likelihood ratio statistic for sequential
     detection of a change-point", Annals of Statistics 23; nu: Siegmund, Yakir (2007), Statistics of Gene Mapping.
     """
+    from scipy.special import ndtr
+
     n = np.arange(1, window + 1)
     x = threshold / np.sqrt(n)
     density = np.exp(-0.125 * x**2) / math.sqrt(2.0 * math.pi)
@@ -218,6 +222,8 @@ def _where(function: Callable[[float], float], least: float) -> float:
     """Where a growing function is zero; `least` if it is above zero everywhere."""
     if function(least) >= 0.0:
         return least
+    from scipy.optimize import brentq
+
     high = 1.0
     while function(high) < 0.0 and high < LARGEST_THRESHOLD:
         high *= 1.5
@@ -370,6 +376,8 @@ def watch_of(monitor: Monitor | None, filter_: Filter) -> Watch | None:
 
 @cache
 def _limits(monitor: Monitor, channels: int) -> np.ndarray:
+    from scipy.special import chdtri
+
     each, block = monitor.steps_of(channels), monitor.block
     chance = min(block / each, 1.0)  # of each block
     low, high = float(chdtri(block, 1.0 - 0.5 * chance)), float(chdtri(block, 0.5 * chance))

@@ -1,1 +1,53 @@
-"""Filters around Gymnasium envs and vector envs."""
+"""Filters around Gymnasium envs and vector envs, and registered envs with a filter around them.
+
+`gym.make("filters:BowThruster-EnKF-v0")` makes one, `gym.make_vec` many.
+
+The entry point group PLANTS lists packages whose envs offer a model. Each of their ids with a vector env gets a
+filtered one, "BowThruster-Filtered-v0", whose argument `filter` names the filter, and one for each of ALIASES.
+"""
+
+from importlib import import_module
+
+PLANTS = "filters.plants"  # group of entry points: packages that register their envs when imported
+ALIASES = {"kf": "KF", "ekf": "EKF", "ukf": "UKF", "enkf": "EnKF", "pf": "PF"}
+
+
+def filtered_id(env_id: str, word: str = "Filtered") -> str:
+    """The id of an env with a filter: "BowThruster-v0" and "EnKF" give "BowThruster-EnKF-v0"."""
+    name, version = env_id.rsplit("-", 1)
+    return f"{name}-{word}-{version}"
+
+
+def plant_ids() -> list[str]:
+    """Ids of registered envs, single and vectorised, of the packages in PLANTS; no env is imported."""
+    from importlib.metadata import entry_points  # here, because it loads what reads mails
+
+    from gymnasium.envs.registration import registry
+
+    packages = {point.value for point in entry_points(group=PLANTS)}
+    for package in sorted(packages):
+        import_module(package)
+    entries = {
+        env_id: spec.entry_point for env_id, spec in registry.items() if spec.vector_entry_point is not None
+    }
+    return [
+        env_id
+        for env_id, entry in entries.items()
+        if isinstance(entry, str) and entry.partition(":")[0].partition(".")[0] in packages
+    ]
+
+
+def register_filtered_envs() -> None:
+    """Register every id of a plant with a filter around its env; a second call has no effect."""
+    from gymnasium.envs.registration import register, registry
+
+    for env_id in plant_ids():
+        for word, filter in [("Filtered", None), *((word, name) for name, word in ALIASES.items())]:
+            if filtered_id(env_id, word) not in registry:
+                register(
+                    id=filtered_id(env_id, word),
+                    entry_point="filters.wrappers.envs:make_env",
+                    vector_entry_point="filters.wrappers.envs:make_vector_env",
+                    max_episode_steps=registry[env_id].max_episode_steps,
+                    kwargs={"env_id": env_id} | ({} if filter is None else {"filter": filter}),
+                )

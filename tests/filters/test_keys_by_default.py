@@ -25,6 +25,18 @@ def test_keys_are_those_of_the_first_seeds_unless_they_are_given(kind, numbers, 
     np.testing.assert_array_equal(smoothed[0].means, smoothed[1].means)
 
 
+def test_no_keys_are_made_for_a_filter_that_draws_nothing(as_python, monkeypatch):
+    def refuse(seeds):
+        raise AssertionError(seeds)
+
+    monkeypatch.setattr("filters.engine.batch.filter_keys", refuse)
+    model = wide_model()
+    u, z = data(model)
+    assert np.isfinite(run(KalmanFilter(model=model), inputs=u, measurements=z).means).all()
+    with pytest.raises(AssertionError, match=r"range\(0, 3\)"):
+        run(EnsembleKalmanFilter(model=model, ensemble_size=5), inputs=u, measurements=z)
+
+
 def test_a_model_without_inputs_needs_none(as_python):
     noise = {"process_noise_cov": [0.1], "measurement_noise_cov": [1.0], "prior_mean": [0.0], "prior_cov": [1.0]}
     filter_ = KalmanFilter(model=affine_model(a=[[0.9]], b=np.zeros((1, 0)), c=[[1.0]], **noise))

@@ -8,7 +8,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from filters import FILTERS, EstimateState, EstimateStates
-from filters.wrappers.envs import ALIASES, filtered_id
+from filters.wrappers import ALIASES, filtered_id
 from tests.models import affine
 from thruster_env.model.state_space import StateSpaceModel
 

@@ -200,8 +200,22 @@ def test_training_of_estimators_imports_torch_when_it_is_called():
     assert result.stdout.strip() == "False"
 
 
-def test_importing_the_env_stays_light():
-    heavy = ["numba", "scipy", "matplotlib", "optuna", "torch", "filters", "tuning"]
-    code = f"import sys, thruster_env; print([name for name in {heavy} if name in sys.modules])"
+ORDERS = ("filters, gymnasium", "gymnasium, filters", "filters, thruster_env.auv", "thruster_env.auv, filters")
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_envs_are_registered_in_whichever_order_packages_are_imported(order):
+    ids = "BowThruster-v0", "SegorogeniAUVPath-v0", "Replay-v0", "BowThruster-EKF-v0", "SegorogeniAUV-Filtered-v0"
+    code = (
+        f"import {order}; from gymnasium import registry; print([name for name in {ids} if name not in registry])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("package, below", [("thruster_env", ["filters"]), ("filters", [])])
+def test_importing_envs_and_filters_stays_light(package, below):
+    heavy = ["gymnasium", "numba", "llvmlite", "scipy", "matplotlib", "optuna", "torch", "tuning", *below]
+    code = f"import sys, {package}; print([name for name in {heavy} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

@@ -4,6 +4,8 @@
 installation.
 
 Numbers that took long to compute, kept beside the machine code that computed them, for the next process.
+
+What waits until another package is imported, which takes long and may not be needed.
 """
 
 from __future__ import annotations
@@ -19,8 +21,10 @@ import sysconfig
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType, ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -158,6 +162,38 @@ def as_module(name: str) -> list[str]:
     home = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     run = f"import runpy, sys; sys.path.append({home!r}); runpy.run_module({name!r}, run_name='__main__')"
     return [sys.executable, "-P", "-c", run]
+
+
+def when_imported(package: str, act: Callable[[], None]) -> None:
+    """Call `act` once a package has been imported: at the end of its import, or now if it is there."""
+    if package in sys.modules:
+        act()
+    else:
+        sys.meta_path.insert(0, _Import(package, act))  # before all others: the last one calls the first
+
+
+class _Import:
+    """Watches for the import of a package."""
+
+    def __init__(self, package: str, act: Callable[[], None]):
+        self._package, self._act = package, act
+
+    def find_spec(self, name: str, path=None, target=None) -> ModuleSpec | None:
+        """The spec as the other finders give it, whose loader then calls `act`."""
+        if name != self._package:
+            return None
+        sys.meta_path.remove(self)
+        spec = find_spec(name)
+        loader: Any = spec and spec.loader
+        if loader is not None:
+            execute = loader.exec_module
+
+            def execute_and_act(module: ModuleType) -> None:
+                execute(module)
+                self._act()
+
+            loader.exec_module = execute_and_act
+        return spec
 
 
 # How to install what is not in a plain installation: the optional dependencies of pyproject.toml.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import thruster_env.auv  # noqa: F401 - registers the envs
-from filters.wrappers import envs as ids
+from filters import wrappers as ids
 from filters.wrappers.envs import EstimateState, EstimateStates
 from tests.thruster_env.auv.test_env import DISTURBED
 from tests.thruster_env.thruster.test_vector_env import NEXT_STEP, assert_copies_are_single_envs, every_mode
