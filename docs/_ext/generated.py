@@ -1,8 +1,11 @@
-"""Pages that are generated: that on the command line, and the tutorials, which are the scripts in examples/."""
+"""Generated pages: the command line's, the operations of a filter's page, and the tutorials of examples."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from importlib import import_module
+from inspect import getdoc, signature
 from weakref import WeakSet
 
 import typer
@@ -68,9 +71,44 @@ def _in_capitals(match: re.Match[str]) -> str:
     return f"* `{name}{metavar}`{folder}"
 
 
+# What a filter's page is written with, as tables.
+
+OPERATIONS_PAGE = "reference/operations"
+ALGEBRA = {
+    "operations": "Symmetry, angles, missing channels, quotients, numbers",
+    "points": "Roots, sigma points, weights, densities",
+    "members": "Means and covariances over an ensemble",
+    "roots": "Inverses, triangles, blocks, factors U and D",
+}
+
+
+def operations() -> str:
+    """All functions that a page calls on its matrices, each with its first sentence, in Markdown."""
+    return "\n".join(line for name, title in ALGEBRA.items() for line in _operations_of(name, title))
+
+
+def _operations_of(name: str, title: str) -> Iterator[str]:
+    module = import_module(f"filters.algebra.{name}")
+    yield from ("", f"## {title}", "", f"`filters.algebra.{name}`", "", "| call | result |", "|---|---|")
+    for public, function in vars(module).items():
+        computed = getattr(function, "compute", function)  # of an `Operation`
+        if (
+            public.startswith("_")
+            or getattr(computed, "__module__", None) != module.__name__
+            or isinstance(computed, type)
+        ):
+            continue
+        arguments = signature(computed).parameters
+        if "slopes" in arguments or any(a.annotation is not a.empty for a in arguments.values()):
+            continue  # a derivative, or what makes operations: no page calls these
+        result = " ".join((getdoc(computed) or "").split("\n\n")[0].split()).replace("|", "\\|")
+        yield f"| `{public}({', '.join(arguments)})` | {result} |"
+
+
 def _append(app, name: str, source: list[str]) -> None:
-    if name == PAGE:
-        source[0] += "\n" + commands()
+    for page, generate in ((PAGE, commands), (OPERATIONS_PAGE, operations)):
+        if name == page:
+            source[0] += "\n" + generate()
 
 
 def setup(app) -> dict[str, bool]:

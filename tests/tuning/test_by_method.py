@@ -193,11 +193,11 @@ def test_an_answer_that_is_worse_than_the_start_is_not_given(as_python, monkeypa
     study = tuning.tune(problem, "kf", method="scoring", storage=storage, **options)
     assert same_filter(study.choice, given_choice("kf", problem))
     refused = study.tuning.answer.refused
-    assert refused.found > refused.given == pytest.approx(study.tuning.result.best_value)
+    assert refused.after > refused.before == pytest.approx(study.tuning.result.best_value)
     again = tuning.tune(problem, "kf", method="scoring", storage=storage, **options)
     objective = study.tuning.plan.objectives[0]
     for one in (study, again):
-        answer, given = (f"{reported(objective, value):.4g}" for value in (refused.found, refused.given))
+        answer, given = (f"{reported(objective, value):.4g}" for value in (refused.after, refused.before))
         assert f"a {reported_name(objective)} of {answer} and the given filter {given}," in one.tuning.chosen[0]
 
 
@@ -212,7 +212,7 @@ def test_an_answer_is_no_worse_than_the_numbers_of_the_model(as_python, monkeypa
     np.testing.assert_array_equal(found["process_noise_cov"], own["process_noise_cov"])
     np.testing.assert_array_equal(found["measurement_noise_cov"], r)
     refused = study.tuning.answer.refused
-    assert refused.given < refused.found and "so that one is returned" in study.tuning.chosen[0]
+    assert refused.before < refused.after and "so that one is returned" in study.tuning.chosen[0]
 
 
 @pytest.mark.parametrize(("method", "options"), [("em", {}), ("em", {"full_r": True}), ("squarem", {})])

@@ -78,8 +78,8 @@ def test_methods_keep_them(method):
     task = task_of(linear(), options={"where": TIED})
     task.budget = task.budget._replace(runs=2000)
     find_method(method).run(method, task)
-    assert len(task.kept) > 1
-    for one in task.kept[1:]:
+    assert len(task.answers) > 1
+    for one in task.answers[1:]:
         q, r = one.choice.model["process_noise_cov"], one.choice.model["measurement_noise_cov"]
         assert q[1] == pytest.approx(4 * q[0], rel=1e-12) and r[1] == 0.1
 

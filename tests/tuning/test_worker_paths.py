@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from thruster_env.core.modules import as_module, object_named, safe_paths
+from thruster_env.core.modules import object_named, safe_paths
+from tuning.search.workers import as_module
 
 TRAPS = "struct tuning numerics optuna filters json pickle selectors cmaes multiprocessing".split()
 PROBLEM = """

@@ -1,35 +1,16 @@
-"""Objects by "module:object", optional dependencies, and leftovers of uninstalled copies.
-
-`python -m thruster_env.core.modules`, from the checkout's folder, removes them; `make` does it after each
-installation.
-
-Numbers that took long to compute, kept beside the machine code that computed them, for the next process.
-
-What waits until another package is imported, which takes long and may not be needed.
-"""
+"""Objects by "module:object", packages that wait for another's import, and how to install optional ones."""
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import importlib
-import json
 import os
-import shutil
 import sys
-import sysconfig
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
-from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any
-
-import numpy as np
-
-from thruster_env.core.compiled import CompiledOrPython, made_by
-from thruster_env.core.files import write_whole
 
 # Objects by "module:object": code, which only a user's own command line or call may have imported.
 
@@ -154,16 +135,6 @@ def safe_paths() -> Iterator[None]:
             os.environ[SAFE_PATH] = before
 
 
-def as_module(name: str) -> list[str]:
-    """The command that runs one of our modules as a program; no file in the working folder can replace it.
-
-    Where our packages are not installed, the folder that holds them comes last on the path.
-    """
-    home = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    run = f"import runpy, sys; sys.path.append({home!r}); runpy.run_module({name!r}, run_name='__main__')"
-    return [sys.executable, "-P", "-c", run]
-
-
 def when_imported(package: str, act: Callable[[], None]) -> None:
     """Call `act` once a package has been imported: at the end of its import, or now if it is there."""
     if package in sys.modules:
@@ -220,70 +191,3 @@ def to_install(extra: str) -> str:
     if extra in OF_ONE_PACKAGE:
         return f"pip install {OF_ONE_PACKAGE[extra]}"
     return f"pip install '.[{extra}]' in the project's folder"
-
-
-# What an uninstalled copy of our packages left behind: folders without sources, which would hide the checkout's.
-
-
-def remove_leftovers(site: Path, checkout: Path) -> list[Path]:
-    """Remove folders in `site` with the name of a package in `checkout` that hold caches alone; return them.
-
-    Args:
-        site: folder where pip installs packages.
-        checkout: folder of the sources.
-    """
-    removed = []
-    for source in sorted(checkout.glob("*/__init__.py")):
-        folder = site / source.parent.name
-        files = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
-        if folder.is_dir() and all(file.parent.name == "__pycache__" for file in files):
-            shutil.rmtree(folder)
-            removed.append(folder)
-    return removed
-
-
-if __name__ == "__main__":
-    for folder in remove_leftovers(Path(sysconfig.get_path("purelib")), Path.cwd()):
-        print(f"removed {folder}, which an earlier installation left behind")
-
-_known: dict[str, tuple[float, ...]] = {}  # of this process
-
-
-def cached_numbers(
-    name: str, count: int, follows_from: bytes, code: CompiledOrPython, compute: Callable
-) -> np.ndarray:
-    """Return the vector compute(), from the cache if it was computed from the same inputs before.
-
-    Numbers lie as JSON where the code is compiled to (`thruster_env.core.compiled`), for one kind of
-    processor, and go with it. A file that is damaged is as if it were not there, a folder that takes none is as it
-    is.
-
-    Args:
-        name: first part of the file's name.
-        count: n, how many numbers there are.
-        follows_from: everything that the numbers follow from, also the sources of what computes them.
-        code: what computes them, or most of them.
-        compute: a function that returns finite numbers (n,); others are not kept.
-    """
-    folder = code.folder
-    key = hashlib.sha256(follows_from + (made_by() if folder else "Python").encode()).hexdigest()
-    if key not in _known:
-        file = None if folder is None else Path(folder) / f"{name}-{key[:32]}.json"
-        numbers = None if file is None else _read(file, count)
-        if numbers is None:
-            numbers = tuple(np.asarray(compute(), dtype=np.float64).tolist())
-            if not np.isfinite(numbers).all():
-                return np.array(numbers)
-            if file is not None:
-                with contextlib.suppress(ValueError):  # nothing can be written there
-                    write_whole(file, json.dumps(numbers))
-        _known[key] = numbers
-    return np.array(_known[key])
-
-
-def _read(file: Path, count: int) -> tuple[float, ...] | None:
-    try:
-        numbers = tuple(map(float, json.loads(file.read_bytes())))
-    except (OSError, TypeError, ValueError):
-        return None
-    return numbers if len(numbers) == count and np.isfinite(numbers).all() else None

@@ -124,7 +124,7 @@ def run_alone(
         find_method(name).run(name, task)
         stopped = interrupted()
     space = plan.space()
-    path = task.kept[1:] if task.refused is None else task.kept[1:-1]
+    path = task.answers[1:] if task.refused is None else task.answers[1:-1]
     for choice in _some([step.choice for step in path], trials - 1):
         study.enqueue_trial(within_ranges(trial_parameters(choice, space), space))
     waiting = len(study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.WAITING,)))

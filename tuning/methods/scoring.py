@@ -151,8 +151,8 @@ class Method(NamedTuple):
     def run(self, name: str, task: Task, guarded: bool = True) -> None:
         """Run the method until it is done or the budget spent; ValueError if the task lacks what it needs.
 
-        The answer is `task.best`, and the answers for a smaller budget are in `task.kept`. If the answer is worse
-        than the start or the model's own numbers, these replace it (`task.refused`).
+        The answer is `task.best`; `task.answers` holds those for smaller budgets. If the answer is worse than the
+        start or the model's own numbers, these replace it (`task.refused`).
         """
         self.check(name, task)
         try:

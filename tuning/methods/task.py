@@ -39,7 +39,7 @@ class Budget(NamedTuple):
     seconds: float = math.inf  # of processor time, without compilation
 
 
-class Kept(NamedTuple):
+class Answer(NamedTuple):
     """A choice that was the best so far from a time on."""
 
     runs: float
@@ -50,8 +50,8 @@ class Kept(NamedTuple):
 class Refused(NamedTuple):
     """An answer that was worse than what the method was given, which then is the answer."""
 
-    given: float  # the objective of what was given
-    found: float  # that of the answer
+    before: float  # the objective of what the method was given
+    after: float  # that of the answer
 
 
 class Spent(Exception):
@@ -101,7 +101,7 @@ class Task:
         self.start = untuned_choice(filter_name, self.problems[0]) if start is None else start
         self.runs, self._excluded = 0.0, 0.0
         self._prices: dict[str, float] = {}
-        self.kept = [Kept(0.0, 0.0, self.start)]
+        self.answers = [Answer(0.0, 0.0, self.start)]
         self.refused: Refused | None = None
         self._seen: set[tuple] = set()
         self._begun = time.process_time()
@@ -125,11 +125,11 @@ class Task:
     @property
     def best(self) -> Choice:
         """The last choice that was kept."""
-        return self.kept[-1].choice
+        return self.answers[-1].choice
 
     def best_within(self, runs: float = math.inf, seconds: float = math.inf) -> Choice:
         """The choice that the method would have given for a smaller budget."""
-        return [entry for entry in self.kept if entry.runs <= runs and entry.seconds <= seconds][-1].choice
+        return [entry for entry in self.answers if entry.runs <= runs and entry.seconds <= seconds][-1].choice
 
     @cached_property
     def generator(self) -> np.random.Generator:
@@ -166,7 +166,7 @@ class Task:
         if not late:
             self.check()
         if not same_filter(choice, self.best):
-            self.kept.append(Kept(self.runs, self.seconds, choice))
+            self.answers.append(Answer(self.runs, self.seconds, choice))
 
     def charge(self, runs: float) -> None:
         """Count passes of the filter; Spent once the budget is over."""
@@ -193,7 +193,7 @@ class Task:
         ]
         if worse:
             least, i = min(worse, key=lambda pair: math.inf if math.isnan(pair[0]) else pair[0])
-            self.kept.append(Kept(self.runs, self.seconds, earlier[i]))
+            self.answers.append(Answer(self.runs, self.seconds, earlier[i]))
             self.refused = Refused(least, new_scores[0])
 
     @contextmanager

@@ -23,7 +23,7 @@ from typing import Any
 
 import optuna
 
-from thruster_env.core.modules import as_module, working_folder_last
+from thruster_env.core.modules import working_folder_last
 from thruster_env.core.threads import cores
 from tuning.problems.assumed import within
 from tuning.problems.data import Data
@@ -79,6 +79,16 @@ def _packed(problem: Problem) -> str:
 def _unpacked(text: str) -> Problem:
     with working_folder_last():  # where the model's module may lie
         return pickle.loads(base64.b64decode(text))
+
+
+def as_module(name: str) -> list[str]:
+    """The command that runs one of our modules as a program; no file in the working folder can replace it.
+
+    Where our packages are not installed, the folder that holds them comes last on the path.
+    """
+    home = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    run = f"import runpy, sys; sys.path.append({home!r}); runpy.run_module({name!r}, run_name='__main__')"
+    return [sys.executable, "-P", "-c", run]
 
 
 def start(module: str, orders: dict[str, Any], **options: Any) -> subprocess.Popen:

@@ -143,7 +143,7 @@ def test_draws_by_gradients_have_the_mean_of_a_random_walk_and_end_with_the_budg
         task = task_of(problem, 4, budget=Budget(runs=runs))
         task._prices[LIKELIHOOD] = 4.0  # which is measured by a clock otherwise
         find_method("nuts").run("nuts", task)
-        assert task.runs <= runs + 4 * task._prices[LIKELIHOOD] and (len(task.kept) > 1) == (runs > 1)
+        assert task.runs <= runs + 4 * task._prices[LIKELIHOOD] and (len(task.answers) > 1) == (runs > 1)
         few.append(task.values_of(task.best, task.free))
     np.testing.assert_array_equal(few[1], few[2])
 
@@ -184,7 +184,7 @@ def test_als_has_the_scatter_of_the_toolboxs_example():
     for repetition in range(30):
         task = Task("kf", problem, problem.data([repetition]))
         find_method("als").run("als", task)
-        found.append([task.kept[1].choice.model[name] for name in ("q", "r")])  # with the gain of the example
+        found.append([task.answers[1].choice.model[name] for name in ("q", "r")])  # with the gain of the example
     means, deviations = np.mean(found, axis=0), np.std(found, axis=0)
     errors = np.array([0.135, 0.033]) / np.sqrt(30)
     assert (abs(means - [0.495, 0.100]) < 4 * errors).all(), (means, deviations)
@@ -320,9 +320,9 @@ def test_what_methods_need_is_said_in_a_line():
 def test_runs_are_counted_and_end_a_method():
     task = task_of(linear(), budget=Budget(runs=40))
     find_method("random-only").run("random-only", task)
-    assert task.runs == 44 and task.kept[-1].runs <= 40  # the evaluation that went beyond is not taken
+    assert task.runs == 44 and task.answers[-1].runs <= 40  # the evaluation that went beyond is not taken
     assert task.best_within(runs=0) == task.start
-    assert [one.runs for one in task.kept] == sorted(one.runs for one in task.kept)
+    assert [one.runs for one in task.answers] == sorted(one.runs for one in task.answers)
 
 
 def test_the_level_of_inflation_is_the_mode_of_its_density():

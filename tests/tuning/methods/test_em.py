@@ -75,10 +75,10 @@ def test_the_method_goes_these_steps():
     with pytest.raises(StopIteration):
         _second_choice(task, "em")
     q, r = np.diag(FIRST_Q), np.diag(FIRST_R)
-    for kept in task.kept[2:5]:
+    for answer in task.answers[2:5]:
         q, r = (np.diag(np.diag(one)) for one in textbook_step(task.data[0].measurements, q, r))
-        np.testing.assert_allclose(kept.choice.model["process_noise_cov"], np.diag(q), rtol=1e-8)
-        np.testing.assert_allclose(kept.choice.model["measurement_noise_cov"], np.diag(r), rtol=1e-8)
+        np.testing.assert_allclose(answer.choice.model["process_noise_cov"], np.diag(q), rtol=1e-8)
+        np.testing.assert_allclose(answer.choice.model["measurement_noise_cov"], np.diag(r), rtol=1e-8)
 
 
 def test_the_method_goes_these_steps_with_full_matrices():
@@ -87,10 +87,10 @@ def test_the_method_goes_these_steps_with_full_matrices():
     with pytest.raises(StopIteration):
         _second_choice(task, "em")
     q, r = np.diag(FIRST_Q), np.diag(FIRST_R)
-    for kept in task.kept[2:5]:
+    for answer in task.answers[2:5]:
         q, r = textbook_step(task.data[0].measurements, q, r)
-        np.testing.assert_allclose(kept.choice.model["process_noise_cov"], q, rtol=1e-8)
-        np.testing.assert_allclose(kept.choice.model["measurement_noise_cov"], r, rtol=1e-8)
+        np.testing.assert_allclose(answer.choice.model["process_noise_cov"], q, rtol=1e-8)
+        np.testing.assert_allclose(answer.choice.model["measurement_noise_cov"], r, rtol=1e-8)
 
 
 def _second_choice(task, name):
@@ -99,7 +99,7 @@ def _second_choice(task, name):
 
     def counted(choice):
         keep(choice)
-        if len(task.kept) > 5:
+        if len(task.answers) > 5:
             raise StopIteration
 
     task.keep = counted

@@ -95,13 +95,13 @@ def test_coordinate_steps_go_up_by_a_tenth_or_down_by_half_and_nowhere_else():
     find_method("coordinate-steps").run("coordinate-steps", task)
     first = np.log([*task.start.model["process_noise_cov"], *task.start.model["measurement_noise_cov"]])
     values = []
-    for kept in task.kept:
-        model = kept.choice.model
+    for answer in task.answers:
+        model = answer.choice.model
         moved = np.log([*model["process_noise_cov"], *model["measurement_noise_cov"]]) - first
         for one in moved:  # a sum of whole numbers of both steps
             ups = (one - BACKWARD * np.arange(21)) / FORWARD
             assert abs(ups - ups.round()).min() < 1e-9
-        values.append(task.value(kept.choice))
+        values.append(task.value(answer.choice))
     assert (np.diff(values) < 1e-12).all() and len(values) > 3  # the first step is the start, but for rounding
     assert task.runs <= 8 * (2 * 4 * 20 + 1 + len(values))
 

@@ -47,7 +47,7 @@ from tuning.experiments.users import holm
 from tuning.likelihood.family import DIFFERENTIABLE
 from tuning.likelihood.gradient import optimum
 from tuning.methods.registry import ALONE, ONLY, find_method
-from tuning.methods.task import Budget, Kept, Task
+from tuning.methods.task import Answer, Budget, Task
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LOG_SCORE, SCORE
@@ -219,7 +219,7 @@ def _study(case: Case, method: str, set_index: int, task: Task) -> None:
             run_study(open_study("first", other), other, 2)
         result = run_study(open_study("methods", plan), plan, TRIALS)
     task.runs += TRIALS * task.passes
-    task.kept.append(Kept(task.runs, task.seconds, result.choice))
+    task.answers.append(Answer(task.runs, task.seconds, result.choice))
 
 
 def reference(case: Case, protocol: Protocol) -> Result:
