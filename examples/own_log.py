@@ -59,7 +59,7 @@ for header, column in runs[0].items():
 # A first estimate, with the data sheet's model: the mean NIS (normalised innovation squared) is above its band, so
 # the innovations are larger than the filter assumes.
 
-before = tuning.estimate(runs[3], preset="tunnel_physical")
+before = tuning.estimate(("tunnel_physical", runs[3]))
 before
 
 # %%
@@ -95,7 +95,7 @@ study
 #
 # The tuned filter on a new run. Its innovations agree with their predicted covariance.
 
-after = tuning.estimate(runs[3], study, preset=mine)
+after = tuning.estimate((mine, runs[3]), study)
 after
 
 # %%

@@ -6,6 +6,7 @@
     estimate    a filter or a smoother over a recorded log
     identify    a model's parameters from recorded runs, and which of them the runs determine
     explore     a page on which one tunes by hand, and sees at once what comes of it
+    read_logs   recorded runs, with all that one has to know to read them
     report      a page on a tuned filter that any browser shows
 
     train_estimator   an estimator with a network, trained on a problem's runs
@@ -26,13 +27,24 @@ if TYPE_CHECKING:
     from tuning.api.evaluate import evaluate
     from tuning.api.explore import explore
     from tuning.api.identify import identify
+    from tuning.api.read_logs import read_logs
     from tuning.api.report import report
     from tuning.api.study import tune
     from tuning.api.train_estimator import train_estimator
 
 warnings.filterwarnings("ignore", message="IProgress not found")  # tqdm's in notebooks: Optuna imports it, unused
 
-__all__ = ["compare", "estimate", "evaluate", "explore", "identify", "report", "train_estimator", "tune"]
+__all__ = [
+    "compare",
+    "estimate",
+    "evaluate",
+    "explore",
+    "identify",
+    "read_logs",
+    "report",
+    "train_estimator",
+    "tune",
+]
 
 
 def __getattr__(name: str) -> Any:

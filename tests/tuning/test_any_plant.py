@@ -11,8 +11,7 @@ from filters.consistency.report import NO_TRUTH, sentences
 from filters.engine.batch import run
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
-from tuning.cli import evaluate as consistency
-from tuning.cli.tables import choice_table
+from tuning.api.held_out import CovarianceCheck
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
 from tuning.evaluation.held_out import Comparison, summary
@@ -27,6 +26,7 @@ from tuning.reporting.search_figures import comparison_figure, consistency_figur
 from tuning.reporting.sections import advice, held_out_section
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import errors_table, numbers_table
+from tuning.reporting.terminal import choice_table
 from tuning.reporting.time_figures import estimates_figure, plotted_states
 from tuning.search.objectives import check_objectives, find_objective, nis_ratio
 from tuning.search.plan import Plan
@@ -204,11 +204,8 @@ def test_consistency_without_truth_is_that_of_the_innovations(tmp_path):
     assert report.channels == ("range [m]", "speed [m/s]") and report.ensemble is None
     for coverage in known.innovation_coverage:
         assert coverage.covers(0.95)
-    assert np.isnan(report.coverage).all() and consistency.as_data(report)["states"] == (
-        "p [m]",
-        "v [m/s]",
-        "b [m]",
-    )
+    states = CovarianceCheck("oracle", report, None, "").as_dict()["states"]
+    assert np.isnan(report.coverage).all() and states == ("p [m]", "v [m/s]", "b [m]")
     assert known.coverage[0].value == pytest.approx(0.95, abs=0.03) and len(sentences(known)) >= 5 + 6
     for name, one in (("without", report), ("with", known)):
         assert consistency_figure(tmp_path / f"{name}.png", one, "title").stat().st_size > 10_000

@@ -39,7 +39,7 @@ def found(recorded):
 
 def test_estimate_is_the_command_in_one_call(as_json, runs, tmp_path):  # noqa: F811
     told = as_json("estimate", "run0.csv", *OF_LOGS, "--smoother", "--lag", 5, "--skip", 20, "--out", "theirs.csv")
-    mine = tuning.estimate("run0.csv", **WHOSE, smoother=True, lag=5, skip=20)
+    mine = tuning.estimate(tuning.read_logs("run0.csv", **WHOSE), smoother=True, lag=5, skip=20)
     assert mine.log_likelihood == told["log_likelihood"] and mine.findings.mean_nis == told["mean_nis"]
     assert mine.log.digest == told["digest"] and mine.found.smoothed
     assert mine.save("mine.csv").read_text() == (tmp_path / "theirs.csv").read_text()
@@ -50,15 +50,15 @@ def test_estimate_is_the_command_in_one_call(as_json, runs, tmp_path):  # noqa: 
 
 
 def test_a_pair_of_model_and_log_is_the_same(recorded):
-    alone = tuning.estimate(recorded[0], model="tunnel_physical", sensors=WHOSE["sensors"])
-    pair = tuning.estimate(("tunnel_physical", recorded[0]), sensors=WHOSE["sensors"])
+    alone = tuning.estimate(tuning.read_logs(recorded[0], **WHOSE))
+    pair = tuning.estimate(tuning.read_logs(("tunnel_physical", recorded[0]), sensors=WHOSE["sensors"]))
     assert pair.log_likelihood == alone.log_likelihood
     with pytest.raises(ValueError, match="'mass'"):  # the logs of the pair are read as those of the thruster
         tuning.identify(("tunnel_physical", [recorded[0]]), "mass", sensors=WHOSE["sensors"])
 
 
 def test_estimates_are_drawn_and_copied(recorded):
-    mine = tuning.estimate(recorded[0], **WHOSE)
+    mine = tuning.estimate(tuning.read_logs(recorded[0], **WHOSE))
     whole, innovations = mine.plot_states(), mine.plot_innovations()
     assert isinstance(whole, matplotlib.figure.Figure) and len(whole.axes) > len(innovations.axes) == 2
     for other in (copy.copy(mine), pickle.loads(pickle.dumps(mine))):
@@ -66,7 +66,7 @@ def test_estimates_are_drawn_and_copied(recorded):
 
 
 def test_a_baseline_has_no_nis(recorded):
-    mine = tuning.estimate(recorded[0], filter="open-loop", **WHOSE)
+    mine = tuning.estimate(tuning.read_logs(recorded[0], **WHOSE), filter="open-loop")
     assert repr(mine).endswith("rows)") and "nan" not in mine._repr_html_()
 
 
@@ -102,15 +102,18 @@ def test_runs_that_are_held_out_only_validate(recorded):
 WRONG = [
     (
         lambda log: tuning.estimate(log, "a.json", filter="ekf"),
-        "either a tuned file or a filter, but got both",
+        "either a tuned file or a filter .*, but got both",
     ),
-    (lambda log: tuning.estimate(log, 5, **WHOSE), "tuned must be a tuned file or a Study, but got 5"),
+    (
+        lambda log: tuning.estimate(tuning.read_logs(log, **WHOSE), 5),
+        "tuned must be a tuned file or a Study, but got 5",
+    ),
     (lambda log: tuning.identify(log, lambda dt: None), "free must be names of parameters, but got .*model=..."),
     (
         lambda log: tuning.identify(log, FREE, model="motor"),
         "or a thruster's preset, but got 'motor'",
     ),
-    (lambda log: tuning.estimate(("tunnel", log), model="a:b"), "a pair .* must come without another model"),
+    (lambda log: tuning.read_logs(("tunnel", log), model="a:b"), "a pair .* must come without another model"),
     (lambda log: tuning.identify([]), "at least one log must be left to learn from"),
     (lambda log: tuning.identify(log, "mass", **WHOSE), "free parameters must be of .*, but got 'mass'"),
     (lambda log: tuning.identify(log, model="tunnel", preset="t200"), "give either a model or a preset"),

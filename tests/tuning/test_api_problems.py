@@ -86,7 +86,7 @@ def test_tuning_on_a_model_and_frames_finds_a_filter(logs):
     study = tuning.tune((cart(), frames), "kf", trials=3, lead=20, progress=False)
     assert study.tuning.plan.objectives == ("likelihood",) and "log-likelihood" in repr(study)
     assert study.problem.name == "run1 and 1 more" and study.filter.name == "kf"
-    estimates = tuning.estimate(frames[0], study, model=cart())
+    estimates = tuning.estimate((cart(), frames[0]), study)
     assert estimates.filter.name == "kf" and np.isfinite(estimates.means).all()
     assert "log-likelihood" in study.held_out.to_frame().columns
     assert "log-likelihood" in repr(study.held_out) and "nan" not in study._repr_html_()

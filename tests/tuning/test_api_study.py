@@ -49,7 +49,7 @@ def test_tune_is_the_command_in_one_call(study, as_json, tmp_path):  # noqa: F81
     assert {**ours, "file": ""} == {**told, "file": ""} and told["trials"] == TRIALS
     found = as_json("evaluate", "--tuned", "mine.json", "--seeds", 4)
     for source in ("mine.json", study):
-        assert plain(tuning.evaluate(source, seeds=4).to_dict()) == found
+        assert plain(tuning.evaluate(source, seeds=4).as_dict()) == found
 
 
 def test_the_tuned_filter_is_ready_to_use(study, tmp_path):

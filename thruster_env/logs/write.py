@@ -36,6 +36,7 @@ from thruster_env.model.quantities import Quantity
 EXACT = "exact"  # every digit of a number
 LEAST = 10  # digits
 DIGITS = f"%.{LEAST}g"
+PICTURES = (".png", ".svg", ".pdf")  # which figures are written as
 
 
 def check_suffix(path: str | Path, option: str = "--out", suffixes: tuple[str, ...] = SUFFIXES) -> None:
@@ -46,6 +47,11 @@ def check_suffix(path: str | Path, option: str = "--out", suffixes: tuple[str, .
         raise ValueError(f"{option} must end in {known}, but got {str(path)!r}")
     if ending == ".parquet":
         _pyarrow()
+
+
+def check_picture(path: str | Path, option: str) -> None:
+    """Raise ValueError unless the name of a figure's file ends in one of PICTURES."""
+    check_suffix(path, option, PICTURES)
 
 
 def check_not_among(path: str | Path) -> None:

@@ -20,10 +20,11 @@ from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.files import panels
 from thruster_env.core.text_tables import TITLE, plain_text, verbatim
+from tuning.api.display import about, drawn, frame, html, number
 from tuning.api.evaluate import NOMINAL
 from tuning.api.held_out import cells_of
 from tuning.api.problems import given_for, is_filter, problems_of
-from tuning.api.progress import about, console_for, drawn, frame, html, number, row_bar
+from tuning.api.progress import console_for, row_bar
 from tuning.api.run import MOST_TRIALS
 from tuning.api.study import DEFAULT_FILTER, Study, is_own, user_choice
 from tuning.evaluation.baselines import OWN

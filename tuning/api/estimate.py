@@ -1,36 +1,62 @@
-"""`tuning.estimate`: a filter or a smoother over a recorded run."""
+"""`tuning.estimate` and `thruster estimate`: a filter or a smoother over a recorded run."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from rich.console import RenderableType
 
 from filters.filter import Filter
 from filters.logs.estimate import LogEstimate
 from filters.logs.estimate import estimate as estimate_log
-from filters.logs.findings import LogAlarms, LogFindings, alarms_of, columns_of, findings, verdict
-from filters.monitoring.monitor import Monitor, monitor_of
+from filters.logs.findings import (
+    ALPHA,
+    LogAlarms,
+    LogFindings,
+    Residual,
+    alarms_of,
+    columns_of,
+    episode_sentence,
+    episodes,
+    findings,
+    verdict,
+)
+from filters.monitoring.monitor import Monitor, monitor_of, tuned_monitor
 from thruster_env.core.checks import short_repr
+from thruster_env.core.text_tables import plain_text, table
 from thruster_env.logs.log import Log
-from thruster_env.logs.write import write_columns
-from tuning.api.progress import drawn, frame, html, number
-from tuning.logs.problem import name_of
-from tuning.logs.read import as_tuned, model_of_logs, read_named
-
-# `LogEstimates`: the estimates of a filter or a smoother on a recorded run, as a value.
-
+from thruster_env.logs.write import check_picture, check_suffix, write_columns
+from tuning.api.display import drawn, frame, html, number
+from tuning.api.markers import (
+    FILTER,
+    OUTPUT,
+    READ,
+    WRITTEN,
+    FilterOption,
+    LogsArgument,
+    Option,
+    Seed,
+    TunedArgument,
+)
+from tuning.api.read_logs import recorded_runs
+from tuning.logs.read import as_tuned
 
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
+
+    from tuning.api.study import Study
+
+MOST_EPISODES = 8  # of alarms in words
+OF_FILE = "tuned"  # the monitor of the tuned file
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -40,10 +66,14 @@ class LogEstimates:
     Attributes:
         found: the estimate itself.
         findings: mean NIS with its 95 % band, whiteness, RMSE of predictions, errors against references.
+        watched: alarms of the monitor, if one was asked for.
+        files: that were written.
     """
 
     found: LogEstimate
     findings: LogFindings
+    watched: LogAlarms | None = None
+    files: tuple[str, ...] = ()
 
     @property
     def log(self) -> Log:
@@ -116,8 +146,7 @@ class LogEstimates:
         """Estimates of states and outputs over time beside the references, and the innovations below."""
         from filters.logs.findings import draw_log
 
-        smoothed = ", smoothed," if self.found.smoothed else ""
-        return drawn(draw_log(self.found, f"{self.filter.name}{smoothed} on {Path(self.log.name).name}"))
+        return drawn(draw_log(self.found, f"{self._what} on {Path(self.log.name).name}"))
 
     def plot_innovations(self) -> Figure:
         """Innovations of each channel over time, in the 95 % band that the filter expects."""
@@ -125,78 +154,165 @@ class LogEstimates:
 
         return drawn(draw_log(self.found, f"{self.filter.name} on {Path(self.log.name).name}", states=False))
 
+    @property
+    def _what(self) -> str:
+        return f"{self.filter.name}, smoothed," if self.found.smoothed else self.filter.name
+
+    def tables(self) -> list[RenderableType]:
+        """Innovations, predictions and references, the findings, the alarms and the files, for a terminal."""
+        log, result = self.log, self.findings
+        how = ", on its own stamps" if log.stamps is not None else ", put on a grid" if log.irregular else ""
+        about = f"{log.steps + 1} rows, dt {log.dt:g} s{how}"
+        title = f"{self._what} on {log.name} ({about}); scored: rows {result.first} to {log.steps}"
+        rows = [["restarts", str(self.found.divergences), "0"]]
+        if not isnan(result.mean_nis):
+            rows.insert(0, ["log-likelihood", f"{result.log_likelihood:.6g}", ""])
+            if result.whiteness is not None:
+                rows.insert(0, ["whiteness, p-value", f"{result.whiteness.p_value:.3g}", f"above {ALPHA:g}"])
+            band = " to ".join(f"{end:.3g}" for end in result.nis_band)
+            rows.insert(0, ["mean NIS over channels", f"{result.mean_nis:.3g}", band])
+        parts: list[RenderableType] = [table(title, ["innovations", "", "if consistent"], rows)]
+        what = "Smoother" if self.found.smoothed else "Estimate"
+        for caption, residuals in (
+            ("One-step prediction less measurement", result.predictions),
+            (f"{what} less reference, not seen", result.references),
+        ):
+            if residuals or residuals is result.predictions:
+                parts.append(table(caption, ["", "RMSE", "bias", "rows"], list(map(_cells, residuals))))
+        return [*parts, *self.sentences(), *self._alarm_sentences(), *(f"wrote {path}" for path in self.files)]
+
+    def _alarm_sentences(self) -> list[str]:
+        """The first alarms in words, and the channel at fault."""
+        log, alarms = self.log, self.watched
+        if alarms is None:
+            return []
+        times, rows = log.start + log.times, log.steps + 1 - alarms.first
+        expected = rows / alarms.monitor.steps_between
+        what = f"{rows} rows, {expected:.2g} false alarms expected if the model is right"
+        if not alarms.alarms:
+            return [f"No alarm in {what}."]
+        stretches = episodes(alarms.alarms, alarms.monitor.memory)
+        lines = [f"Alarms: {len(alarms.alarms)} in {what}."]
+        for episode in stretches[:MOST_EPISODES]:
+            lines.append(f"- {episode_sentence(episode, log.measured[episode[0].channel], times)}")
+        lines += [f"- and {len(stretches) - MOST_EPISODES} more stretches"] * (len(stretches) > MOST_EPISODES)
+        if alarms.without is not None:
+            pairs = zip(log.measured, alarms.without, strict=True)
+            counts = ", ".join(f"{channel.symbol} {count}" for channel, count in pairs)
+            index = alarms.at_fault
+            fault = "no single channel is" if index is None else f"{log.measured[index].symbol} is"
+            lines.append(f"Remaining alarms without each channel: {counts}: {fault} at fault.")
+        return lines
+
+    def as_dict(self) -> dict[str, Any]:
+        """All results as plain data, as in `thruster estimate --json`."""
+        log, result, white = self.log, self.findings, self.findings.whiteness
+        data = {
+            "log": log.name,
+            "digest": log.digest,
+            "dt": log.dt,
+            "rows": log.steps + 1,
+            "irregular": log.irregular,
+            "grid": log.stamps is None,
+            "filter": self.filter.name,
+            "smoothed": self.found.smoothed,
+            "first_row": result.first,
+            "mean_nis": result.mean_nis,
+            "nis_band": result.nis_band,
+            "whiteness_p_value": None if white is None else white.p_value,
+            "log_likelihood": result.log_likelihood,
+            "divergences": self.found.divergences,
+            "restarts": self.found.restarts and self.found.restarts._asdict(),
+            "one_step_ahead": {residual.quantity.symbol: residual._asdict() for residual in result.predictions},
+            "references": {residual.quantity.symbol: residual._asdict() for residual in result.references},
+            "findings": [asdict(finding) for finding in log.findings],
+            "sentences": self.sentences(),
+        }
+        return {**data, **self._alarms_as_dict(), "files": list(self.files)}
+
+    def _alarms_as_dict(self) -> dict[str, Any]:
+        watched, names = self.watched, [channel.symbol for channel in self.log.measured]
+        if watched is None:
+            return {}
+        alarms = [{**alarm._asdict(), "channel": names[alarm.channel]} for alarm in watched.alarms]
+        left = watched.without and dict(zip(names, watched.without, strict=True))
+        fault = None if watched.at_fault is None else names[watched.at_fault]
+        return {"monitor": watched.monitor.as_mapping(), "alarms": alarms, "left_without": left, "at_fault": fault}
+
     def __repr__(self) -> str:
-        what = f"{self.filter.name}{', smoothed,' if self.found.smoothed else ''} on {self.log.name}"
-        rows, findings = self.log.steps + 1, self.findings
+        rows, findings, what = self.log.steps + 1, self.findings, f"{self._what} on {self.log.name}"
         if isnan(findings.mean_nis):
             return f"LogEstimates({what}: {rows} rows)"
         low, high = findings.nis_band
         nis = f"mean NIS over channels {findings.mean_nis:.3g}, {low:.3g} to {high:.3g} if consistent"
         return f"LogEstimates({what}: {rows} rows; {nis}; log-likelihood {number(findings.log_likelihood)})"
 
+    def __str__(self) -> str:
+        """What `thruster estimate` prints."""
+        return plain_text(self.tables())
+
     def _repr_html_(self) -> str:
-        findings, rows = self.findings, []
+        rows = []
         for what, residuals in (
-            ("prediction less measurement", findings.predictions),
-            ("less reference", findings.references),
+            ("prediction less measurement", self.findings.predictions),
+            ("less reference", self.findings.references),
         ):
-            for residual in residuals:
-                errors = f"{residual.rmse:.4g}", f"{residual.bias:+.4g}"
-                rows.append([what, residual.quantity.short_label, *errors, residual.rows])
+            rows += [[what, *_cells(residual)] for residual in residuals]
         return html(repr(self), ["", "quantity", "RMSE", "bias", "rows"], rows, " ".join(self.sentences()))
 
 
-if TYPE_CHECKING:
-    from tuning.api.study import Study
+def _cells(residual: Residual) -> list[str]:
+    return [residual.quantity.short_label, f"{residual.rmse:.4g}", f"{residual.bias:+.4g}", str(residual.rows)]
 
 
 def estimate(
-    log: Any,
-    tuned: str | Path | Study | None = None,
+    log: Annotated[Any, LogsArgument(metavar="LOG", type=Path, file=READ, last="stamps")],
+    tuned: Annotated[str | Path | Study | None, TunedArgument] = None,
     *,
-    filter: Any = None,
-    model: Any = None,
-    preset: str | Path | None = None,
-    sensors: Sequence[str] | None = None,
-    columns: Any = None,
-    clock_offset: Any = None,
-    dt: float | None = None,
-    grid: bool = True,
-    stamps: str | None = None,
-    smoother: bool = False,
-    lag: int | None = None,
+    filter: Annotated[Any, FilterOption] = None,
+    ensemble_size: Annotated[int | None, Option(FILTER)] = None,
+    smoother: Annotated[bool, Option(FILTER)] = False,
+    lag: Annotated[int | None, Option(FILTER)] = None,
     skip: int | None = None,
-    seed: int = 0,
+    monitor: Annotated[Monitor | Mapping | float | str | None, Option(metavar="STEPS", type=str)] = None,
+    isolate: bool = False,
+    out: Annotated[str | Path | None, Option(OUTPUT, type=Path, file=WRITTEN)] = None,
+    plot: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
+    seed: Seed = 0,
     **numbers: Any,
 ) -> LogEstimates:
     """Estimate the state of a recorded run, and report what the innovations say about filter and model.
 
+    The log has the model's inputs and measurements, found by the headers of its columns or given by --column.
     States or outputs of the model in the log, such as the thrust of a load cell that the filter does not see, are
-    compared with the estimate.
+    compared with the estimate. docs/logs.md has the rules.
 
-        estimates = tuning.estimate("run.csv", tuned="tuned.json")
+        estimates = tuning.estimate("run.csv", "tuned.json")
         estimates.to_frame()
         estimates.plot_states()
 
+    Example: thruster estimate run.csv tuned.json --out est.csv --plot est.png
+
+    Example: thruster estimate run.csv --sensor speed --column speed=motor_rpm --column thrust=loadcell[kgf]
+
     Args:
-        log: the path of a .csv, .parquet or .npz file, or of a recorder's; a table, as a pandas.DataFrame or a
-            mapping from headers to arrays; or a `Log`; or a pair (model, log).
-        tuned: a tuned file or a `Study`, with filter, Q, R and other parameters.
-        filter: without these, the name of a filter, or another package's estimator; "ekf" if None.
-        model: the log's model, if it is not a thruster's: a `StateSpaceModel`, an object that makes or offers one,
-            "module:object", or a thruster's preset.
-        preset: the log's thruster, by name or file.
-        sensors: a thruster's channels that the filter sees.
-        columns: headers by quantity: {"speed": "motor_rpm", "thrust": "loadcell[kgf]"}.
-        clock_offset: seconds by quantity that a channel's clock is ahead.
-        dt: sample time [s] of a log without times, or of the grid.
-        grid: whether to put the log on a grid; otherwise the filter uses its own time stamps.
-        stamps: of a bag, "header" or "receipt": the clock of all topics.
-        smoother: correct estimates by later measurements.
-        lag: number of later measurements, also without `smoother`; all by default.
-        skip: initial rows that are not scored; 50, or a quarter of a short log, by default.
-        seed: of the filter's random numbers.
-        **numbers: the filter's own, such as `ensemble_size`.
+        log: recorded run. In Python as `tuning.read_logs` reads it, a file or table of a thruster, or a pair
+            (model, log).
+        tuned: tuned file, with filter, Q and R. In Python also a `Study`.
+        filter: without a tuned file, the name of a filter, as `thruster filters` lists them; ekf by default. In
+            Python also another package's estimator.
+        ensemble_size: ensemble size; 100 by default, 1000 for particles.
+        smoother: also use later measurements.
+        lag: smoother with that many later measurements; all by default.
+        skip: number of initial rows that are not scored; 50, or a quarter of a short log, by default.
+        monitor: test for outliers, biases, changed noise, stuck and missing readings, with one false alarm in this
+            number of steps, or "tuned" for the tuned file's monitor (docs/monitoring.md). In Python also a
+            `Monitor` or a mapping of its attributes.
+        isolate: also run the filter without each channel, and name the faulty one.
+        out: estimates, bands and innovations as .csv, .parquet or .npz.
+        plot: picture of everything over time, .png, .svg or .pdf.
+        seed: seed of all randomness; the same seed gives the same results.
+        **numbers: further parameters of the filter.
 
     Returns:
         `LogEstimates`: `means`, `stds`, `findings`, `to_frame()`, `plot_states()`, `plot_innovations()`, `save()`.
@@ -204,17 +320,53 @@ def estimate(
     Raises:
         ValueError: states the rule and the value.
     """
+    runs = recorded_runs(log)
+    if isinstance(runs.files, str | Path) and str(runs.files).endswith(".json") and tuned is not None:
+        runs, tuned = replace(runs, files=tuned), runs.files  # the other way round
     if tuned is not None and filter is not None:
         raise ValueError(
-            f"give either a tuned file or a filter, but got both, {short_repr(tuned)} and {short_repr(filter)}"
+            "give either a tuned file or a filter (--filter NAME), but got both, "
+            f"{short_repr(tuned)} and {short_repr(filter)}"
         )
-    log, model, preset = model_of_logs(log, model, preset)
-    named = {"preset": preset, "model": model, "sensors": sensors, "columns": columns, "stamps": stamps}
+    if plot is not None:
+        check_picture(plot, "--plot")
+    if out is not None:
+        check_suffix(out)
+    numbers |= {} if ensemble_size is None else {"ensemble_size": ensemble_size}
     with _as_file(tuned) as file:
-        named = as_tuned(named, file)
-        read, offer = read_named(log, **named, clock_offset=clock_offset, dt=dt, name=name_of(log, 0), grid=grid)
-        estimates = estimate_log(read, filter, offer, tuned=file, smoother=smoother, lag=lag, seed=seed, **numbers)
-    return LogEstimates(estimates, findings(estimates, skip))
+        watch = monitor_for(monitor, file)
+        if isolate and watch is None:
+            raise ValueError(
+                "isolate (--isolate) must come with monitor (--monitor STEPS), whose alarms it counts"
+            )
+        runs = replace(runs, reading=as_tuned(runs.reading, file))
+        recorded, offer = runs.read()
+        result = estimate_log(
+            recorded, filter, offer, tuned=file, smoother=smoother, lag=lag, seed=seed, **numbers
+        )
+    estimates = LogEstimates(result, findings(result, skip))
+    if watch is not None:
+        estimates = replace(estimates, watched=estimates.alarms(watch, isolate=isolate))
+    if out is not None:
+        write_columns(out, columns_of(result, estimates.watched), again=True)
+    if plot is not None:
+        from filters.logs.findings import log_figure
+
+        log_figure(Path(plot), result, f"{estimates._what} on {recorded.name}", estimates.watched)
+    return replace(estimates, files=tuple(str(path) for path in (out, plot) if path is not None))
+
+
+def monitor_for(argument: Monitor | Mapping | float | str | None, tuned: str | Path | None) -> Monitor | None:
+    """The monitor for an argument: one, its attributes, steps between false alarms, or "tuned", the file's."""
+    if argument != OF_FILE:
+        try:
+            return monitor_of(float(argument) if isinstance(argument, str) else argument)
+        except ValueError as error:
+            rule = f"monitor (--monitor) must be steps, or {OF_FILE!r}"
+            raise ValueError(f"{rule}, but got {argument}: {error}") from None
+    if tuned is None:
+        raise ValueError(f"monitor (--monitor) {OF_FILE} must come with a tuned file, but got none")
+    return tuned_monitor(tuned)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from filters.filter import Filter
 from filters.logs.findings import colour_of
 from thruster_env.core.files import panels
 from thruster_env.core.text_tables import plain_text, table, verbatim
-from tuning.api.progress import about, drawn, frame, html, number
+from tuning.api.display import about, drawn, frame, html, number
 from tuning.evaluation.baselines import ORACLE
 from tuning.learning.training import HELD_OUT, LONGER, NOISIER, Check, Standing
 from tuning.problems.problem import Problem

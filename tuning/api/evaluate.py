@@ -1,15 +1,35 @@
-"""`tuning.evaluate`: a filter, tuned or not, beside its baselines on seeds that no study saw."""
+"""`tuning.evaluate` and `thruster evaluate`: a filter, tuned or not, on seeds that no study saw."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from tuning.api.held_out import HeldOut, on_held_out
+from filters.registry import filter_type
+from thruster_env.core.checks import short_repr
+from thruster_env.core.files import check_target
+from thruster_env.logs.write import check_picture
+from tuning.api.held_out import HeldOut, covariance_check, on_held_out
+from tuning.api.markers import (
+    FILTER,
+    INPUT,
+    OUTPUT,
+    RUNS,
+    WRITTEN,
+    FilterOption,
+    ModelOption,
+    Option,
+    PresetOption,
+    ProblemOption,
+    Progress,
+    Seed,
+    TunedArgument,
+)
 from tuning.api.problems import given_for, is_filter, problem_of
-from tuning.api.progress import console_for
-from tuning.api.study import Study, is_own, user_choice
-from tuning.evaluation.baselines import OWN, TUNED, rule_of_thumb
+from tuning.api.progress import console_for, working
+from tuning.api.study import DEFAULT_FILTER, Study, is_own, user_choice
+from tuning.evaluation.baselines import GIVEN, OWN, TUNED, given_noise, rule_of_thumb
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.assumed import constants_in, suited
 from tuning.problems.problem import Problem
@@ -20,32 +40,51 @@ NOMINAL = "nominal"  # the problem of a filter that is not tuned, where none is 
 
 
 def evaluate(
-    tuned: str | Path | Study,
-    problem: Any = None,
+    tuned: Annotated[str | Path | Study | None, TunedArgument] = None,
+    problem: Annotated[
+        Any, ProblemOption(INPUT, ("--problem", "--scenario"), type=str, choices="problems")
+    ] = None,
     *,
-    seeds: int = HELD_OUT_SEEDS,
-    seed: int = 0,
-    preset: str | Path | None = None,
-    model: Any = None,
-    progress: bool | None = None,
+    filter: Annotated[Any, FilterOption] = None,
+    given: Annotated[bool, Option(FILTER)] = False,
+    seeds: Annotated[int, Option(RUNS)] = HELD_OUT_SEEDS,
+    consistency: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
+    preset: Annotated[str | Path | None, PresetOption] = None,
+    model: Annotated[Any, ModelOption] = None,
+    seed: Seed = 0,
+    progress: Progress = None,
 ) -> HeldOut:
-    """Run a filter and its baselines on held-out seeds of a problem.
+    """Run a filter on held-out seeds of a problem and compare it with its baselines.
 
     The rule of thumb takes R from the sensor's data sheet and Q from 1 % of each state's range. The scaled default
-    is the same with one factor on Q that brings the mean NIS to 1. The oracle has the plant's own Q and R.
+    is the same with one factor on Q that brings the mean NIS (normalised innovation squared) to 1. The oracle has
+    the plant's own Q and R.
 
         evaluation = tuning.evaluate("tuned.json", seeds=50)
         evaluation.to_frame()
 
+    `consistency` compares a filter's errors and innovations with its covariances: NEES, NIS, whiteness, coverage,
+    CRPS and, for ensembles, rank histograms, with a sentence on each and one picture.
+
+    Example: thruster evaluate out/enkf-mismatch-seed0.json
+
+    Example: thruster evaluate --filter enkf --scenario mismatch --consistency calibrated.png
+
     Args:
-        tuned: a tuned file, a `Study`, or the name of a filter, which gets the rule of thumb. Or your
-            own parameters: a filter, as `make_filter("ekf", model)`, or a `StateSpaceModel` with its own Q and R.
-        problem: a name, a `Problem`, "module:object" or a pair (model, data); by default that of the
-            tuned file, or "nominal" for the name of a filter.
-        seeds: number of held-out seeds, for problems that can generate any number.
-        seed: of the study to which they belong.
-        preset: the problem of another thruster, by name or file; of a tuned file alone its own preset.
-        model: of the logs of a tuned file, if it is code: a model, what makes or offers one, or "module:object".
+        tuned: tuned file, which names filter, parameters and problem. In Python also a `Study`, the name of a
+            filter, or your own parameters: a filter, as `make_filter("ekf", model)`, or a `StateSpaceModel` with
+            its own Q and R.
+        problem: name of a problem, by default that of the tuned file, or nominal. In Python also a `Problem`,
+            `tuning.read_logs(...)` or a pair (model, data).
+        filter: without a tuned file, the name of a filter, as `thruster filters` lists them.
+        given: use the Q and R of the problem's model instead of the rule of thumb, in an ekf unless `filter` names
+            another one.
+        seeds: number of held-out seeds.
+        consistency: also check whether the filter's covariance is consistent, and draw it: .png, .svg or .pdf.
+        preset: the problem of another thruster, or the present place of a tuned file's preset.
+        model: the model of the logs that it was tuned on, if that is code. In Python also what makes or offers
+            one.
+        seed: seed of all randomness; the same seed gives the same results.
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
@@ -54,9 +93,38 @@ def evaluate(
     Raises:
         ValueError: states the rule and the value.
     """
-    choice, chosen, is_tuned = subject_of(tuned, problem, preset, model)
-    name = OWN if is_own(tuned) else TUNED
-    return on_held_out(choice, chosen, seed, seeds, is_tuned=is_tuned, console=console_for(progress), name=name)
+    if given and tuned is not None:
+        raise ValueError(f"given (--given) must come without a tuned file, but got both, with {short_repr(tuned)}")
+    filter = DEFAULT_FILTER if given and filter is None else filter
+    if (tuned is None) == (filter is None):
+        got = "none" if tuned is None else f"both, {short_repr(tuned)} and {short_repr(filter)}"
+        raise ValueError(f"give either a tuned file or a filter (--filter NAME), but got {got}")
+    choice, chosen, is_tuned = subject_of(filter if tuned is None else tuned, problem, preset, model)
+    choice = with_given(choice.name, chosen) if given else choice
+    if consistency is not None:
+        check_picture(consistency, "--consistency")
+        if not choice.filter(chosen).has_covariance:
+            rule = "consistency (--consistency) must be of a filter with a covariance"
+            raise ValueError(f"{rule}, but got {choice.name!r}")
+        check_target(consistency)
+    name, console = OWN if is_own(tuned) else TUNED, console_for(progress)
+    evaluation = on_held_out(choice, chosen, seed, seeds, is_tuned=is_tuned, console=console, name=name)
+    if consistency is None:
+        return evaluation
+    label = evaluation.name if is_tuned else GIVEN if given else evaluation.comparison.rule
+    with working("checking the covariance", console):
+        return replace(evaluation, covariance=covariance_check(evaluation, label, consistency))
+
+
+def with_given(name: str, problem: Problem) -> Choice:
+    """The filter with the given Q and R of the problem's model; ValueError if there are none."""
+    if not filter_type(name).has_covariance:
+        raise ValueError(f"given (--given) must be used with a filter that has a Q and R, but got {name}")
+    choice = given_noise(name, problem)
+    if choice is None:
+        rule = "given (--given) must be used with a problem whose model has a given Q and R"
+        raise ValueError(f"{rule}, but got {problem.name}")
+    return choice
 
 
 def subject_of(

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console, RenderableType
 
-from filters.consistency.intervals import Interval
-from filters.consistency.report import ConsistencyReport
+from filters.consistency.intervals import Interval, rmse_ratios
+from filters.consistency.nees import SquaresCheck
+from filters.consistency.report import MOST_STATES, ConsistencyReport, comparison_sentence, sentences
 from filters.estimators.find import label_of
 from filters.filter import Filter
 from thruster_env.core.checks import at_least
 from thruster_env.core.text_tables import plain_text
-from tuning.api.progress import about, drawn, frame, html, number, working
-from tuning.evaluation.baselines import RULE, TUNED, baseline_size, baselines
+from tuning.api.display import about, drawn, frame, html, number
+from tuning.api.progress import working
+from tuning.evaluation.baselines import ORACLE, RULE, TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency, restart_sentences
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import metrics
@@ -23,6 +27,7 @@ from tuning.evaluation.worth import memory_sentence, scaling_sentence, warnings_
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import gains, model_doubts, residual_sentences
 from tuning.reporting.leaderboard import comparison_table
+from tuning.reporting.terminal import choice_table
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
@@ -38,12 +43,13 @@ class HeldOut:
     Attributes:
         choice: the filter's parameters.
         problem: the problem.
-        proof: evaluations, bound and seeds.
+        comparison: evaluations, bound and seeds.
         is_tuned: whether the choice is that of a study; otherwise it is the rule of thumb.
         seed: of the study to which the seeds belong.
         name: the filter's label, "tuned" or, for the user's parameters, "own numbers".
         chosen: a study's choice and what it replaced, in sentences.
         forget: the longest time constant that the study allowed [s]; None if any.
+        covariance: whether it is consistent, if that was asked for.
     """
 
     choice: Choice
@@ -54,6 +60,7 @@ class HeldOut:
     name: str = TUNED
     chosen: tuple[str, ...] = ()
     forget: float | None = None
+    covariance: CovarianceCheck | None = None
 
     @property
     def filter(self) -> Filter:
@@ -116,13 +123,15 @@ class HeldOut:
         """Log-likelihood of a run minus that of each baseline, paired; it needs no truth."""
         return self.comparison.likelihood_gains
 
-    def to_dict(self) -> dict[str, Any]:
-        """All results as plain numbers, as in `thruster evaluate --json`."""
+    def as_dict(self) -> dict[str, Any]:
+        """All results as plain data, as in `thruster evaluate --json`."""
         data = metrics(self.comparison)
         if not self.is_tuned:
             del data["tuned"]
         warned = warnings_of(self.evaluation, self.problem, self.forget)
-        return {"filter": self.choice._asdict(), "scenario": self.problem.name, **data, "warnings": warned}
+        checked = {} if self.covariance is None else {"consistency": self.covariance.as_dict()}
+        what = {"filter": self.choice._asdict(), "scenario": self.problem.name}
+        return {**what, **data, "warnings": warned, **checked}
 
     def to_frame(self) -> pandas.DataFrame:
         """A row per filter: RMSE of each state with its 95 % interval, score, NEES, NIS, log-likelihood, restarts.
@@ -195,10 +204,13 @@ class HeldOut:
         return plain_text([*self.chosen, *self.tables()])
 
     def tables(self) -> list[RenderableType]:
-        """The table of errors and the gain of tuning, for a terminal."""
+        """The parameters, the errors, the gain of tuning and the residuals, for a terminal."""
         where = f"held-out {self.problem.seed_word} {self.seeds.start} to {self.seeds.stop - 1}"
-        table = comparison_table(self.evaluations, self.bound, f"{where}, scenario {self.problem.name}")
-        return [table, *self.sentences(), *residual_sentences(self.problem, self.seed)]
+        where = f"{where}, scenario {self.problem.name}"
+        errors = comparison_table(self.evaluations, self.bound, where, self.problem.scale_about)
+        checked = [] if self.covariance is None else self.covariance.lines()
+        words = [*self.sentences(), *residual_sentences(self.problem, self.seed), *checked]
+        return [choice_table(self.choices, self.problem), errors, *words]
 
     def sentences(self) -> list[str]:
         """The gain of tuning over each baseline; for an untuned filter a description of the scaled default."""
@@ -228,6 +240,93 @@ class HeldOut:
         title = f"{what} on {len(self.seeds)} held-out {self.problem.seed_word} of {self.problem.name}"
         note = "In brackets 95 % intervals. Score: mean over states of RMSE over scale." if truth else ""
         return html(title, ["filter", *heads, "NIS"], rows, note)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CovarianceCheck:
+    """Whether a filter's covariance is consistent, with a picture of the checks.
+
+    Attributes:
+        label: of the filter among its baselines.
+        report: NEES, NIS, whiteness, coverage and CRPS.
+        over_true: RMSE of each state over the oracle's, if there is one.
+        picture: path of the file.
+    """
+
+    label: str
+    report: ConsistencyReport
+    over_true: Sequence[Interval] | None
+    picture: str
+
+    def sentences(self) -> list[str]:
+        """A sentence on each check, and on the errors over the oracle's."""
+        parts = sentences(self.report)
+        if self.over_true is not None:
+            pairs = list(zip(self.report.states, self.over_true, strict=True))
+            parts += [
+                comparison_sentence(state, self.label, ORACLE, ratio) for state, ratio in pairs[:MOST_STATES]
+            ]
+            if len(pairs) > MOST_STATES:
+                parts.append(f"Of {len(pairs)} states these are the first {MOST_STATES}.")
+        return parts
+
+    def lines(self) -> list[str]:
+        """The same for a terminal."""
+        return [f"Is the {self.label} filter consistent?", *self.sentences(), f"Picture: {self.picture}"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The numbers by name."""
+        report, white, ensemble = self.report, self.report.whiteness, self.report.ensemble
+        members = None
+        if ensemble is not None:
+            ranks = [{"frequencies": rank.frequencies, "p_value": rank.p_value} for rank in ensemble.ranks]
+            members = {"size": ensemble.size, "ranks": ranks, "crps": ensemble.crps}
+        return {
+            "states": report.states,
+            "nees": _of_squares(report.nees),
+            "nis": _of_squares(report.nis),
+            "innovations": {
+                "correlations": white.correlations,
+                "statistic": white.statistic,
+                "p_value": white.p_value,
+            },
+            "coverage_95": report.coverage,
+            "crps": report.crps,
+            "crps_if_honest": report.crps_expected,
+            "members": members,
+            "channels": report.channels,
+            "innovation_coverage_95": report.innovation_coverage,
+            "divergences": report.divergences,
+            "rmse_over_true": self.over_true,
+            "sentences": self.sentences(),
+            "picture": self.picture,
+        }
+
+
+def _of_squares(check: SquaresCheck) -> dict[str, Any]:
+    return {
+        "mean": check.mean,
+        "right": check.dimension,
+        "share_of_steps_in_95_band": check.share_inside,
+        "share_beyond_95_point": check.beyond,
+        "distance_from_chi_square": check.distribution.distance,
+        "p_value": check.distribution.p_value,
+    }
+
+
+def covariance_check(evaluation: HeldOut, label: str, path: str | Path) -> CovarianceCheck:
+    """Check the covariance of an evaluated filter, called `label`, and draw the checks."""
+    from tuning.reporting.search_figures import consistency_figure
+
+    report, comparison = evaluation.check_consistency(), evaluation.comparison
+    ratios: Sequence[Interval] | None = None
+    against: dict[str, Any] = {}
+    if report.has_truth and comparison.true is not None:
+        ratios = rmse_ratios(comparison.tuned.mean_squares, comparison.true.mean_squares, comparison.tuned.weights)
+        against[f"{label}\nover {ORACLE}"] = ratios
+    title = f"{evaluation.choice.name}, {label}, on {report.runs} seeds of {evaluation.problem.name}"
+    consistency_figure(Path(path), report, title, against, comparison.tuned.scored or None)
+    return CovarianceCheck(label, report, ratios, str(path))
 
 
 def on_held_out(

@@ -14,7 +14,8 @@ from rich.console import Console
 from thruster_env.core.checks import short_repr
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.api.progress import console_for, drawn, frame, html
+from tuning.api.display import drawn, frame, html
+from tuning.api.progress import console_for
 from tuning.identification.family import with_ranges
 from tuning.identification.identify import STARTS, check_excitation
 from tuning.identification.identify import identify as identify_runs

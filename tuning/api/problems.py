@@ -10,6 +10,7 @@ from filters.registry import FILTERS, filter_type
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import short_repr
 from thruster_env.core.modules import is_code
+from tuning.api.read_logs import RecordedRuns
 from tuning.logs.problem import log_problem, problems_in
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, named
@@ -36,6 +37,10 @@ def problem_of(argument: Any, preset: str | Path | None = None, **of_logs: Any) 
         ValueError: states the rule and the value.
     """
     options = {name: value for name, value in of_logs.items() if value is not None}
+    if isinstance(argument, RecordedRuns):
+        if preset is not None:
+            raise ValueError(f"preset must be given to read_logs, but got {short_repr(preset)} beside {argument}")
+        return argument.problem()
     if isinstance(argument, tuple) and len(argument) == 2:
         return _of_logs(*argument, preset, options)
     if options:

@@ -17,9 +17,10 @@ from filters.registry import filter_type
 from thruster_env.core.checks import short_repr
 from thruster_env.core.text_tables import plain_text
 from thruster_env.model.state_space import StateSpaceModel
+from tuning.api.display import about, drawn, frame, html, number
 from tuning.api.held_out import HeldOut
 from tuning.api.problems import problems_of
-from tuning.api.progress import about, console_for, drawn, frame, html, number
+from tuning.api.progress import console_for
 from tuning.api.run import Tuning, aim_of, run_tuning, sampler_of, with_budget
 from tuning.evaluation.tuned import check_keepable
 from tuning.evaluation.worth import tuning_effect

@@ -32,6 +32,10 @@ PANELS = {
     "Policies and learned estimators": ("train", "score", "play", "train-estimator"),
     "Published results and long studies": ("reproduce", "study"),
 }
+VERBS = {
+    "evaluate": "evaluate",
+    "estimate": "estimate",
+}  # commands that functions make, and their files in tuning.api
 COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
 MARKUP: Final = "markdown"
 LOADING = "loading ..."
@@ -114,9 +118,11 @@ class Commands(Group):
         if self._listing:
             return listed(name)
         if name not in self._made:
-            module = imported(f"tuning.cli.{file_of(name)}")
             alone = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
-            if hasattr(module, "app"):
+            if name in VERBS:
+                verb = getattr(imported(f"tuning.api.{VERBS[name]}"), file_of(name))
+                alone.command(name, cls=Command)(imported("tuning.cli.verbs").command_of(verb))
+            elif hasattr(module := imported(f"tuning.cli.{file_of(name)}"), "app"):
                 alone = module.app
             else:
                 alone.command(name, cls=Command)(module.command)
@@ -132,9 +138,12 @@ def file_of(name: str) -> str:
 
 def listed(name: str) -> TyperCommand:
     """A command with its name, panel and help alone, read from its file."""
-    tree = ast.parse(Path(__file__).with_name(f"{file_of(name)}.py").read_text(encoding="utf-8"))
-    functions = [part for part in tree.body if isinstance(part, ast.FunctionDef) and part.name == "command"]
-    text = ast.get_docstring(functions[0] if functions else tree) or ""
+    file, function = Path(__file__).with_name(f"{file_of(name)}.py"), "command"
+    if name in VERBS:
+        file, function = file.parents[1] / "api" / f"{VERBS[name]}.py", file_of(name)
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    functions = [part for part in tree.body if isinstance(part, ast.FunctionDef) and part.name == function]
+    text = (ast.get_docstring(functions[0] if functions else tree) or "").partition("\n\nArgs:")[0]
     return TyperCommand(
         name, help=text if functions else text.partition(": ")[2].capitalize(), rich_help_panel=COMMANDS[name]
     )

@@ -18,6 +18,7 @@ from thruster_env.core.checks import finite, short_repr
 from thruster_env.core.files import save_figure
 from thruster_env.core.text_tables import table
 from thruster_env.logs.log import Log
+from thruster_env.logs.write import check_picture
 from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.parameters import (
     PresetFile,
@@ -41,7 +42,7 @@ from tuning.cli.options import (
     filter_option,
     with_groups,
 )
-from tuning.cli.output import announce_compilation, check_picture, check_targets, emit, progress_console
+from tuning.cli.output import announce_compilation, check_targets, emit, progress_console
 from tuning.experiments.bollard import FITTED, Identified, identify, read_table, relative_errors
 from tuning.identification.identify import STARTS
 from tuning.identification.identify import identify as identify_logs

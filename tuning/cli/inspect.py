@@ -11,6 +11,7 @@ import typer
 from thruster_env.core.checks import within
 from thruster_env.core.files import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.core.text_tables import table
+from thruster_env.logs.write import check_picture
 from thruster_env.thruster.analysis import (
     INPUTS,
     STATES,
@@ -30,7 +31,7 @@ from thruster_env.thruster.linear import NO_LINEARISATION, SAMPLE_TIME, Publishe
 from thruster_env.thruster.parameters import is_file
 from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, Plant, make_plant
 from tuning.cli.options import INPUT, OUTPUT, JsonOption, PresetOption
-from tuning.cli.output import check_picture, check_targets, emit, warn_beyond
+from tuning.cli.output import check_targets, emit, warn_beyond
 
 GAIN_UNITS = {"V_s": "N/V", "U_0": "N s/m"}  # of thrust over each input
 OUTPUTS = ("omega_m [rad/s]", "U_a [m/s]", "T [N]")

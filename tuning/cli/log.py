@@ -23,7 +23,7 @@ from thruster_env.logs.recorders.bag_counts import METADATA
 from thruster_env.logs.recorders.bags import HEADER, RECEIPT
 from thruster_env.logs.recorders.registry import ENDINGS, Contents, Field, contents, format_of
 from thruster_env.logs.table import SUFFIXES, read_table
-from thruster_env.logs.write import check_suffix, write_log
+from thruster_env.logs.write import check_picture, check_suffix, write_log
 from tuning.cli.main import PrintedWhole
 from tuning.cli.options import (
     A_LOG,
@@ -33,7 +33,7 @@ from tuning.cli.options import (
     ReadingOptions,
     with_groups,
 )
-from tuning.cli.output import check_picture, check_targets, emit
+from tuning.cli.output import check_targets, emit
 from tuning.logs.read import read_named
 from tuning.problems.plant_packages import logs_package
 

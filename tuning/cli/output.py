@@ -20,12 +20,11 @@ from thruster_env.core.files import check_not_read, check_target, write_whole
 from thruster_env.core.text_tables import console
 from thruster_env.logs.recorders.registry import ENDINGS
 from thruster_env.logs.table import SUFFIXES
-from thruster_env.logs.write import check_not_among, check_suffix
+from thruster_env.logs.write import check_not_among
 from thruster_env.thruster.plant import largest_known_voltage
 from tuning.cli.main import PrintedWhole
 from tuning.cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
 
-PICTURES = (".png", ".svg", ".pdf")  # which figures are written as
 progress_console = Console(stderr=True, markup=False, highlight=False)
 
 
@@ -48,11 +47,6 @@ def _check_json(target: str | None) -> None:
     """Raise ValueError for a path that would be a log, or the description of one."""
     if target is not None and Path(target).suffix in (*SUFFIXES, *ENDINGS, ".toml"):
         raise ValueError(f"--json must be no log, nor what is said of one, but got {target!r}")
-
-
-def check_picture(path: Path, option: str) -> None:
-    """Raise ValueError unless the name of a figure's file ends in one of PICTURES."""
-    check_suffix(path, option, PICTURES)
 
 
 def check_targets(targets: Iterable[str | Path | None], json_target: str | None, read: Iterable = ()) -> None:

@@ -24,9 +24,10 @@ from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.files import check_target
 from thruster_env.core.text_tables import console, table
+from thruster_env.logs.write import check_picture
 from tuning.cli import options
 from tuning.cli.options import JsonOption, SeedOption
-from tuning.cli.output import announce_compilation, check_picture, emit, progress_console
+from tuning.cli.output import announce_compilation, emit, progress_console
 from tuning.experiments import BENCHMARKS, STUDIES, VEHICLE_STUDIES
 from tuning.experiments.benchmark import RUNS as BENCHMARK_RUNS
 from tuning.experiments.benchmark import WHY, Benchmark, Row, find_benchmark

@@ -10,7 +10,6 @@ from rich.console import RenderableType
 from filters.consistency.intervals import slightly, span
 from thruster_env.core.modules import is_code
 from tuning.api.run import Tuning
-from tuning.cli.tables import choice_table, front_table, gradient_table, kinds_table
 from tuning.evaluation.baselines import (
     GIVEN,
     NOISE,
@@ -37,6 +36,7 @@ from tuning.problems.assumed import within
 from tuning.problems.plant_packages import built_in
 from tuning.reporting.choice_words import apart, consistency_sentence, gains, model_doubts, residual_sentences
 from tuning.reporting.leaderboard import comparison_table
+from tuning.reporting.terminal import choice_table, front_table, gradient_table, kinds_table
 from tuning.search.among_types import filter_types_tried
 from tuning.search.objectives import LIKELIHOOD, NIS_BAND, PROPER, reported, reported_name
 from tuning.search.parameters import index_pairs, size_ladder

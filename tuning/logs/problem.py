@@ -22,7 +22,7 @@ from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification, write_values
-from tuning.logs.read import check_model, read_named, texts
+from tuning.logs.read import check_model, name_of, read_named, texts
 from tuning.problems.assumed import name_and_unknown
 from tuning.problems.find import named
 from tuning.problems.log_parts import check_apart, check_times
@@ -132,13 +132,6 @@ def _add(runs: dict[str, Any], name: str, log: Any) -> None:
     if name in runs and not isinstance(log, str | PathLike) and runs[name] is not log:
         raise ValueError(f"logs must have different names, but got two called {name}")
     runs.setdefault(name, log)
-
-
-def name_of(log: Any, index: int) -> str:
-    """Name of a log: its path, its own name, or for a table its number."""
-    if isinstance(log, Log):
-        return log.name
-    return str(log) if isinstance(log, str | PathLike) else f"run{index + 1}"
 
 
 def _content(runs: Mapping[str, Any], options: Mapping[str, Any], cuts: Mapping[str, Any]) -> dict | None:

@@ -6,6 +6,7 @@ The model of recorded runs comes from a pair (model, logs), from a model, or fro
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -151,6 +152,13 @@ def check_model(named, trusted: Any, file: str | Path) -> None:
             f"the model of logs must be given by its name if it is code, but {file} names {short_repr(named)} and "
             f"got {short_repr(trusted)}: use --model {named} (model={named!r} in Python), if you trust it"
         )
+
+
+def name_of(log: Any, index: int) -> str:
+    """Name of a log: its path, its own name, or for a table its number."""
+    if isinstance(log, Log):
+        return log.name
+    return str(log) if isinstance(log, str | PathLike) else f"run{index + 1}"
 
 
 def model_of_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any, Any, str | Path | None]:

@@ -88,7 +88,8 @@ def test_a_simulated_log_goes_through_estimate(simulated, as_json, thruster, tmp
 
 def test_estimating_imports_no_optimiser_and_draws_nothing_that_is_not_asked_for():
     heavy = ["optuna", "matplotlib", "pint", "pyarrow"]
-    code = f"import sys, tuning.cli.app, tuning.cli.estimate; print([n for n in {heavy} if n in sys.modules])"
+    modules = "tuning.cli.app, tuning.cli.verbs, tuning.api.estimate"
+    code = f"import sys, {modules}; print([n for n in {heavy} if n in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -206,7 +207,7 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
         ),
         (
             ("estimate", "run.csv", "--filter", "ekf", "--tuned", "x.json"),
-            "give either a tuned file or --filter NAME",
+            "give either a tuned file or a filter (--filter NAME)",
         ),
         (("estimate", "run.csv", "--out", "est.txt"), "--out must end in .csv, .parquet or .npz"),
         (("estimate", "run.csv", "--plot", "est.tex"), "--plot must end in .png, .svg or .pdf, but got"),

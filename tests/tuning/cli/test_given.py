@@ -35,12 +35,12 @@ def test_the_covariance_of_what_was_given_is_checked(as_json, tmp_path):  # noqa
     (
         (
             ("--scenario", "nominal"),
-            "--given must be used with a problem whose model has a given Q and R, but got nominal",
+            "given (--given) must be used with a problem whose model has a given Q and R, but got nominal",
         ),
-        (("tuned.json",), "--given must come without a tuned file, but got both, with tuned.json"),
+        (("tuned.json",), "given (--given) must come without a tuned file, but got both, with 'tuned.json'"),
         (
             ("--problem", ALTITUDE, "--filter", "low-pass"),
-            "--given must be used with a filter that has a Q and R, but got low-pass",
+            "given (--given) must be used with a filter that has a Q and R, but got low-pass",
         ),
     ),
 )

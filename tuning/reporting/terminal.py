@@ -1,4 +1,4 @@
-"""Tables of choices and their results, shared by several commands."""
+"""Tables of choices and their results for a terminal."""
 
 from __future__ import annotations
 

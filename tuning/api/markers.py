@@ -1,0 +1,78 @@
+"""How the parameters of a verb stand at the command line, where its signature and docstring cannot say it.
+
+A verb is a function such as `tuning.evaluate`. `tuning.cli.verbs` makes its command: types and defaults come from
+the signature, help from the docstring, and the rest from these markers in `Annotated`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from filters.registry import FILTERS
+
+# Panels of the help, in the order in which verbs declare their parameters.
+INPUT, FILTER, SEARCH, LEARNING, RUNS, OUTPUT = "Input", "Filter", "Search", "Learning", "Runs", "Output"
+LOGS = "Recorded runs"
+UNSET: Any = object()
+READ, WRITTEN = "read", "written"
+
+
+@dataclass(frozen=True)
+class Option:
+    """A parameter as an option; what is left out follows from its name, type, default and description.
+
+    Attributes:
+        panel: that groups it in the help.
+        names: "--filter", for instance, or "--grid/--no-grid".
+        metavar: word for its value.
+        type: of its value, if the annotation allows more than a command line can express.
+        default: if it differs from the function's.
+        choices: names that are accepted in any case, or which list: "presets", "problems", "sensors".
+        least: of a number.
+        most: of a number.
+        file: READ or WRITTEN: whether a file can be written is checked before anything runs.
+    """
+
+    panel: str = RUNS
+    names: tuple[str, ...] = ()
+    metavar: str | None = None
+    type: Any = None
+    default: Any = UNSET
+    choices: Iterable[str] | str | None = None
+    least: float | None = None
+    most: float | None = None
+    file: str | None = None
+
+
+@dataclass(frozen=True)
+class Argument(Option):
+    """A parameter whose value stands alone on the command line; it may be named by an option in addition."""
+
+
+@dataclass(frozen=True)
+class LogsArgument(Argument):
+    """Recorded runs: the file or files, and options of `tuning.read_logs` up to the parameter `last`."""
+
+    last: str = ""
+
+
+@dataclass(frozen=True)
+class ProblemOption(Option):
+    """A problem, or several: its name, or recorded runs (--log) with the options of `tuning.read_logs`."""
+
+
+@dataclass(frozen=True)
+class PythonOnly:
+    """A parameter without an option, and its value for a command."""
+
+    value: Any = UNSET
+
+
+Progress = Annotated[bool | None, PythonOnly(True)]
+Seed = Annotated[int, Option(RUNS, least=0)]
+FilterOption = Option(FILTER, ("--filter",), type=str, choices=(*FILTERS, "auto"))
+TunedArgument = Argument(FILTER, ("--tuned",), "FILE", str, file=READ)
+PresetOption = Option(INPUT, type=str, choices="presets", file=READ)
+ModelOption = Option(INPUT, metavar="MODULE:OBJECT", type=str)

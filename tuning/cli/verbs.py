@@ -1,0 +1,242 @@
+"""Make the commands of the verbs: `thruster evaluate` from the function `tuning.evaluate`, and so on.
+
+Types and defaults of options are those of the signature, their help is that of the docstring, and the rest stands
+in the markers of `tuning.api.markers`. A result has `tables()` for the terminal, `as_dict()` for --json and,
+unless it is 0, an `exit_code`.
+"""
+
+from __future__ import annotations
+
+import builtins
+import inspect
+import re
+import sys
+import types
+from collections.abc import Callable, Mapping, Sequence
+from inspect import Parameter
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+import typer
+
+from thruster_env.core.checks import short_repr
+from thruster_env.thruster.channels import CHANNELS
+from thruster_env.thruster.parameters import PRESETS
+from tuning.api.markers import (
+    OUTPUT,
+    READ,
+    UNSET,
+    WRITTEN,
+    Argument,
+    LogsArgument,
+    Option,
+    ProblemOption,
+    PythonOnly,
+)
+from tuning.api.read_logs import read_logs
+from tuning.cli.options import spelt
+from tuning.cli.output import announce_compilation, check_targets, emit
+from tuning.problems.plant_packages import built_in
+
+SHARED = {"preset", "model"}  # of recorded runs, and of tuned files
+SAME, AGAIN = "The same as the argument.", "_again"
+SIMPLE = (bool, int, float, str, Path)
+
+
+def names_in(choices: str) -> tuple[Sequence[str], str]:
+    """The names in a list, and what follows the description of a parameter whose value is such a name."""
+    if choices == "presets":
+        return [*PRESETS], f"{', '.join(PRESETS)}, or a FILE.toml of `thruster new preset` or `thruster identify`."
+    if choices == "sensors":
+        return [*CHANNELS], f"{', '.join(CHANNELS)}."
+    from tuning.cli.problems import PROBLEMS  # which imports all plants
+
+    return [*built_in()], PROBLEMS
+
+
+class Part(NamedTuple):
+    """An option or argument of a command."""
+
+    parameter: Parameter  # with Typer's annotation
+    marker: Option
+    default: Any  # of the function
+    option: str  # how one sets it: --filter, or the word of an argument
+    of_logs: bool = False  # whether it is one of `read_logs` alone
+
+    def is_set(self, value: Any) -> bool:
+        """Whether a value differs from the default."""
+        return value is not None and value != [] and value != self.default
+
+
+def command_of(verb: Callable) -> Callable:
+    """The function that Typer calls for a verb, with the verb's options as its signature."""
+    parts, fixed = parts_of(verb)
+    help_text = "Also write the result as JSON; - for standard output."
+    json = typer.Option("--json", metavar="FILE", help=help_text, rich_help_panel=OUTPUT)
+    of_json = parameter_of("json", str | None, json, None)
+
+    def command(**values: Any) -> None:
+        target = values.pop("json")
+        arguments = arguments_of(verb, parts, values)
+        check_targets(files_of(parts, values, WRITTEN), target, read=files_of(parts, values, READ))
+        announce_compilation()
+        result = verb(**fixed, **arguments)
+        emit(result.tables(), result.as_dict(), target)
+        if code := getattr(result, "exit_code", 0):
+            sys.exit(code)
+
+    taking: Any = command
+    taking.__signature__ = inspect.Signature([*(part.parameter for part in parts), of_json])
+    taking.__annotations__ = {name: part.annotation for name, part in taking.__signature__.parameters.items()}
+    taking.__doc__ = shell_text(described(verb)[0], parts)
+    return taking
+
+
+def parts_of(verb: Callable, last: str = "") -> tuple[list[Part], dict[str, Any]]:
+    """The options of a function's parameters, up to the `last` one, and the values of those without an option."""
+    parts: list[Part] = []
+    fixed: dict[str, Any] = {}
+    texts, hints, parameters = described(verb)[1], hints_of(verb), inspect.signature(verb).parameters
+    for name, parameter in parameters.items():
+        kind, marker = hints[name]
+        if isinstance(marker, PythonOnly) or parameter.kind is Parameter.VAR_KEYWORD:
+            fixed |= {} if getattr(marker, "value", UNSET) is UNSET else {name: marker.value}
+            continue
+        text = texts.get(name, "")
+        if isinstance(marker, LogsArgument):
+            text = f"{text} {described(read_logs)[1]['files']}"
+        parts += parts_of_parameter(parameter, kind, marker, text)
+        if isinstance(marker, LogsArgument | ProblemOption):
+            files, *of_logs = parts_of(read_logs, getattr(marker, "last", ""))[0]
+            if isinstance(marker, ProblemOption):
+                kind, info = get_args(files.parameter.annotation)
+                info.help = f"Instead of a problem: {info.help[:1].lower()}{info.help[1:]}"
+                of_logs.insert(0, files._replace(parameter=parameter_of("log", kind | None, info, None)))
+            parts += [part._replace(of_logs=True) for part in of_logs if part.parameter.name not in parameters]
+        if name == last:
+            break
+    for part in parts:
+        info = get_args(part.parameter.annotation)[1]
+        info.help = shell_text(info.help, parts)
+    return parts, fixed
+
+
+def parts_of_parameter(parameter: Parameter, kind: Any, marker: Option, text: str) -> list[Part]:
+    """A parameter as Typer declares it: an option or an argument, or an argument that an option may name."""
+    kind = simplified(kind) if marker.type is None else marker.type
+    default = parameter.default if marker.default is UNSET else marker.default
+    if get_origin(kind) is list:
+        default = default or None
+    kind = kind | None if default is None else kind
+    choices, listed = marker.choices, ""
+    if isinstance(choices, str):
+        choices, listed = names_in(choices)
+    options: dict[str, Any] = {"metavar": marker.metavar, "min": marker.least, "max": marker.most}
+    options |= {
+        "callback": None if choices is None else spelt(choices),
+        "help": f"{text.rstrip('.:')}: {listed}" if listed else text,
+    }
+    names = marker.names or (f"--{parameter.name.replace('_', '-')}",)
+    option = names[-1].rpartition("/")[2]
+    info = typer.Option(*names, rich_help_panel=marker.panel, **options)
+    if isinstance(marker, Argument):
+        option, info = marker.metavar or parameter.name.upper(), typer.Argument(**options)
+    parts = [Part(parameter_of(parameter.name, kind, info, default), marker, parameter.default, option)]
+    if isinstance(marker, Argument) and marker.names:
+        again = typer.Option(*names, metavar=marker.metavar, help=SAME, rich_help_panel=marker.panel)
+        parts.append(parts[0]._replace(parameter=parameter_of(parameter.name + AGAIN, kind, again, None)))
+    return parts
+
+
+def parameter_of(name: str, kind: Any, info: Any, default: Any) -> Parameter:
+    """A parameter of a command in Typer's form."""
+    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
+
+
+def arguments_of(verb: Callable, parts: Sequence[Part], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The function's arguments: those that are set, and recorded runs in place of the options on them."""
+    chosen = {part.parameter.name: part for part in parts if part.is_set(values[part.parameter.name])}
+    arguments = {name: values[name] for name, part in chosen.items() if not part.of_logs}
+    of_logs = {name: values[name] for name, part in chosen.items() if part.of_logs}
+    for name in [name for name in arguments if name.endswith(AGAIN)]:
+        first, again = arguments.get(name.removesuffix(AGAIN)), arguments.pop(name)
+        if first is not None:
+            raise ValueError(
+                f"a tuned file must be one, but got {first} and {chosen[name].marker.names[0]} {again}"
+            )
+        arguments[name.removesuffix(AGAIN)] = again
+    for part in parts:
+        name, marker = part.parameter.name, part.marker
+        if isinstance(marker, LogsArgument) and name in arguments:
+            arguments[name] = read_logs(arguments[name], **of_logs)
+        elif isinstance(marker, ProblemOption):
+            files, shared = of_logs.pop("log", None), SHARED & arguments.keys()
+            if files:
+                if name in arguments:
+                    got = f"both, {files[0]} and {arguments[name]}"
+                    raise ValueError(f"a problem must be of --log or of --problem, but got {got}")
+                arguments[name] = read_logs(files, **of_logs, **{key: arguments.pop(key) for key in shared})
+            elif of_logs:
+                first = chosen[next(iter(of_logs))].option
+                raise ValueError(
+                    f"{first} must come with --log, but got {short_repr(next(iter(of_logs.values())))}"
+                )
+    return arguments
+
+
+def files_of(parts: Sequence[Part], values: Mapping[str, Any], role: str) -> list:
+    """Paths that a command reads or writes."""
+    groups = [values[part.parameter.name] for part in parts if part.marker.file == role]
+    return [path for group in groups for path in (group if isinstance(group, list) else [group])]
+
+
+# What signature and docstring say.
+
+
+def described(function: Callable) -> tuple[str, dict[str, str]]:
+    """The text of a Google docstring without programs, and the descriptions of the arguments by name."""
+    text, _, rest = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
+    body = [part for part in text.split("\n\n") if not part.startswith("    ")]
+    descriptions: dict[str, str] = {}
+    for line in rest.partition("\n\n")[0].splitlines():
+        if match := re.match(r"    \**(\w+): (.*)", line):
+            name, descriptions[match[1]] = match[1], match[2]
+        else:
+            descriptions[name] += f" {line.strip()}"
+    return "\n\n".join(body), {key: shell_text(value) for key, value in descriptions.items()}
+
+
+def shell_text(text: str, parts: Sequence[Part] = ()) -> str:
+    """A text of a docstring for the command line: options in place of parameters, nothing on Python alone."""
+    text = re.sub(r" ?\bIn Python.*?[.](?= [A-Z]|\s*$)", "", text)
+    for part in parts:
+        text = text.replace(f"`{part.parameter.name}`", f"`{part.option}`")
+    return text[:1].upper() + text[1:]
+
+
+def hints_of(function: Callable) -> dict[str, tuple[Any, Any]]:
+    """The type of each parameter and its marker; names that only a type checker imports count as any type."""
+    hints = get_type_hints(function, {}, Names(function.__globals__), include_extras=True)
+    pairs = {
+        name: (get_args(hint) if get_origin(hint) is Annotated else (hint, Option()))
+        for name, hint in hints.items()
+    }
+    return {name: (pair[0], pair[1]) for name, pair in pairs.items()}
+
+
+class Names(dict):
+    """Names of a module, and any type for names that it lacks."""
+
+    def __missing__(self, name: str) -> Any:
+        return getattr(builtins, name, Any)
+
+
+def simplified(hint: Any) -> Any:
+    """The type of an option: of a union the first that a command line can express, a list for a sequence."""
+    if hint in SIMPLE:
+        return hint
+    if get_origin(hint) in (Union, types.UnionType):
+        return next((kind for kind in map(simplified, get_args(hint)) if kind is not None), None)
+    if get_origin(hint) in (list, Sequence):
+        return types.GenericAlias(list, simplified(get_args(hint)[0]))
+    return None
