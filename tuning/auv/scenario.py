@@ -1,6 +1,4 @@
-"""`Scenario`: a named, seeded, immutable recipe for an underwater vehicle, made once for all filters.
-
-The vehicle's scenarios that come with the package, by name.
+"""The underwater vehicle's scenarios: `Scenario`, a named, seeded and immutable recipe, and the built-in ones.
 
     python -m tuning.auv.scenario [NAME ...]
 
@@ -48,6 +46,14 @@ from tuning.problems.scenario import BaseScenario, plain
 
 
 TORQUE = 1  # index of K_prop among the inputs of a manoeuvre
+UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
+RUNS_AT_ONCE = 16  # runs whose covariances of all steps are in memory at the same time
+SEQUENCES = 200  # input sequences for a stored scale
+PLANE = math.radians(6.0)
+SAILING = Levels(low=(2.0, -PLANE, -PLANE), high=(4.0, PLANE, PLANE), shortest=60, longest=160)
+"""Thrusts of 2 to 4 N and planes within 6 deg, each held for 3 to 8 s."""
+MINUTE: dict[str, Any] = {"excitation": SAILING, "steps": 1200, "first_scored_step": 100}
+DVL = ("u", "v", "w")
 
 
 @EXCITATIONS.register("manoeuvre")
@@ -78,10 +84,6 @@ def commands_of(excitation: Excitation, plant: Plant, keys: np.ndarray, steps: i
     """Thrust, the torque where it is an input, and planes (B, steps, p), clipped to the limits of the env."""
     low, high = plant.input_limits
     return np.clip(excitation.inputs(keys, steps, plant.dt, len(plant.inputs)), low, high)
-
-
-UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
-RUNS_AT_ONCE = 16  # runs whose covariances of all steps are in memory at the same time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,9 +253,6 @@ class Scenario(BaseScenario):
 # The scale of a vehicle's scenario: standard deviations by the Riccati equation along noise-free paths.
 
 
-SEQUENCES = 200  # input sequences for a stored scale
-
-
 def computed_scale(scenario: Scenario, sequences: int = SEQUENCES) -> np.ndarray:
     """The scale (n,) of a scenario, its bound over the seeds 0, 1, 2, ...
 
@@ -266,11 +265,6 @@ def computed_scale(scenario: Scenario, sequences: int = SEQUENCES) -> np.ndarray
     return scale
 
 
-PLANE = math.radians(6.0)
-SAILING = Levels(low=(2.0, -PLANE, -PLANE), high=(4.0, PLANE, PLANE), shortest=60, longest=160)
-"""Thrusts of 2 to 4 N and planes within 6 deg, each held for 3 to 8 s."""
-
-MINUTE: dict[str, Any] = {"excitation": SAILING, "steps": 1200, "first_scored_step": 100}
 PAPERS: dict[str, Any] = {
     "sensors": "papers",
     "dt": 0.001,
@@ -291,7 +285,6 @@ def suite_with(name: str, channels: tuple[str, ...], effect: dict) -> dict[str, 
     }
 
 
-DVL = ("u", "v", "w")
 # Standard deviations by the Riccati equation for 200 input sequences, to one per cent; a test recomputes some.
 MOTION_SCALE = (0.007873, 0.004605, 0.005282, 0.002202, 0.002147, 0.002115, 0.0005593, 0.0009131)
 NAVIGATION_SCALE = (

@@ -10,8 +10,7 @@ import typer
 from thruster_env.core.text_tables import table
 from tuning.cli.options import JsonOption, spelt
 from tuning.cli.output import emit
-from tuning.methods.registry import METHODS, find_method
-from tuning.methods.scoring import GRADIENT, TRUTH
+from tuning.methods.registry import GRADIENT, METHODS, TRUTH, find_method
 
 NEEDS = "needs"
 HEADS = ("method", "what it does", "use it", NEEDS)

@@ -1,8 +1,6 @@
 """The baselines of a tuned filter: given, scaled default, rule of thumb, noise estimation and oracle.
 
-NIS is the normalised innovation squared.
-
-A filter beside a linear regression of the measurements, which assumes no model: does the model fit the logs?
+A linear regression of the measurements, which assumes no model, tests whether the model fits the logs.
 """
 
 from __future__ import annotations
@@ -41,6 +39,13 @@ FLOOR = 1e-6  # of each variance, which is added to singular covariances before 
 UNMOVED = 1e-9  # of a coordinate, within which a parameter has not moved
 BEYOND = 1e200  # in place of an infinite divergence
 CLOSE = 0.02  # tolerance of the mean NIS about 1: that of an ensemble need not be continuous in Q
+
+# Of the regression.
+ORDERS = (1, 2, 3, 5, 8)  # numbers of past rows, among which the training runs choose
+MOST_NUMBERS = 1_000_000  # of the matrix of regressors
+LEAST_VARIANCE = 1e-12  # of the residuals, over that of the channel: what is below is rounding
+FEWEST = 10  # rows for each weight
+FAR = 0.1  # log-likelihood of a measurement by which a filter is far below: its innovations are 10 % larger
 
 
 class Scaled(NamedTuple):
@@ -315,13 +320,6 @@ def same_filter(a: Choice, b: Choice) -> bool:
 
 def _same_values(a: Mapping, b: Mapping) -> bool:
     return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
-
-
-ORDERS = (1, 2, 3, 5, 8)  # numbers of past rows, among which the training runs choose
-MOST_NUMBERS = 1_000_000  # of the matrix of regressors
-LEAST_VARIANCE = 1e-12  # of the residuals, over that of the channel: what is below is rounding
-FEWEST = 10  # rows for each weight
-FAR = 0.1  # log-likelihood of a measurement by which a filter is far below: its innovations are 10 % larger
 
 
 def gain_over_regression(model: StateSpaceModel, tuned: Evaluation, training: Data, data: Data) -> Interval:

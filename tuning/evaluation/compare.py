@@ -1,8 +1,6 @@
 """Filters side by side on scenarios: errors, consistency, cost, and paired comparisons on the same seeds.
 
-NEES is the normalised estimation error squared.
-
-The noise and constants that filters of a comparison assume.
+In order: the Q and R that each filter assumes, the comparison, and the filters that can take part in it.
 """
 
 from __future__ import annotations
@@ -82,6 +80,19 @@ SAID = {
 }
 KNOWLEDGE = ("true", "scaled", "untuned", "given", "noise", STUDY)  # of Q and R; see `KNOWS`
 OF_BASELINE = {SCALED: "scaled", RULE: "untuned", GIVEN: "given", NOISE: "noise"}
+VERDICTS = {  # in sentences
+    "better": "better than",
+    "worse": "worse than",
+    "tie": "not significantly different from",
+    "unknown": "without a likelihood to compare with that of",
+}
+WIDE = 1.0  # length of a ratio's interval over its value, above which a few runs dominate the mean
+SYMBOLS = {"ambient_velocity": "U_0"}  # for labels
+
+# The filters of a comparison in which none is named.
+DEFAULT_FILTERS = ("ekf", "enkf", "pf")
+PARTICLES = "pf"
+MOST_STATES = 6  # to which a thousand particles are spread by default: the number needed grows exponentially
 
 
 class Known(NamedTuple):
@@ -214,16 +225,6 @@ def belief_sentences(rows: Sequence[Any]) -> list[str]:
         f"walk of {belief.walk_std:.3g} per step (standard deviation; all in its own unit)."
         for name, belief in beliefs.items()
     ]
-
-
-VERDICTS = {  # in sentences
-    "better": "better than",
-    "worse": "worse than",
-    "tie": "not significantly different from",
-    "unknown": "without a likelihood to compare with that of",
-}
-WIDE = 1.0  # length of a ratio's interval over its value, above which a few runs dominate the mean
-SYMBOLS = {"ambient_velocity": "U_0"}  # for labels
 
 
 class Contender(NamedTuple):
@@ -474,11 +475,6 @@ def timed_runs(filter_: Filter, data: Data, scale) -> tuple[RunMetrics, float]:
 
 
 # Which filters can run on all problems of a comparison, which do so by default, and why others do not.
-
-
-DEFAULT_FILTERS = ("ekf", "enkf", "pf")
-PARTICLES = "pf"
-MOST_STATES = 6  # to which a thousand particles are spread by default: the number needed grows exponentially
 
 
 def default_filters(problems: Sequence[Problem]) -> tuple[list[str], dict[str, str]]:

@@ -1,7 +1,7 @@
 """A filter on a problem's data: errors with intervals, consistency, and paired comparisons.
 
-NEES is the normalised estimation error squared, NIS the normalised innovation squared. For a consistent filter
-their expected values are the number of states and the number of measured channels.
+For a consistent filter the mean NEES (normalised estimation error squared) equals the number of states, and the
+mean NIS (normalised innovation squared) the number of measured channels.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Held-out evaluation: a choice and its baselines on seeds that no trial saw, with the bound on these seeds.
 
-Evaluations are stored as plain numbers in files and studies, with a digest of their inputs (the choice, the
-problems and the versions of all packages), and used only if that is the same. The digest does not prove who
-wrote them: `tuning.evaluation.tuned` recomputes held-out metrics.
+Files and studies store evaluations as plain numbers with a digest of the inputs: the choice, the problems and the
+versions of all packages. A stored evaluation is used only if its digest still matches. The digest does not prove
+who wrote it; `tuning.evaluation.tuned` recomputes held-out metrics.
 """
 
 from __future__ import annotations
@@ -54,6 +54,9 @@ from tuning.search.forgetting import time_constants_on, with_oracle_and_advice
 from tuning.search.parameters import size_ladder
 from tuning.search.plan import HELD_OUT_SEEDS, SIZE_SEEDS, TRAINING_SEEDS, Plan
 from tuning.search.space import Choice
+
+PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
+ROLES = ("untuned", "tuned", "true", "scaled", "given", "noise")  # evaluations of a `Comparison`
 
 
 class Comparison(NamedTuple):
@@ -180,9 +183,6 @@ def _evaluation_in(choice: Choice, done: Sequence[tuple[Choice, Evaluation]]) ->
 
 
 # Versions of the packages that numerical results depend on.
-
-
-PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
 
 
 def versions() -> dict[str, str]:
@@ -326,9 +326,6 @@ def _key(output: Quantity) -> str:
 
 
 # Results of long computations that a study and a tuned file store, so that a report need not repeat them.
-
-
-ROLES = ("untuned", "tuned", "true", "scaled", "given", "noise")  # evaluations of a `Comparison`
 
 
 def sizes_as_data(rows: Sequence[SizeRow], choice: Choice, plan: Plan) -> dict:

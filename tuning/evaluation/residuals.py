@@ -1,9 +1,7 @@
-"""Noise estimation: sample covariances of the residuals of a model's two equations on the truth.
+"""Residuals and innovations against the noise that a filter assumes, and noise estimation from the residuals.
 
-Residuals of another kind than a filter assumes: heavy tails, and a few blocks of logs that carry the mean NIS.
-
-NIS is the normalised innovation squared. A burst of garbage in one log raises R for all logs, and the mean NIS of
-the tuned filter still looks right, because the burst makes up for what is too small everywhere else.
+In order: heavy tails; a mean NIS that a few blocks of logs carry; noise estimation, by the sample covariances of
+x' - f(x, u) and z - h(x) on the true states.
 """
 
 from __future__ import annotations
@@ -43,6 +41,12 @@ MOST_BLOCKS = 0.25  # share of the blocks that may stand out: more are no except
 LIFTED = 1.5  # mean NIS with the blocks that stand out over that without them
 LARGE = 4.0  # innovation of a row over the robust deviation of its channel, from which it belongs to the burst
 MOST_SPANS, NEAR = 3, 25  # spans that are named, and the distance in rows up to which two are one
+
+# Of noise estimation.
+FEWEST_PAIRS = 10  # residuals for each entry of a mean, below which there is no covariance worth the name
+LEAST_EIGENVALUE = 1e-9  # of R's correlations: channels that are copies of each other have none
+TOLERANCE = 0.1  # of variances and correlations of residuals, relative, within which a model is right
+ROUNDING = 1e-12  # of a state's largest value, below which residuals are rounding
 
 
 class Tails(NamedTuple):
@@ -145,6 +149,9 @@ def uneven_nis(filter_: Filter, problem: Problem, seed: int = 0) -> UnevenNis | 
         r_b = sum of NIS / number of measured values of block b,   stands out: r_b > 4 median r,
         carried: mean NIS > 1.5 times the mean without those that stand out
 
+    A burst of garbage in one log raises R for all logs, and the mean NIS of the tuned filter still looks right:
+    the burst offsets values that are too small everywhere else.
+
     Args:
         filter_: the filter, of a covariance.
         problem: of logs; all of its blocks are looked at, training and held out.
@@ -206,12 +213,6 @@ def uneven_sentence(uneven: UnevenNis, channels: int) -> str:
         "garbage, leave it out (--outliers missing, outliers='missing' in Python, where the findings name it; "
         "otherwise make these cells of the log empty), or take --filter ekf-robust."
     )
-
-
-FEWEST_PAIRS = 10  # residuals for each entry of a mean, below which there is no covariance worth the name
-LEAST_EIGENVALUE = 1e-9  # of R's correlations: channels that are copies of each other have none
-TOLERANCE = 0.1  # of variances and correlations of residuals, relative, within which a model is right
-ROUNDING = 1e-12  # of a state's largest value, below which residuals are rounding
 
 
 class Residuals(NamedTuple):

@@ -1,7 +1,4 @@
-"""Metrics of a filter in each of its runs, without the covariances of every step.
-
-NEES is the normalised estimation error squared, NIS the normalised innovation squared.
-"""
+"""Metrics of a filter in each of its runs: log score, errors, NEES and NIS, without storing every covariance."""
 
 from __future__ import annotations
 
@@ -21,6 +18,7 @@ from tuning.problems.data import FIRST_SCORED_STEP, Data, estimates_in_parts, wh
 
 
 LEAST = -1e6  # log score of a step whose covariance is singular or not finite
+FARTHEST = 1e100  # outputs are clipped to this, so that their squares are finite
 
 
 def log_scores_of(
@@ -50,9 +48,6 @@ def log_scores_of(
         scores = -0.5 * (len(indices) * math.log(2.0 * math.pi) + logarithms + squares)
     scores = np.where(np.isfinite(scores), np.maximum(scores, LEAST), LEAST)
     return np.where(data.scored[:, late], scores, np.nan)
-
-
-FARTHEST = 1e100  # outputs are clipped to this, so that their squares are finite
 
 
 class RunMetrics(NamedTuple):

@@ -1,7 +1,4 @@
-"""The ensemble size: score against N on fresh seeds, and the smallest N that is as good as the best.
-
-NIS is the normalised innovation squared.
-"""
+"""The ensemble size: score against N on fresh seeds, and the smallest N that is as good as the best."""
 
 from __future__ import annotations
 

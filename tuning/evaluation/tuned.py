@@ -1,6 +1,6 @@
 """The tuned file: one JSON file with a filter's parameters, their origin and their held-out metrics.
 
-NIS is the normalised innovation squared.
+`verify` recomputes these metrics.
 """
 
 from __future__ import annotations
@@ -55,6 +55,7 @@ from tuning.search.study import StudyResult
 from tuning.search.validation import as_data
 
 SAME_NOISE = 1e-6  # relative difference of two covariances, above which they are not the same
+TOLERANCE = 1e-9  # relative: the effect of the order of a sum
 
 
 def write_tuned(
@@ -336,7 +337,6 @@ def consistency(result: StudyResult) -> dict:
 # Verification of a tuned file: its held-out metrics, recomputed.
 
 
-TOLERANCE = 1e-9  # relative: the effect of the order of a sum
 LATER = (
     "scaled",
     "scaled_default",

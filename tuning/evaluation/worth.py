@@ -1,7 +1,4 @@
-"""Held-out results in words: the gain over each baseline, and a description of the scaled default.
-
-NIS is the normalised innovation squared.
-"""
+"""Held-out results in words: the gain over each baseline, and a description of the scaled default."""
 
 from __future__ import annotations
 

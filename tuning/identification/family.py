@@ -29,6 +29,7 @@ from tuning.search.parameters import r_name
 
 FACTOR = 10.0  # range of a positive parameter about its start
 NOISE_FACTOR = 1e4  # range of a variance about its start
+FUNCTIONS = "transition", "observe", "transition_jacobian", "observe_jacobian"
 
 
 class ModelFamily:
@@ -175,9 +176,6 @@ def _numbers_of(function: Callable) -> dict[str, float]:
 
 
 # Parameters that a model's functions hold in their closures, as constants: then derivatives along them are exact.
-
-
-FUNCTIONS = "transition", "observe", "transition_jacobian", "observe_jacobian"
 
 
 @dataclasses.dataclass(frozen=True)

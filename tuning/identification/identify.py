@@ -1,6 +1,6 @@
 """A plant's parameters by maximum likelihood of a filter's innovations, from several starts.
 
-Outliers in logs: samples with large innovations of a robust filter are left out.
+With a gate, samples with large innovations of a robust filter are outliers and left out.
 """
 
 from __future__ import annotations
@@ -36,6 +36,13 @@ from tuning.problems.problem import Coordinates, Parameter
 from tuning.search.study import stop_on_interrupt
 
 ROUNDS = 30  # of leaving out and identifying again, at most; a narrow gate takes many
+STARTS = 4  # the given one, and others drawn about it
+MOST_STARTS = 1000
+START_ROUNDS = 3  # of finding further runs that begin elsewhere, at most
+LEAST_GATE = 2.0  # one sample of 22 is beyond it without any outlier; the filter then misses too many
+NEARER = 5  # largest number of times that a start without a likelihood is moved halfway to the first
+REACH = 0.25  # fraction of a range, to either side of the start, within which other starts are drawn
+Progress = Callable[[int, float, dict[str, float]], None]
 
 
 def outliers_of(model: StateSpaceModel, runs: Data, gate: float, starts: Starts | None = None) -> np.ndarray:
@@ -103,16 +110,6 @@ def check_excitation(objective: Objective, logs: Sequence[Log], start: np.ndarra
             f"logs must excite the free parameters, but constant inputs do not determine {', '.join(loose)}: "
             "hold these, or record steps"
         )
-
-
-STARTS = 4  # the given one, and others drawn about it
-MOST_STARTS = 1000
-START_ROUNDS = 3  # of finding further runs that begin elsewhere, at most
-LEAST_GATE = 2.0  # one sample of 22 is beyond it without any outlier; the filter then misses too many
-NEARER = 5  # largest number of times that a start without a likelihood is moved halfway to the first
-REACH = 0.25  # fraction of a range, to either side of the start, within which other starts are drawn
-
-Progress = Callable[[int, float, dict[str, float]], None]
 
 
 def identify(

@@ -1,7 +1,7 @@
-"""The log-likelihood of logs as a function of a model's free parameters, with its derivatives.
+"""The log-likelihood of logs as a function of a model's free parameters, with its derivatives and its maximum.
 
-The effect of leaving out samples beyond a gate on the variance of the rest, and on standard errors. The
-maximum of a log-likelihood within bounds, by Fisher scoring with Marquardt's damping.
+In order: the effect of a gate for outliers on variances and standard errors; the objective; Fisher scoring with
+Marquardt's damping.
 """
 
 from __future__ import annotations
@@ -26,6 +26,16 @@ from tuning.identification.family import CapturedConstants
 from tuning.identification.starts import runs_of
 from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates
+
+FILTERS = "kf", "ekf"
+STEP = 1e-4  # of differences of the model, in coordinates
+LARGE_STEP = 1e-2  # of differences of the likelihood itself
+COVARIANCES = "process_noise_cov", "measurement_noise_cov", "prior_cov"
+BLOCKS = 20  # least number of blocks of all runs, whose scores give the scatter
+ITERATIONS = 60  # at most
+ENOUGH = 1e-4  # predicted rise in log-likelihood below which the search ends
+LONGEST = 1.5  # longest step, in coordinates
+LEAST_CURVATURE = 1e-6  # of the largest one; fixes directions on which the data have no information
 
 
 def kept_variance(gate: float) -> float:
@@ -56,13 +66,6 @@ def _edge(gate: float) -> float:
     if gate > 38.0:  # phi is no number of floating point any more
         return 0.0
     return 2.0 * gate * math.exp(-0.5 * gate**2) / math.sqrt(2.0 * math.pi) / math.erf(gate / math.sqrt(2.0))
-
-
-FILTERS = "kf", "ekf"
-STEP = 1e-4  # of differences of the model, in coordinates
-LARGE_STEP = 1e-2  # of differences of the likelihood itself
-COVARIANCES = "process_noise_cov", "measurement_noise_cov", "prior_cov"
-BLOCKS = 20  # least number of blocks of all runs, whose scores give the scatter
 
 
 class Evaluation(NamedTuple):
@@ -329,12 +332,6 @@ def _checked_channels(predicted: Sequence[str], model: StateSpaceModel) -> list[
     if all(unseen):
         raise ValueError(f"a filter must see some channel, but {', '.join(symbols)} are only predicted")
     return unseen
-
-
-ITERATIONS = 60  # at most
-ENOUGH = 1e-4  # predicted rise in log-likelihood below which the search ends
-LONGEST = 1.5  # longest step, in coordinates
-LEAST_CURVATURE = 1e-6  # of the largest one; fixes directions on which the data have no information
 
 
 class Ascent(NamedTuple):

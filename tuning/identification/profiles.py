@@ -1,8 +1,6 @@
-"""Profile likelihoods: how far the log-likelihood falls where one parameter is held elsewhere.
+"""Profile likelihoods, with one parameter held elsewhere, and validation of the model on other runs.
 
-Validation of a model on runs that it was not identified on: prediction, simulation and likelihood.
-
-NIS is the normalised innovation squared.
+Validation compares the model's prediction, simulation and likelihood before and after identification.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """The result of identification: values, standard errors, and which parameters the data determine.
 
-Likelihood-ratio tests of each free parameter against leaving it out.
+In order: likelihood-ratio tests of each free parameter against leaving it out; the result; and the file of
+identified values, which commands take as the preset of `--model`:
 
-Identified values of a user's model, in a file that commands take as the preset of `--model`.
-
-[values]            the model's arguments, named constants, Q11, Q22, ... and R11, ...
-[identified]        how they were found, for readers
+    [values]            the model's arguments, named constants, Q11, Q22, ... and R11, ...
+    [identified]        the origin of the values, for readers
 """
 
 from __future__ import annotations
@@ -32,6 +31,13 @@ from tuning.problems.problem import Coordinates
 LEGS = 25  # iterations of the other parameters, at most
 ROUNDS = 4  # of going on from a better place that a test has found, at most
 BETTER = 1e-3  # rise in log-likelihood that counts as one
+WIDEST = 0.5  # largest part of its range that the 95 % interval of a determined parameter may take
+TRADED = 0.95  # correlation from which two parameters are reported to trade off
+EQUAL = 0.25  # standard errors within which the determined parameters of two equal optima lie ...
+EQUAL_VALUES = 0.01  # ... or difference of their log-likelihoods
+LEVEL = 0.05  # of a test above which the data are as likely without a parameter
+MOST_RUNS = 8  # whose numbers a sentence has
+TABLES = ("values", "identified")
 
 
 class NullTest(NamedTuple):
@@ -134,14 +140,6 @@ def _held_at(objective: Objective, best: Ascent, index: int, null: float, cov: n
         at[index] = null
     at = max(starts, key=objective.value)
     return climb(objective, at, *bounds, fixed=fixed, iterations=LEGS, stop=stop)
-
-
-WIDEST = 0.5  # largest part of its range that the 95 % interval of a determined parameter may take
-TRADED = 0.95  # correlation from which two parameters are reported to trade off
-EQUAL = 0.25  # standard errors within which the determined parameters of two equal optima lie ...
-EQUAL_VALUES = 0.01  # ... or difference of their log-likelihoods
-LEVEL = 0.05  # of a test above which the data are as likely without a parameter
-MOST_RUNS = 8  # whose numbers a sentence has
 
 
 class Optimum(NamedTuple):
@@ -400,9 +398,6 @@ def covariance(information: np.ndarray, scores: np.ndarray, width: np.ndarray) -
     ratios, turns = np.linalg.eigh(scatter / np.outer(roots, roots))
     wide = turns * np.maximum(ratios, 1.0) @ turns.T * np.outer(roots, roots)
     return axes @ wide @ axes.T * scale
-
-
-TABLES = ("values", "identified")
 
 
 def write_values(

@@ -1,7 +1,7 @@
-"""The training of an estimator with a network: windows of many runs, and checks on runs of their own.
+"""The training of an estimator with a network: windows of many runs, and checks on validation runs.
 
-The filter that a training starts from, and the scales of its quantities on the training runs. Trained
-estimators and filters on runs that no training saw, also on longer and noisier ones.
+In order: the loss; the training; the filter it starts from, with the scales of its quantities; trained estimators
+beside filters on held-out runs, also longer and noisier ones.
 """
 
 from __future__ import annotations
@@ -35,6 +35,12 @@ from tuning.problems.env_problem import measurement_noise
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Problem
 from tuning.problems.scenario import BaseScenario
+
+LARGEST_GRADIENT = 1.0  # its norm is cut to this: one outlier shall not undo what was learned
+START = "ekf"
+SMALLEST = 1e-12  # of a scale: a quantity that stays at zero is divided by this, and stays there
+LARGER = 4.0  # factor on R
+HELD_OUT, LONGER, NOISIER = "held out", "twice as long", f"R x {LARGER:g}"
 
 # What the training of an estimator minimises: squared errors, or the log density of the truth.
 
@@ -71,9 +77,6 @@ class Loss:
         assert track.cov is not None
         root = factor(track.cov[:, self._states[:, None], self._states])
         return torch.where(scored, -density(error, root, torch.ones_like(error, dtype=torch.bool)), 0.0).sum()
-
-
-LARGEST_GRADIENT = 1.0  # its norm is cut to this: one outlier shall not undo what was learned
 
 
 class Check(NamedTuple):
@@ -200,10 +203,6 @@ def _losses(
                 yield total / counted
 
 
-START = "ekf"
-SMALLEST = 1e-12  # of a scale: a quantity that stays at zero is divided by this, and stays there
-
-
 def starting_filter(problem: Problem, data: Data, seed: int) -> tuple[str, Filter]:
     """The extended Kalman filter that a training starts from: the baseline that is best on the training runs.
 
@@ -309,9 +308,6 @@ def _large(values: np.ndarray) -> np.ndarray:
 # Held-out runs that differ from those of a training: twice as long, and with a larger measurement noise.
 
 
-LARGER = 4.0  # factor on R
-
-
 def twice_as_long(problem: Problem, seeds: Sequence[int]) -> Data | None:
     """Runs of a problem that are twice as long; None of one whose runs have their length."""
     if isinstance(problem, BaseScenario):
@@ -332,9 +328,6 @@ def with_larger_noise(problem: Problem, data: Data, factor: float = LARGER) -> D
     steps, keys = np.arange(data.measurements.shape[1]), data.filter_keys.astype(np.int64)
     noise = measurement_noise(keys, steps, (factor - 1.0) * model.measurement_noise_cov)
     return data._replace(measurements=data.measurements + noise)
-
-
-HELD_OUT, LONGER, NOISIER = "held out", "twice as long", f"R x {LARGER:g}"
 
 
 class Standing(NamedTuple):

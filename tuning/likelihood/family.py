@@ -28,6 +28,9 @@ from tuning.search.parameters import (
 from tuning.search.relations import correlation_slopes, correlations_of, full_covariance, obeying
 from tuning.search.space import Choice
 
+LEAST_NUMBERS = 8  # number of parameters from which the information is faster than differences
+STEP = 1e-4  # in coordinates, of the differences of a model's numbers
+
 # Q or R as a function of tuned parameters, with exact derivatives.
 
 
@@ -91,8 +94,6 @@ class TunedCovariance:
 
 
 DIFFERENTIABLE = tuple(kind.name for kind in KINDS)  # filters, and those of users that `has_gradient` knows
-LEAST_NUMBERS = 8  # number of parameters from which the information is faster than differences
-STEP = 1e-4  # in coordinates, of the differences of a model's numbers
 
 
 def has_gradient(name: str) -> bool:

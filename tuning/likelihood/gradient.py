@@ -1,7 +1,4 @@
-"""Parameters by gradients: of maximum likelihood of the innovations, or of the best score at the true states.
-
-What gradients lead to: the likelihood of the innovations, or the best score at the true states.
-"""
+"""Parameters by gradients: of maximum likelihood of the innovations, or of the best score on the true states."""
 
 from __future__ import annotations
 
@@ -32,6 +29,16 @@ OF_STATES = {  # objectives on the true states: what of them is summed over step
     MSE: recursion.SQUARES,
     LOG_SCORE: recursion.LOG_SCORE,
 }
+BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from the optimum
+STEP = 1e-3  # in coordinates, of the differences of gradients that give the Hessian
+FLAT = 1e-12  # curvature relative to the largest one, below which a direction counts as flat
+DIVERGED = 1e12  # in place of -log L where the filter diverges
+EQUAL = 0.02  # optima this close in every coordinate are the same
+SAME_LEVEL = 1e-4  # relative difference of their levels, up to which they may be
+PRECISE = 1e-13  # relative decrease of -log L below which the search ends
+FEW_RUNS = 4  # with which the search for a model of many states begins
+COARSE = 1e-9  # the same for models of many states, whose log L is of the order of a million
+LINEAR_WITHIN = 2.5  # a quarter of the range, in coordinates of parameters on linear scales
 
 
 class Goal:
@@ -186,18 +193,6 @@ class Goal:
         with np.errstate(divide="ignore"):
             weights[: len(scale)] = 1.0 / (np.isfinite(scale).sum() * scale * deviations)
         return weights
-
-
-BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from the optimum
-STEP = 1e-3  # in coordinates, of the differences of gradients that give the Hessian
-FLAT = 1e-12  # curvature relative to the largest one, below which a direction counts as flat
-DIVERGED = 1e12  # in place of -log L where the filter diverges
-EQUAL = 0.02  # optima this close in every coordinate are the same
-SAME_LEVEL = 1e-4  # relative difference of their levels, up to which they may be
-PRECISE = 1e-13  # relative decrease of -log L below which the search ends
-FEW_RUNS = 4  # with which the search for a model of many states begins
-COARSE = 1e-9  # the same for models of many states, whose log L is of the order of a million
-LINEAR_WITHIN = 2.5  # a quarter of the range, in coordinates of parameters on linear scales
 
 
 class Optimum(NamedTuple):

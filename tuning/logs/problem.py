@@ -1,6 +1,6 @@
-"""Recorded logs as the problem of a study: from a user's options, or from those in a tuned file.
+"""Recorded logs as a problem: of a study, from options or from a tuned file, and of an identification.
 
-The input of an identification: training runs, held-out runs, and the model family.
+An identification has training runs, held-out runs, and a family of models.
 """
 
 from __future__ import annotations
@@ -34,6 +34,9 @@ OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid"
 
 
 CUTS = ("held_out", "blocks", "lead", "hold_gaps", "start", "outliers")
+EVERY_THIRD = 3
+SHORTEST_PIECE = 10  # rows of a run between gaps: fewer tell little beside how they begin
+OFFSET_SHARE = 4  # a clock offset may be at most the length of a log divided by this
 
 
 def log_problem(
@@ -215,11 +218,6 @@ def model_named_in(problem: Problem) -> str | None:
     if content is None or "logs" not in content:
         return None
     return content["options"].get("model")
-
-
-EVERY_THIRD = 3
-SHORTEST_PIECE = 10  # rows of a run between gaps: fewer tell little beside how they begin
-OFFSET_SHARE = 4  # a clock offset may be at most the length of a log divided by this
 
 
 def split_runs(

@@ -1,6 +1,6 @@
 """One recorded run with its model: a file or a table, its plant, and the meaning of its columns.
 
-The model of recorded runs comes from a pair (model, logs), from a model, or from a thruster's preset.
+The model comes from a pair (model, logs), from a model, or from a thruster's preset.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Lagged covariances of a fixed gain's innovations: what they are, what they should be, and what they tell."""
+"""Q and R from the autocovariance of a fixed-gain filter's innovations.
+
+In order: the autocovariances; autocovariance least squares; Mehra's covariance matching; Desroziers' diagnostics.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,15 @@ ITERATIONS = 3  # the gain of each is that of the Q and R found before
 LEAST_DECAY = 1e-9  # of an error in a step
 ALIKE = 1e-9  # relative difference, up to which two linearisations are the same
 LINEAR = 1e-6  # part of Q or R that numbers may not stand for: slopes of a model's own numbers are differences
+
+# Of autocovariance least squares.
+LEAST = 1e-10  # part of the start's variances below which none falls, so that a gain exists
+PRECISE, MOST = 1e-12, 400  # relative change of squares and roots that ends Gauss and Newton's steps; and how many
+
+# Of Desroziers' diagnostics.
+DESROZIERS_ITERATIONS = 30
+CLOSE = 1e-3  # relative change that ends it
+MOST_CHANGE = 10.0  # factor on Q or R in an iteration
 
 
 class Stationary(NamedTuple):
@@ -167,11 +179,7 @@ def autocovariances(parts: list[list[np.ndarray]], lags: int) -> np.ndarray:
     return np.array(means)
 
 
-# Autocovariance least squares: Q and R from how the innovations of a fixed gain go together over time.
-
-
-LEAST = 1e-10  # part of the start's variances below which none falls, so that a gain exists
-PRECISE, MOST = 1e-12, 400  # relative change of squares and roots that ends Gauss and Newton's steps; and how many
+# Autocovariance least squares: Q and R from the autocovariance of a fixed gain's innovations.
 
 
 def als(task: Task) -> None:
@@ -345,12 +353,7 @@ def mehra_equations(
     return np.concatenate([of_r, of_q]), np.concatenate([r.ravel(), np.ravel(ends) - lagged_sums(known)])
 
 
-# R and one factor on Q from innovations before and after updates, as Desroziers has it.
-
-
-DESROZIERS_ITERATIONS = 30
-CLOSE = 1e-3  # relative change that ends it
-MOST_CHANGE = 10.0  # factor on Q or R in an iteration
+# Desroziers' diagnostics: R and one factor on Q from the innovations before and after updates.
 
 
 def desroziers(task: Task) -> None:

@@ -1,7 +1,7 @@
-"""Expectation-maximisation without a smoother, and the posterior mean of a model's numbers.
+"""Q and R by expectation-maximisation without a smoother, and from their posterior.
 
-By Fisher's identity the slopes of the likelihood give the steps of expectation-maximisation. The posterior is
-drawn by a random walk (`posterior`) or by the no-U-turn sampler (`nuts`).
+By Fisher's identity the slopes of the likelihood give the steps of expectation-maximisation. The posterior mean is
+that of a random walk (`posterior`) or of the no-U-turn sampler (`nuts`); `maximum_a_posteriori` finds the mode.
 """
 
 from __future__ import annotations
@@ -21,11 +21,17 @@ from tuning.search.parameters import MeasurementVariance, ProcessVariance
 
 MOST = 20_000  # steps
 CLOSE = 1e-9  # largest relative change of a variance in a step that ends the search
-ENOUGH, PATIENCE = (
-    1e-8,
-    100,
-)  # log L rises by less in so many steps where a variance goes to zero: an end, too
+ENOUGH, PATIENCE = 1e-8, 100  # log L rises by less in so many steps where a variance goes to zero: an end, too
 LEAST = 0.1  # factor of a step; only those of a nonlinear filter could be smaller, or negative
+
+# Of posteriors.
+DRAWS, WARM_UP = 2000, 500
+DEVIATION = math.log(10.0)  # of the prior, in coordinates: a factor of ten, or a tenth of a linear range
+AIM_OF_ONE, AIM = 0.44, 0.234  # accepted part of the proposals, of one number and of many
+WEAK = 2  # degrees of freedom beyond the size of a covariance, so that the prior's mean is the start
+NUTS_WARM_UP, NUTS_DRAWS = 300, 500
+EDGE = 1e-3  # part of a range that a start keeps from its ends
+LEAST_SHARE = 1e-300  # below which s (1 - s) has no logarithm
 
 
 def em(task: Task) -> None:
@@ -158,13 +164,6 @@ def _times_measured(task: Task) -> int:
     return count
 
 
-DRAWS, WARM_UP = 2000, 500
-DEVIATION = math.log(
-    10.0
-)  # of the prior, in coordinates: within a factor of ten, or a tenth of a linear range each
-AIM_OF_ONE, AIM = 0.44, 0.234  # accepted part of the proposals, of one number and of many
-
-
 def posterior(task: Task) -> None:
     """The mean over a Metropolis random walk of p(theta | z) in coordinates, with normal priors about the start.
 
@@ -211,9 +210,6 @@ def posterior(task: Task) -> None:
 
 
 # The likeliest Q and R with a prior: maximum a posteriori with inverse Wishart distributions.
-
-
-WEAK = 2  # degrees of freedom beyond the size of a covariance, so that the prior's mean is the start
 
 
 def maximum_a_posteriori(task: Task) -> None:
@@ -267,11 +263,6 @@ def _log_prior(
 
 
 # The posterior of a model's numbers by the no-U-turn sampler, along the exact gradient of the likelihood.
-
-
-NUTS_WARM_UP, NUTS_DRAWS = 300, 500
-EDGE = 1e-3  # part of a range that a start keeps from its ends
-LEAST_SHARE = 1e-300  # below which s (1 - s) has no logarithm
 
 
 def nuts(task: Task) -> None:

@@ -1,27 +1,35 @@
-"""The methods by name."""
+"""The methods of tuning by name, each with its function, its needs, its source and when to use it."""
 
 from __future__ import annotations
 
+import importlib.util
+from collections.abc import Callable
+from typing import NamedTuple
+
+from filters.registry import filter_type
 from thruster_env.core.checks import one_of
-from tuning.methods.correlations import als, desroziers, mehra
+from thruster_env.core.modules import to_install
+from tuning.likelihood.family import check_gradient
+from tuning.methods.correlations import als, desroziers, mehra, stationary
 from tuning.methods.em import em, maximum_a_posteriori, nuts, posterior, squarem
-from tuning.methods.okf import masked, okf
-from tuning.methods.scoring import (
-    COVARIANCE,
-    GRADIENT,
+from tuning.methods.okf import okf
+from tuning.methods.scoring import noise_estimation, scoring
+from tuning.methods.searches import (
     INFLATION,
-    LINEAR,
-    MODEL,
-    NOISE,
-    NUTPIE,
-    TRUTH,
-    Method,
-    noise_estimation,
-    scoring,
+    SLOWER,
+    anderson,
+    ascend,
+    coordinate_steps,
+    masked,
+    nelder_mead,
+    sage_husa,
+    sample,
+    vb,
 )
-from tuning.methods.searches import SLOWER, anderson, ascend, coordinate_steps, nelder_mead, sage_husa, sample, vb
-from tuning.methods.task import Task
+from tuning.methods.task import Spent, Task, way_out
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
+from tuning.search.parameters import Q, R
+from tuning.search.space import has_search_space
 
 ABBEEL = "Abbeel, Coates, Montemerlo, Ng, Thrun (2005)"
 CHEN = "Chen, Heckman, Julier, Ahmed (2018), arXiv 1807.08855"
@@ -35,6 +43,79 @@ UNIFORM = "Bergstra, Bengio (2012)"
 GRADIENT_METHOD = "gradient"
 DEFAULT = "tpe"
 ONLY = "-only"  # behind a sampler: without what a study does besides
+
+# What a method may need; INFLATION is that of an ensemble.
+TRUTH = "truth"  # true states
+GRADIENT = "gradient"  # a Kalman filter with derivatives
+COVARIANCE = "covariance"  # a filter with a covariance
+LINEAR = "linear"  # a linear model with a stationary filter
+NUTPIE = "nutpie"  # the package
+NOISE = "noise"  # that Q and R are tuned, and not a model's own parameters
+MODEL = "model"  # that some number of the model is tuned
+
+
+class Method(NamedTuple):
+    """A method that finds a filter's numbers."""
+
+    about: str  # what it does, in one sentence
+    when: str  # when to use it
+    function: Callable[[Task], None]  # keeps choices of a task until it is done, or the task raises Spent
+    source: str
+    needs: tuple[str, ...] = ()  # of the above
+    # Options of the model's numbers with which it can work.
+    options: tuple[str, ...] = ("hold_r", "full_q", "full_r", "prior", "where")
+    by_trials: bool = False  # whether it ends after a number of trials; others have their own criterion
+    sampler: str = ""  # of a study; empty if the method runs alone
+
+    @property
+    def is_study(self) -> bool:
+        """Whether it is a study, which draws its runs, tries the baselines and validates its best trials."""
+        return bool(self.sampler)
+
+    def check(self, name: str, task: Task) -> None:
+        """Raise ValueError if a task lacks what the method needs."""
+        if not has_search_space(task.filter):
+            raise ValueError(f"filter must be one that has something to tune, but got {task.filter!r}")
+        if GRADIENT in self.needs:
+            check_gradient(task.filter, f"a filter for method {name!r}")
+        if COVARIANCE in self.needs and not filter_type(task.filter).has_covariance:
+            raise ValueError(f"method {name!r} needs a filter with a covariance, but got {task.filter!r}")
+        if INFLATION in self.needs and INFLATION not in filter_type(task.filter).numbers:
+            raise ValueError(f"method {name!r} tunes the inflation of an ensemble, but {task.filter!r} has none")
+        if TRUTH in self.needs and not task.has_truth:
+            pairs = zip(task.problems, task.data, strict=True)
+            lacking = next(problem.name for problem, data in pairs if problem.scale is None or data.states is None)
+            raise ValueError(f"method {name!r} needs true states, but {lacking} has none")
+        if NOISE in self.needs and not {Q, R} <= set(task.start.model):
+            raise ValueError(
+                f"method {name!r} tunes Q and R, but {task.problems[0].name} has parameters of its own"
+            )
+        if MODEL in self.needs and not task.free:
+            raise ValueError(
+                f"method {name!r} tunes the model, but {task.problems[0].name} has no free parameter of it"
+            )
+        if LINEAR in self.needs:
+            stationary(task.model(task.start), task.problems[0].name, name)
+        if NUTPIE in self.needs and importlib.util.find_spec(NUTPIE) is None:
+            raise ValueError(f"method {name!r} needs {NUTPIE}, which is not installed: {to_install('nuts')}")
+        unable = [option for option, wanted in task.options.items() if wanted and option not in self.options]
+        if unable:
+            rest = f": P0 is tuned{way_out('P0')}" if "prior" in unable else ""
+            raise ValueError(f"method {name!r} must come without {', '.join(unable)}{rest}")
+
+    def run(self, name: str, task: Task, guarded: bool = True) -> None:
+        """Run the method until it is done or the budget spent; ValueError if the task lacks what it needs.
+
+        The answer is `task.best`; `task.answers` holds those for smaller budgets. If the answer is worse than the
+        start or the model's own numbers, these replace it (`task.refused`).
+        """
+        self.check(name, task)
+        try:
+            self.function(task)
+        except Spent:
+            pass
+        if guarded and not task.stop():  # whoever asks for an end waits for no more
+            task.refuse_worse()
 
 
 def study(task: Task) -> None:

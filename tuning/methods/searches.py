@@ -1,6 +1,7 @@
-"""Methods by gradients of an objective: L-BFGS-B in the coordinates of a study's numbers, from several starts.
+"""Methods that search an objective, by gradients, simplex or samplers, and methods that run adaptive filters.
 
-Adaptive filters run until they have converged: their mean Q and R, kept constant from then on.
+In order: L-BFGS-B along an objective's gradient from several starts; searches without a gradient; Optuna's
+samplers; the mean Q and R of adaptive filters that ran until convergence; Anderson's adaptive inflation.
 """
 
 from __future__ import annotations
@@ -14,15 +15,38 @@ from optuna.distributions import BaseDistribution
 
 from filters import make_filter
 from filters.engine.session import Session
+from thruster_env.core.angles import difference
 from tuning.evaluation.baselines import with_covariances
+from tuning.evaluation.residuals import predicted
 from tuning.likelihood.gradient import optimum, start_at, starts_of
-from tuning.methods.scoring import INFLATION
 from tuning.methods.task import Task
+from tuning.problems.data import estimates_in_parts
 from tuning.problems.problem import Coordinates
 from tuning.search.parameters import FILTER_PARAMETERS
 from tuning.search.samplers import make_sampler
 from tuning.search.space import Choice
 from tuning.search.storage import quiet_optuna
+
+HIDDEN_PART = 0.5  # of the times, at which `masked` hides all channels
+INFLATION = "inflation"  # the parameter of a filter with an ensemble
+
+# Of the simplex and of coordinate steps.
+FORWARD, BACKWARD = math.log(1.1), math.log(0.5)  # steps in coordinates
+ITERATIONS, LIMIT = 20, 0.1  # MATLAB's defaults: passes over all numbers, and the RMS error that is small enough
+SIDE = math.log(10.0)  # of the first simplex, in coordinates
+FEW = 4  # numbers, up to which the simplex has its first coefficients
+CLOSE = 1e-3  # size of a simplex, in coordinates, and relative spread of its values, at which it ends
+
+# Of samplers and of adaptive filters.
+MOST_TRIALS = 10_000
+SLOWER = 10  # steps from one measurement to the next at the second sample time: 0.1 s and 1 s in the source
+FORGETTING = 0.995  # of Q and R a step
+
+# Of Anderson's adaptive inflation.
+DEVIATION = 0.1  # s at the beginning: how well lambda is known
+LEAST_DEVIATION = 0.02  # below which s does not fall, so that lambda may go on to change
+NEWTON = 8  # steps to the mode
+SETTLED = 0.25  # part of a run whose lambdas do not count
 
 
 def ascend(objective: str) -> Callable[[Task], None]:
@@ -47,13 +71,6 @@ def ascend(objective: str) -> Callable[[Task], None]:
 
 
 # Searches of an objective without its gradient: the downhill simplex, and one number at a time.
-
-
-FORWARD, BACKWARD = math.log(1.1), math.log(0.5)  # steps in coordinates
-ITERATIONS, LIMIT = 20, 0.1  # MATLAB's defaults: passes over all numbers, and the RMS error that is small enough
-SIDE = math.log(10.0)  # of the first simplex, in coordinates
-FEW = 4  # numbers, up to which the simplex has its first coefficients
-CLOSE = 1e-3  # size of a simplex, in coordinates, and relative spread of its values, at which it ends
 
 
 class Descent:
@@ -127,11 +144,51 @@ def coordinate_steps(task: Task) -> None:
             return
 
 
+def masked(task: Task) -> None:
+    """Nelder and Mead's simplex on the error of predicted measurements, half of which the filter does not see.
+
+        J = sum over channels of mean (z - h(x^))^2 / var(z - h(x^)) of the start,  at the times left out
+
+    It determines Q against R and no common factor on both, as every error does.
+
+    Source: Barratt, Boyd (2020), "Fitting a Kalman smoother to data", American Control Conference, where a
+    smoother takes the place of the filter.
+    """
+    hidden = [task.generator.random(runs.measurements.shape[:2]) < HIDDEN_PART for runs in task.data]
+    scales: list[np.ndarray] = []
+
+    def error(choice: Choice) -> float:
+        squares = np.mean([_squares(task, choice, i, mask) for i, mask in enumerate(hidden)], axis=0)
+        task.charge(task.passes)
+        if not scales:
+            scales.append(np.where(squares > 0, squares, 1.0))
+        value = float((squares / scales[0]).sum())
+        return value if math.isfinite(value) else math.inf
+
+    with task.uncounted():
+        _squares(task, task.start, 0, hidden[0])
+    nelder_mead(task, error)
+
+
+def _squares(task: Task, choice: Choice, index: int, hidden: np.ndarray) -> np.ndarray:
+    """Mean squares (m,) of predicted measurements at scored times that are hidden."""
+    problem, data = task.problems[index], task.data[index]
+    filter_, model = choice.filter(problem), task.model(choice, index)
+    blind = data._replace(measurements=np.where(hidden[..., None], np.nan, data.measurements))
+    totals, counts, first = 0.0, 0, 0
+    for part, estimates in estimates_in_parts(filter_, blind):
+        last = first + len(part.seeds)
+        _, expected = predicted(model, estimates.means, part.seen.inputs)
+        z = part.late_scored(data.measurements[first:last])
+        left = difference(z, expected[:, data.late], model.shape.measurement_angles)
+        left = np.where(hidden[first:last, data.late, None], left, np.nan)
+        totals = totals + np.nansum(left**2, axis=(0, 1))
+        counts = counts + (~np.isnan(left)).sum(axis=(0, 1))
+        first = last
+    return totals / np.maximum(counts, 1)
+
+
 # Methods that ask one of Optuna's samplers for trials, and know of an objective nothing but its values.
-
-
-MOST_TRIALS = 10_000
-SLOWER = 10  # steps from one measurement to the next at the second sample time: 0.1 s and 1 s in the source
 
 
 def sample(sampler: str, objective: str | None = None, slower: int | None = None) -> Callable[[Task], None]:
@@ -168,9 +225,6 @@ def sample(sampler: str, objective: str | None = None, slower: int | None = None
                 task.keep(choice)
 
     return run
-
-
-FORGETTING = 0.995  # of Q and R a step
 
 
 def converged(name: str, numbers: dict[str, float]) -> Callable[[Task], None]:
@@ -229,12 +283,6 @@ vb = converged("vb", {"forgetting_factor": FORGETTING})
 
 
 # Adaptive inflation of an ensemble, after Anderson: from each innovation, and then its mean over all steps.
-
-
-DEVIATION = 0.1  # s at the beginning: how well lambda is known
-LEAST_DEVIATION = 0.02  # below which s does not fall, so that lambda may go on to change
-NEWTON = 8  # steps to the mode
-SETTLED = 0.25  # part of a run whose lambdas do not count
 
 
 def anderson(task: Task) -> None:

@@ -1,6 +1,7 @@
 """What problems of any plant share: the model that filters assume, the rule of thumb, and the parameters.
 
-A problem whose filters also estimate constants of their model: "mismatch+voltage_gain" is one by its name.
+Filters of an `AugmentedProblem` also estimate constants of the model, which its name lists:
+"mismatch+voltage_gain".
 """
 
 from __future__ import annotations
@@ -35,6 +36,14 @@ from tuning.problems.problem import GIVEN, SPREAD, Parameter, Problem
 RANGE_SEEDS = range(8)  # seeds whose runs determine each state's range, unless the model has it
 RANGE_FRACTION = 0.01  # standard deviation of the rule of thumb's Q, as a fraction of each state's range
 MOST_STEPS = 1_000_000
+
+# Constants to estimate, in the name of a problem.
+NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+CONSTANT = re.compile(rf"\+([A-Za-z_]\w*(?::{NUMBER}){{0,3}})$")  # at the end of a name: NAME:STD:WALK:MEAN
+RULE = "a constant to estimate (--augment) must be NAME, NAME:STD, NAME:STD:WALK or NAME:STD:WALK:MEAN"
+# Default belief of a constant: standard deviation of a flow [m/s], of others as a fraction of their value ...
+FLOW_STD, RELATIVE_STD, WALK_PART = 0.5, 0.2, 0.02  # ... and of a step's change, as a fraction of the prior's
+Unknowns = Mapping[str, Unknown | None]
 
 
 class AssumedProblem(Problem):
@@ -299,14 +308,6 @@ def _mapping(name: str, mapping) -> dict | None:
     if mapping is not None and not isinstance(mapping, Mapping):
         raise ValueError(f"{name} must map arguments of the model to values, but got {short_repr(mapping)}")
     return None if mapping is None else dict(mapping)
-
-
-NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-CONSTANT = re.compile(rf"\+([A-Za-z_]\w*(?::{NUMBER}){{0,3}})$")  # at the end of a name: NAME:STD:WALK:MEAN
-RULE = "a constant to estimate (--augment) must be NAME, NAME:STD, NAME:STD:WALK or NAME:STD:WALK:MEAN"
-# Default belief of a constant: standard deviation of a flow [m/s], of others as a fraction of their value ...
-FLOW_STD, RELATIVE_STD, WALK_PART = 0.5, 0.2, 0.02  # ... and of a step's change, as a fraction of the prior's
-Unknowns = Mapping[str, Unknown | None]
 
 
 def default_belief(name: str, value: float) -> Unknown:

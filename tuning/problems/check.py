@@ -1,4 +1,4 @@
-"""Checks of a problem: its model and its data have to agree in shapes, names and units."""
+"""Checks of a problem, whose model and data must agree in shapes, names and units, and its stored bound."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""`Data`: inputs and measurements of many runs and, where they are known, true states and outputs.
+"""`Data`: inputs and measurements of many runs and, if they are known, true states and outputs.
 
-The seeds of a study: for training, validation, the choice of the ensemble size, and held-out evaluation.
+In order: `Data`, a filter's estimates on it, part by part, and the seeds of a study for training, validation, the
+choice of the ensemble size, and held-out evaluation.
 """
 
 from __future__ import annotations
@@ -19,6 +20,11 @@ from thruster_env.core.threads import cores
 from thruster_env.model.shape import LANES
 
 FIRST_SCORED_STEP = 50  # RMSE is of steps 50 to 500; the start-up is reported separately
+MOST_BYTES = 2**28  # of a part's estimates: a run of 1000 steps with forty states and channels takes 26 MB
+MOST_SEEDS = 20_000  # runs of 500 steps with so many seeds take a gigabyte
+SEEDS_APART = 1_000_000  # training seeds of study seed s start at s times this, held-out seeds half-way on ...
+SIZES_FROM = SEEDS_APART // 4  # ... those that choose the ensemble size in between ...
+VALIDATION_FROM = 3 * SEEDS_APART // 4  # ... and those on which the best trials meet the baselines behind
 
 
 class Data(NamedTuple):
@@ -212,9 +218,6 @@ def only(counted: np.ndarray | None, known: Any) -> np.ndarray | None:
 # Estimates of many runs, in parts: the covariances of all steps of a large model need much memory.
 
 
-MOST_BYTES = 2**28  # of a part's estimates: a run of 1000 steps with forty states and channels takes 26 MB
-
-
 def estimates_in_parts(filter_: Filter, data: Data) -> Iterator[tuple[Data, Estimates]]:
     """Run a filter on parts of the runs, in order; yield the data of each part and the estimates on them.
 
@@ -263,12 +266,6 @@ def parts_of(filter_: Filter, data: Data) -> list[tuple[int, int]]:
     size = max(MOST_BYTES // a_run, cores())
     size = size // LANES * LANES or size  # filters without an ensemble run so many side by side
     return [(first, min(first + size, count)) for first in range(0, count, size)]
-
-
-MOST_SEEDS = 20_000  # runs of 500 steps with so many seeds take a gigabyte
-SEEDS_APART = 1_000_000  # training seeds of study seed s start at s times this, held-out seeds half-way on ...
-SIZES_FROM = SEEDS_APART // 4  # ... those that choose the ensemble size in between ...
-VALIDATION_FROM = 3 * SEEDS_APART // 4  # ... and those on which the best trials meet the baselines behind
 
 
 def training_seeds(seed: int, count: int) -> range:

@@ -61,6 +61,8 @@ DESCRIPTORS = (
     types.MethodDescriptorType,
     types.ClassMethodDescriptorType,
 )
+LENGTH = 12  # of the hexadecimal digits of a SHA-256 that are kept
+PLAIN = bool | int | float | complex | str | bytes
 
 
 def of_function(function: types.FunctionType, of: Of) -> Iterator[str]:
@@ -250,10 +252,6 @@ def _policy_of(value: Any) -> Any:
     named = any(kind.__name__ == "BaseAlgorithm" for kind in type(value).__mro__)
     policy = getattr(value, "policy", None) if named else None
     return policy if isinstance(policy, torch.nn.Module) else None
-
-
-LENGTH = 12  # of the hexadecimal digits of a SHA-256 that are kept
-PLAIN = bool | int | float | complex | str | bytes
 
 
 def digest_of(*values: Any) -> str:

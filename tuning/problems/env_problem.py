@@ -41,6 +41,12 @@ from tuning.problems.problem import Parameter
 if TYPE_CHECKING:
     pass
 
+Policy = str | Mapping | Excitation | Callable
+RANDOM = "random"
+LARGEST = 1e3  # random action, where the action space has no limit
+SCALE_SEEDS = range(16)  # seeds whose true states' standard deviation is the scale, where none is given
+DIFFERENCE = 1e-6  # of two runs of a seed, as part of the largest number: threads leave less
+
 
 class Episodes(gym.Wrapper):
     """An env that offers filters a problem's model; the first episode of a seed has the measurements of its data.
@@ -106,11 +112,6 @@ def measurement_noise(keys: np.ndarray, steps: np.ndarray, cov: np.ndarray) -> n
 
 
 # Policies of an `EnvProblem`: functions of the observation that choose the same actions for the same seed.
-
-
-Policy = str | Mapping | Excitation | Callable
-RANDOM = "random"
-LARGEST = 1e3  # random action, where the action space has no limit
 
 
 def checked_policy(policy: Policy) -> str | Excitation | Callable:
@@ -181,10 +182,6 @@ def _names(function: Callable) -> set[str]:
         return set(inspect.signature(function).parameters)
     except (TypeError, ValueError):
         return set()
-
-
-SCALE_SEEDS = range(16)  # seeds whose true states' standard deviation is the scale, where none is given
-DIFFERENCE = 1e-6  # of two runs of a seed, as part of the largest number: threads leave less
 
 
 class EnvProblem(AssumedProblem):

@@ -1,7 +1,4 @@
-"""Problems by name, by file or by `module:object`.
-
-A wrong TOML file of a scenario is a clear error of one line.
-"""
+"""Problems by name, by file or by `module:object`; an error in a scenario's TOML file is reported in one line."""
 
 from __future__ import annotations
 

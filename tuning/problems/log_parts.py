@@ -1,4 +1,4 @@
-"""The rows of logs for training, for the choice of the ensemble size, and for held-out evaluation."""
+"""The blocks of logs for training, for the choice of the ensemble size, and for held-out evaluation."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`ModelProblem`: a plant that is itself a model, and the model that filters assume for it.
-
-`RunsProblem`: a list of runs of your own, of any lengths, for filters that assume a model.
-"""
+"""Problems of a model: `ModelProblem` draws runs from one, `RunsProblem` takes your own runs, of any lengths."""
 
 from __future__ import annotations
 
@@ -34,6 +31,7 @@ from tuning.problems.problem import BOUND, OPEN_LOOP, Parameter
 
 SCALE_SEEDS = range(200)  # seeds of the inputs for which the scale is the bound, where none is given
 Inputs = np.ndarray | Sequence | Mapping | Excitation | Callable | None
+PARTS = ("inputs", "measurements", "states")
 
 
 class ModelProblem(AssumedProblem):
@@ -247,9 +245,6 @@ def _checked_inputs(inputs: Inputs, count: int) -> np.ndarray | Excitation | Cal
         rule = f"inputs must be finite numbers (K, {count}), an excitation, or a function of (seeds, steps)"
         raise ValueError(f"{rule}, but got {short_repr(inputs)}") from None
     return array
-
-
-PARTS = ("inputs", "measurements", "states")
 
 
 class RunsProblem(LogProblem):

@@ -1,6 +1,6 @@
-"""`Problem`: the interface between a plant and studies, evaluations and reports.
+"""`Problem`, the interface between a plant and studies, evaluations and reports.
 
-`Parameter`: one number that a study may choose, with its range, its unit and its place in a choice.
+A `Parameter` is one number that a study may choose, with its range, its unit and its place in a choice.
 """
 
 from __future__ import annotations
@@ -23,6 +23,13 @@ from thruster_env.model.quantities import Quantities
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems import data as seeds
 from tuning.problems.data import Data, runs_of
+
+PART = 0.1  # fraction of its range that is the unit of a parameter on a linear scale
+BOUND = "the posterior Cramér-Rao bound"  # what a scale is, in words
+PATH_BOUND = "the bound along noise-free paths"
+OPEN_LOOP = "the RMSE of the open loop"
+SPREAD = "the standard deviation of the true states"
+GIVEN = "the scale given with the problem"
 
 
 class Place(Protocol):
@@ -145,9 +152,6 @@ def squared(unit: str) -> str:
 # Scaled coordinates of free parameters: logarithms of positive parameters, fractions of the range of others.
 
 
-PART = 0.1  # fraction of its range that is the unit of a parameter on a linear scale
-
-
 class Coordinates:
     """Map values of p parameters to coordinates (p,) and back; one unit is a sensible change of each parameter.
 
@@ -214,13 +218,6 @@ class Coordinates:
                 )
             values.append(value)
         return self.of(values)
-
-
-BOUND = "the posterior Cramér-Rao bound"  # what a scale is, in words
-PATH_BOUND = "the bound along noise-free paths"
-OPEN_LOOP = "the RMSE of the open loop"
-SPREAD = "the standard deviation of the true states"
-GIVEN = "the scale given with the problem"
 
 
 class Problem(ABC):

@@ -22,6 +22,7 @@ from tuning.problems.problem import Problem
 
 
 DEEPEST = 10  # levels of mappings and lists
+MOST_STEPS = 1_000_000
 
 
 def frozen(value, depth: int = 0):
@@ -38,9 +39,6 @@ def plain(value):
     if isinstance(value, Mapping):
         return {key: plain(part) for key, part in value.items()}
     return [plain(part) for part in value] if isinstance(value, list | tuple) else value
-
-
-MOST_STEPS = 1_000_000
 
 
 @dataclass(frozen=True, kw_only=True)

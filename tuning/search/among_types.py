@@ -1,10 +1,8 @@
-"""The race of a study over several filter types: the first trials of each, and which type has the next one.
+"""The trials that a study enqueues, and the race among its filter types.
 
-NIS is the normalised innovation squared.
-
-Trials enqueued after a finished trial: a sampler would find them only late and by chance.
-
-The Q and R to which gradients lead, as parameters of a trial.
+A sampler would find these trials only late and by chance. In order: Q and R by gradients, the race with the first
+trials of each type, the results of each type, the trials that follow from a finished one, and the ensemble size of
+the study's choice.
 """
 
 from __future__ import annotations
@@ -33,13 +31,34 @@ from tuning.search.samplers import is_local, near
 from tuning.search.space import FILTER_TYPE, Choice, ends_of, trial_parameters, untuned_choice, within_ranges
 from tuning.search.trials import COST, NIS, best_trial, enqueue_new, is_consistent, is_near, is_over_budget
 
-# Attributes of studies and trials, which stay as they were first written.
+# Attributes of studies and trials, whose texts must not change: they are in journals and databases.
 MAXIMUM_LIKELIHOOD = "likeliest noise"  # Q and R have maximum likelihood; of a study what they are
 BY_GRADIENT = "gradient of"  # the objective on the true states, of which Q and R are the minimum; of a study they
+UNTUNED = "untuned"  # the filter whose parameters before any tuning these are
+ESTIMATED_Q = "estimated Q of"  # the filter that has the Q of noise estimation, and the R of the data sheet
+ESTIMATED = "estimated noise of"  # the filter that has both from noise estimation
+SMALLER = "smaller ensemble of"  # number of the trial that was over the budget
+TRANSFERRED = "noise of"  # number of the trial of another filter type that Q and R are from
+NEAR_BEST = "near"  # number of the best trial, of which this one is a variation
+RESCALED = "consistent twin"  # how often the trial's Q and R have been rescaled
+BASELINE = "baseline"  # the name of the baseline that the trial is
+SIZES = "ensemble sizes"  # attribute of a study: their table, with its digest
+
+# Of Q and R by gradients.
 MOST_FOR_STARTS = 8  # parameters, of which an ascent has more than one start
 MOST_STATES = 8  # of a model, in which filters but the linear and the extended one follow their own gradients
 MOST_FOR_ALL = 24  # parameters, of which an ascent has all runs
 MAXIMUM_LIKELIHOOD_RUNS = 8  # of a model with many states or parameters, and to compare starts: they tell enough
+
+# Of the race.
+REMAINING = 3  # of so many filter types in a round of the race one goes on to the next ...
+MORE = 2  # ... in which it has so many times as many new trials
+INCONSISTENT = 0.05  # part of its objective by which a trial outside the NIS band counts as worse in the race
+ROOM = 0.9  # part of the budget that a smaller ensemble may take
+
+# Of trials that follow from finished ones.
+MOST_RESCALINGS = 2  # nonlinear filters may need a second one
+MAXIMUM_LIKELIHOOD_AFTER = 20  # trials, after which the likeliest noise is tried with all else of the best one
 
 
 def noise_by_gradient(study: optuna.Study, plan: Plan, objective: str = LIKELIHOOD) -> dict[str, float] | None:
@@ -79,19 +98,6 @@ def _best_start(goal: Goal) -> np.ndarray:
         return start_at(goal, [1.0] * len(free))
     best = max((optimum(few, start_at(goal, start)) for start in starts_of(free)), key=lambda ascent: ascent.value)
     return goal.coordinates.of(best.parameters)
-
-
-# Attributes of trials. Their texts are in journals and databases, so they stay as they were first written.
-UNTUNED = "untuned"  # the filter whose parameters before any tuning these are
-ESTIMATED_Q = "estimated Q of"  # the filter that has the Q of noise estimation, and the R of the data sheet
-ESTIMATED = "estimated noise of"  # the filter that has both from noise estimation
-SMALLER = "smaller ensemble of"  # number of the trial that was over the budget
-TRANSFERRED = "noise of"  # number of the trial of another filter type that Q and R are from
-REMAINING = 3  # of so many filter types in a round of the race one goes on to the next ...
-MORE = 2  # ... in which it has so many times as many new trials
-INCONSISTENT = 0.05  # part of its objective by which a trial outside the NIS band counts as worse in the race
-NEAR_BEST = "near"  # number of the best trial, of which this one is a variation
-ROOM = 0.9  # part of the budget that a smaller ensemble may take
 
 
 def enqueue_next_type(study: optuna.Study, plan: Plan) -> None:
@@ -344,13 +350,6 @@ def _row(name: str, trials: list[FrozenTrial]) -> TypeResult:
     )
 
 
-# Attributes of trials. Their texts are in journals and databases, so they stay as they were first written.
-RESCALED = "consistent twin"  # how often the trial's Q and R have been rescaled
-BASELINE = "baseline"  # the name of the baseline that the trial is
-MOST_RESCALINGS = 2  # nonlinear filters may need a second one
-MAXIMUM_LIKELIHOOD_AFTER = 20  # trials, after which the likeliest noise is tried with all else of the best one
-
-
 def enqueue_what_is_left(study: optuna.Study, plan: Plan) -> None:
     """Enqueue what an interrupted study still lacks: the rescaled last trial, and the next filter type."""
     finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
@@ -457,9 +456,6 @@ def _enqueue_minimum(study: optuna.Study, plan: Plan, start: dict) -> None:
 
 
 # The ensemble size of a study's choice, from a table stored in the study.
-
-
-SIZES = "ensemble sizes"  # attribute of a study: their table, with its digest
 
 
 def sizes_of(

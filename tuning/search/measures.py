@@ -1,7 +1,4 @@
-"""Filters on validation seeds: an objective with each run left out once and of each run, for paired comparisons.
-
-NIS is the normalised innovation squared.
-"""
+"""Filters on validation seeds: an objective of each run, and with each run left out, for paired comparisons."""
 
 from __future__ import annotations
 

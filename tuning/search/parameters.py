@@ -24,6 +24,8 @@ FACTORS = (1e-10, 1e4)  # range of each variance of Q and R, as factors on that 
 Q_FIRST, R_FIRST = (1e-5, 1e2), (1e-2, 1e3)  # the part of it in which a search begins
 CORRELATIONS = (-0.99, 0.99)  # range of each correlation in a full Q or R
 PRIOR_FACTORS = (1e-4, 1e2)  # range of P_0, as a factor on the covariance of the plant's initial state
+PRIOR = Argument(PRIOR_FACTOR, is_variance=True)
+SIZE_LADDER = (5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200, 300, 500, 700, 1000, 1400, 2000, 3000, 5000)
 
 
 @dataclass(frozen=True)
@@ -84,9 +86,6 @@ class MeasurementVariance:
     def set(self, choice, value):
         """The choice with another variance."""
         return _with_variance(choice, R, self.index, value)
-
-
-PRIOR = Argument(PRIOR_FACTOR, is_variance=True)
 
 
 def has_process_noise(problem: Problem) -> bool:
@@ -239,9 +238,6 @@ def _replaced(values: Sequence[float], index: int, value: float) -> tuple[float,
 
 
 # The parameters of filters besides their model that a study may choose: ranges and untuned values.
-
-
-SIZE_LADDER = (5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200, 300, 500, 700, 1000, 1400, 2000, 3000, 5000)
 
 
 class Sizes(NamedTuple):

@@ -1,8 +1,6 @@
-"""`Plan`: the definition of a study. Two studies with the same plan are the same study.
+"""`Plan`, the definition of a study: two studies with the same plan are the same study.
 
-NIS is the normalised innovation squared.
-
-The ranges of a study's parameters in words, and parameters at an end of their range.
+It also states the ranges of its parameters in words, and warns of parameters that ended at an end of their range.
 """
 
 from __future__ import annotations
@@ -42,6 +40,9 @@ TRAINING_SEEDS = 32
 HELD_OUT_SEEDS = 200
 VALIDATION_SEEDS = 100  # on which the best trials meet the baselines
 SIZE_SEEDS = 100  # enough to distinguish an ensemble that is 1 % worse than the best, as N = 30 from N = 50
+MOST_OPTIONS = 3  # in a sentence
+WIDER = 1e4  # factor by which a range is widened, on the advice of a report
+NEAR_END = 0.01  # of a range, on its scale: what ends so near to an end has ended there
 
 
 class Plan(NamedTuple):
@@ -268,11 +269,6 @@ class Plan(NamedTuple):
     def size_data(self) -> list[Data]:
         """Data that choose the ensemble size once Q and R are chosen, one for each scenario."""
         return [data_of(problem, problem.size_seeds(self.seed, SIZE_SEEDS)) for problem in self.scenarios]
-
-
-MOST_OPTIONS = 3  # in a sentence
-WIDER = 1e4  # factor by which a range is widened, on the advice of a report
-NEAR_END = 0.01  # of a range, on its scale: what ends so near to an end has ended there
 
 
 def model_ranges(plan: Plan) -> dict[str, Parameter]:

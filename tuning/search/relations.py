@@ -29,6 +29,7 @@ FORM = re.compile(
     rf"|(?P<equal>[^\W\d]\w*))\s*"
 )
 RULE = "a relation must be NAME = [FACTOR] NAME, NAME = VALUE or NAME = LOW..HIGH"
+ROUNDING = 1e-12  # of correlations: what is below is nothing
 
 
 class Relation(NamedTuple):
@@ -120,9 +121,6 @@ def obeying(choice, parameters: Sequence[Parameter]):
 
 
 # A full covariance matrix from variances and correlations, which may be chosen independently of one another.
-
-
-ROUNDING = 1e-12  # of correlations: what is below is nothing
 
 
 def full_covariance(variances: Sequence[float], correlations: Sequence[float]) -> np.ndarray:

@@ -1,6 +1,7 @@
-"""Optuna's samplers by name.
+"""Optuna's samplers by name, for ranges so wide that they contain any truth and mostly implausible values.
 
-Ranges are so wide that no truth lies outside, and most of their values are implausible.
+They draw Q and R within a box about the best trial, and every second trial of the default sampler is near that
+trial. The state of CMA-ES, a pickle in the study, is read safely.
 """
 
 from __future__ import annotations
@@ -29,6 +30,24 @@ from tuning.search.trials import best_trial
 
 
 MARGIN = 10.0  # factor by which the box reaches beyond the best trial
+SAMPLERS = {
+    "tpe": "tree-structured Parzen estimator, all parameters together; good from some ten trials on",
+    "gp": "Gaussian process; the fewest trials, but 0.1 to 0.4 s for each proposal (needs torch)",
+    "cma-es": "covariance matrix adaptation; good for many trials of a smooth error (needs cmaes)",
+    "nsga-ii": "genetic, made for two objectives",
+    "random": "independent draws, which every other sampler should beat",
+    "grid": "every combination of some values of each parameter, in random order",
+}
+WITHOUT_FILTER_TYPES = ("cma-es", "grid")  # cannot choose among filter types with parameters of their own
+GRID_VALUES = 5  # of each parameter
+NOTHING: Mapping = MappingProxyType({})
+NEEDS = {"gp": ("torch", "rl"), "cma-es": ("cmaes", "samplers")}
+
+# Of a trial near the best one.
+LARGEST = 0.1  # step over the width of a linear range; over a decade of a logarithmic one it is ten times this ...
+DECADES = 1.5  # ... and the smallest step is so many powers of ten below
+MOVED = 0.5  # probability that a number is moved
+_OPTIMIZERS = ("CMA", "SepCMA", "CMAwM")
 
 
 def box(
@@ -96,7 +115,6 @@ class RandomInBox(InBox, optuna.samplers.RandomSampler):
 
 
 # The classes in the state of an optimizer of `cmaes`. Any pickle may name any function of any module, and call it.
-_OPTIMIZERS = ("CMA", "SepCMA", "CMAwM")
 _ARRAYS = {("numpy", "ndarray"), ("numpy", "dtype")} | {
     (f"numpy.{core}.{module}", name)
     for core in ("_core", "core")  # of NumPy 2 and 1
@@ -138,20 +156,6 @@ class _Unpickler(pickle.Unpickler):
         if (module, name) in _ARRAYS or (module.partition(".")[0] == "cmaes" and name in _OPTIMIZERS):
             return super().find_class(module, name)
         raise ValueError(f"the state of CMA-ES must be that of an optimizer, but a trial's names {module}.{name}")
-
-
-SAMPLERS = {
-    "tpe": "tree-structured Parzen estimator, all parameters together; good from some ten trials on",
-    "gp": "Gaussian process; the fewest trials, but 0.1 to 0.4 s for each proposal (needs torch)",
-    "cma-es": "covariance matrix adaptation; good for many trials of a smooth error (needs cmaes)",
-    "nsga-ii": "genetic, made for two objectives",
-    "random": "independent draws, which every other sampler should beat",
-    "grid": "every combination of some values of each parameter, in random order",
-}
-WITHOUT_FILTER_TYPES = ("cma-es", "grid")  # cannot choose among filter types with parameters of their own
-GRID_VALUES = 5  # of each parameter
-NOTHING: Mapping = MappingProxyType({})
-NEEDS = {"gp": ("torch", "rl"), "cma-es": ("cmaes", "samplers")}
 
 
 def make_sampler(
@@ -234,11 +238,6 @@ def _grid(distribution: BaseDistribution) -> list:
 
 
 # Every second trial of the default sampler is near the best one, so that wide ranges do not slow the search.
-
-
-LARGEST = 0.1  # step over the width of a linear range; over a decade of a logarithmic one it is ten times this ...
-DECADES = 1.5  # ... and the smallest step is so many powers of ten below
-MOVED = 0.5  # probability that a number is moved
 
 
 def is_local(plan: Plan, number: int) -> bool:

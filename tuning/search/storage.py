@@ -1,8 +1,6 @@
-"""Where studies live: a journal file by default, made safe to resume; a database for several machines.
+"""Where studies are stored: a journal file by default, which is safe to resume; a database for several machines.
 
-Only a study in a database loads SQLAlchemy, which takes a tenth of a second.
-
-Suppress Optuna's messages in programs that show their own progress.
+In order: URLs in messages, databases, journal files, running trials.
 """
 
 from __future__ import annotations
@@ -34,15 +32,34 @@ from sqlalchemy.exc import DBAPIError, OperationalError
 
 from thruster_env.core.checks import short_repr
 
-# The parts of a storage's URL that may be shown: scheme, host and database, not user, password or options.
-
-
+# Of URLs, of which messages contain scheme, host and database, but not user, password or options.
 HIDDEN = "***"
 DATABASES = ("postgresql", "postgres", "mysql", "mariadb", "sqlite", "oracle", "mssql", "redis", "grpc")
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*")
 _ADDRESS = re.compile(r"(?P<host>[\w.-]*|\[[0-9A-Fa-f:.]+\])(?P<port>:\d+)?(?P<database>/[^:@]*)?", re.ASCII)
 _MARKS = re.compile(r"[:/@?#&=;,\s]+")
 _MISSPELT = re.compile(rf"({'|'.join(DATABASES)})(\+\w+)?:(?!//)", re.IGNORECASE)
+
+# Of databases.
+DRIVER = "pip install '.[db]' in the project's folder, and postgresql+psycopg2:// in the URL"
+TABLE_TRIES = 5  # to make the tables of a database, or to find them made
+PATIENCE_SECONDS = 60  # for which a database may be away
+CONNECT_SECONDS = 10  # timeout of a connection, for drivers that have one
+WITH_TIMEOUT = re.compile(r"(postgresql(\+psycopg2?)?|(mysql|mariadb)(\+(pymysql|mysqldb))?)://")
+HEARTBEAT_SECONDS = 10  # between two signs of life of a running trial in a database
+GRACE_SECONDS = 180  # without one, after which it counts as lost; an outage is shorter
+PROXY_PORT, PROXY_SECONDS = 13000, 10  # the default port of a proxy, and the time in which it has to answer
+MARK = "made by call"  # system attribute of a trial, by which a repeated call finds what the first one made
+OnLost = Callable[[optuna.Study, FrozenTrial], Any]  # of a module: storages are pickled
+
+# Of journal files.
+INTERMEDIATE = "intermediate_value"  # key of an entry of Optuna's with the value of a seed
+BEGINNING = b'{"op_code":'  # of each entry of a journal
+
+# Of locks and running trials.
+LOCK_SECONDS = 5  # after which a lock counts as left behind
+SIGNATURE_SECONDS = 2 * LOCK_SECONDS  # by which a living process has signed its trial
+PROCESS, RETRY_OF = "process", "retry_of"  # trial attributes: who runs it, and which one it repeats
 
 
 def public_url(storage: str) -> str:
@@ -107,17 +124,6 @@ def first_line(error: BaseException) -> str:
 
 
 # Databases as storages of studies, tolerant of outages, and their proxy.
-
-
-TABLE_TRIES = 5  # to make the tables of a database, or to find them made
-PATIENCE_SECONDS = 60  # for which a database may be away
-CONNECT_SECONDS = 10  # timeout of a connection, for drivers that have one
-WITH_TIMEOUT = re.compile(r"(postgresql(\+psycopg2?)?|(mysql|mariadb)(\+(pymysql|mysqldb))?)://")
-HEARTBEAT_SECONDS = 10  # between two signs of life of a running trial in a database
-GRACE_SECONDS = 180  # without one, after which it counts as lost; an outage is shorter
-PROXY_PORT, PROXY_SECONDS = 13000, 10  # the default port of a proxy, and the time in which it has to answer
-MARK = "made by call"  # system attribute of a trial, by which a repeated call finds what the first one made
-OnLost = Callable[[optuna.Study, FrozenTrial], Any]  # of a module: storages are pickled
 
 
 def open_database(url: str, on_lost: OnLost) -> BaseStorage:
@@ -278,10 +284,6 @@ class _PatientStorage(_CachedStorage):
 # A study's journal file, whose lines stay complete after a full disk, a killed process or an interrupt.
 
 
-INTERMEDIATE = "intermediate_value"  # key of an entry of Optuna's with the value of a seed
-BEGINNING = b'{"op_code":'  # of each entry of a journal
-
-
 class Journal(JournalStorage):
     """Optuna's journal storage, which reports a trial ended by another process as an error once."""
 
@@ -385,15 +387,6 @@ def cut_unfinished_line(path: Path) -> None:
         warnings.warn(f"{path}: cut off its last line, which a process left unfinished", stacklevel=4)
         with path.open("r+b") as stream:
             stream.truncate(len(content) - len(line))
-
-
-DRIVER = "pip install '.[db]' in the project's folder, and postgresql+psycopg2:// in the URL"
-LOCK_SECONDS = 5  # after which a lock counts as left behind
-SIGNATURE_SECONDS = 2 * LOCK_SECONDS  # by which a living process has signed its trial
-PROCESS, RETRY_OF = (
-    "process",
-    "retry_of",
-)  # trial attributes: who runs it, and which one it repeats
 
 
 def open_storage(storage: Any) -> BaseStorage:

@@ -1,8 +1,6 @@
 """Optuna studies of a filter's parameters, with common random numbers for all trials.
 
-NIS is the normalised innovation squared.
-
-Ctrl-C during long work: the first one asks for an end, the second one forces it.
+The first Ctrl-C ends a study after the running trial, the second one at once.
 """
 
 from __future__ import annotations
@@ -38,6 +36,10 @@ from tuning.search.trials import COST, best_trial, cost_of, is_consistent, make_
 from tuning.search.validation import Validation, as_data, finalists_of, validate
 
 STOPPING = "stopping after the running task; Ctrl-C again stops at once"
+FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+BEST = "best trial under the constraints"  # attribute of a study, for programs that ignore constraints
+CHOSEN = "choice at the end"  # attribute of a study: how the best trials met the baselines, and its trials then
+OnTrial = Callable[[optuna.Study, int], None]
 
 
 @contextmanager
@@ -79,12 +81,6 @@ def without_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
-BEST = "best trial under the constraints"  # attribute of a study, for programs that ignore constraints
-CHOSEN = "choice at the end"  # attribute of a study: how the best trials met the baselines, and its trials then
-OnTrial = Callable[[optuna.Study, int], None]
 
 
 def quiet_optuna() -> None:

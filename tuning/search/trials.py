@@ -1,9 +1,7 @@
 """One trial of a study: the same seeds for all trials, in blocks, and pruning.
 
-NEES is the normalised estimation error squared, NIS the normalised innovation squared.
-
-Which trials are pruned: those that are significantly worse than the best one on the seeds so far. The cost of
-a step of a filter, measured so that filters can be compared with a budget.
+In order: the pruner, which ends trials that are significantly worse than the best one; the cost of a filter's step
+against a budget; the run of a trial; its outcome.
 """
 
 from __future__ import annotations
@@ -43,6 +41,14 @@ from tuning.search.space import Choice, suggest
 BLOCK = 8  # seeds between two decisions whether to prune
 P_THRESHOLD = 0.1  # p-value of Wilcoxon's signed-rank test below which a trial is pruned
 MOST_EXACT = 50  # differences for which Optuna's test is the exact one
+RUNS, STEPS = 32, 200  # of each timed call
+FEWEST, MOST = 3, 15  # timed calls, of which the median is taken ...
+ENOUGH_SECONDS = 0.1  # ... and which end early after this time
+BUDGET = "cost a step over the budget"  # name of the constraint; at most zero within
+COST = "microseconds a step"  # trial attribute
+CONSISTENCY = "mean NIS outside its band"  # name of the constraint; at most zero is inside
+NIS = "mean NIS over the number of channels"
+NEAR = 2e-5  # relative difference of parameters, above which trials are certainly not equal
 
 
 class PairedPruner(optuna.pruners.WilcoxonPruner):
@@ -110,13 +116,6 @@ def _mean(values: dict[int, float]) -> float:
     return sum(values.values()) / len(values)
 
 
-RUNS, STEPS = 32, 200  # of each timed call
-FEWEST, MOST = 3, 15  # timed calls, of which the median is taken ...
-ENOUGH_SECONDS = 0.1  # ... and which end early after this time
-BUDGET = "cost a step over the budget"  # name of the constraint; at most zero within
-COST = "microseconds a step"  # trial attribute
-
-
 def microseconds_a_step(filter_: Filter, data: Data) -> float:
     """Time of one core for a step of one run [us/step]: the median of several calls over a batch.
 
@@ -141,10 +140,6 @@ def _part(data: Data, runs: int, steps: int) -> tuple[np.ndarray, ...]:
 def over_budget(microseconds: float, budget: float) -> float:
     """Logarithm of the cost over the budget; at most zero within the budget, as Optuna expects it."""
     return math.log(microseconds / budget)
-
-
-CONSISTENCY = "mean NIS outside its band"  # name of the constraint; at most zero is inside
-NIS = "mean NIS over the number of channels"
 
 
 def make_pruner(plan: Plan) -> optuna.pruners.BasePruner:
@@ -286,9 +281,6 @@ def is_over_budget(trial: FrozenTrial) -> bool:
 
 
 # Trials that are enqueued unless there is one with the same parameters.
-
-
-NEAR = 2e-5  # relative difference of parameters, above which trials are certainly not equal
 
 
 def enqueue_new(study: optuna.Study, parameters: dict, attributes: dict) -> None:

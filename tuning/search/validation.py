@@ -1,7 +1,4 @@
-"""The choice at the end of a study: the best trials and the baselines meet on validation seeds.
-
-NIS is the normalised innovation squared.
-"""
+"""The choice at the end of a study: the best trials and the baselines meet on validation seeds."""
 
 from __future__ import annotations
 

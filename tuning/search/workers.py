@@ -42,6 +42,9 @@ from tuning.search.study import (
     without_interrupts,
 )
 
+MODULE = "tuning.search.workers"
+POLL_SECONDS = 0.2
+
 # Processes beside this one that work for a study: started, told its plan in a line of JSON, and ended.
 
 
@@ -125,10 +128,6 @@ def read_orders() -> dict[str, Any]:
 def parent_says_stop() -> bool:
     """Whether the parent of this process has closed its standard input, or has ended."""
     return bool(select.select([sys.stdin], [], [], 0)[0])
-
-
-MODULE = "tuning.search.workers"
-POLL_SECONDS = 0.2
 
 
 def run_in_workers(

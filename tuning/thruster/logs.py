@@ -1,7 +1,4 @@
-"""Logs of a thruster with its model, and scenarios of another thruster than the default one.
-
-The parameters of a thruster that may be free in `thruster identify`, and the model for their values.
-"""
+"""Logs of a thruster: the plant of a preset, and `ThrusterFamily`, a model of free parameters to identify."""
 
 from __future__ import annotations
 
@@ -28,6 +25,17 @@ from tuning.search.parameters import r_name
 
 DEFAULT_PRESET = "tunnel"
 FREE = ("motor_damping", "voltage_gain", "lift_coefficient")  # free parameters by default
+FACTOR = 10.0  # range of a positive parameter about its start
+NOISE_FACTOR = 1e4  # range of a variance about its start
+LINEAR = {"blade_angle": (0.05, 1.5), "thrust_asymmetry": (-0.5, 0.5)}
+FASTEST_FLOW = 2.0  # [m/s], ambient
+DEAD_PART = 0.25  # largest dead band, as a fraction of the largest voltage
+DEAD_START = 0.02
+BIAS_PART = 0.25  # largest bias, as a fraction of the channel's largest magnitude
+LONGEST_LAG = 100.0  # in sample times
+LAG_START = 3.0
+OFFSETS = 10.0  # largest clock offset, in sample times, but at least
+LEAST_OFFSET = 0.1  # [s]
 
 
 class Preset(ModelledThruster):
@@ -183,17 +191,6 @@ UNITS = {
     "blade_angle": "rad",
     "thrust_asymmetry": "",
 }  # of the thruster's own parameters
-FACTOR = 10.0  # range of a positive parameter about its start
-NOISE_FACTOR = 1e4  # range of a variance about its start
-LINEAR = {"blade_angle": (0.05, 1.5), "thrust_asymmetry": (-0.5, 0.5)}
-FASTEST_FLOW = 2.0  # [m/s], ambient
-DEAD_PART = 0.25  # largest dead band, as a fraction of the largest voltage
-DEAD_START = 0.02
-BIAS_PART = 0.25  # largest bias, as a fraction of the channel's largest magnitude
-LONGEST_LAG = 100.0  # in sample times
-LAG_START = 3.0
-OFFSETS = 10.0  # largest clock offset, in sample times, but at least
-LEAST_OFFSET = 0.1  # [s]
 
 
 class ThrusterFamily:

@@ -1,10 +1,10 @@
-"""`Scenario`: a named, seeded, immutable recipe that makes truth, inputs and measurements once for all filters.
+"""The thruster's scenarios: `Scenario`, a named, seeded and immutable recipe, and the built-in ones.
 
-The scenarios that come with the package, by name.
+A scenario makes truth, inputs and measurements once for all filters.
 
     python -m tuning.thruster.scenario [NAME ...]
 
-recomputes their scales and prints them.
+recomputes the scales and prints them.
 """
 
 from __future__ import annotations
@@ -50,6 +50,12 @@ from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, Exci
 from tuning.problems.find import find_in
 from tuning.problems.problem import BOUND, GIVEN, OPEN_LOOP
 from tuning.problems.scenario import BaseScenario, plain
+
+UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
+SEQUENCES = 1200  # voltage sequences for a stored scale
+ROUNDING = 1e-6  # of the untuned noise: anything below is rounding
+PARTS = (0.5, 1.0)  # of the largest voltage, where stability is checked: at rest the quadratic drag vanishes
+LINEAR_NOISE: dict[str, Any] = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5, "steps": 100}
 
 # Voltages of the thruster's scenarios: any excitation of one input, and the closed loop that only it has.
 
@@ -114,9 +120,6 @@ class ClosedLoop(Excitation):
             out[:, k] = action[:, 0]
             report = copies.step(out[:, k])
         return out
-
-
-UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -293,11 +296,6 @@ def _range(plant: Plant) -> np.ndarray:
 # The scale of a thruster's scenario: its bound or, where there is none, the error of the open loop.
 
 
-SEQUENCES = 1200  # voltage sequences for a stored scale
-ROUNDING = 1e-6  # of the untuned noise: anything below is rounding
-PARTS = (0.5, 1.0)  # of the largest voltage, where stability is checked: at rest the quadratic drag vanishes
-
-
 def computed_scale(scenario: Scenario, sequences: int = SEQUENCES, truths: int = 100) -> np.ndarray:
     """The scale (2,) of a scenario, over voltage sequences of the seeds 0, 1, 2, ...
 
@@ -346,7 +344,6 @@ def is_stable(plant: Plant) -> bool:
 
 # Bounds from 1200 voltage sequences and 100 truths each, accurate to half a per cent; a test recomputes them.
 NOMINAL_SCALE = (1.0753, 0.0464)
-LINEAR_NOISE: dict[str, Any] = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5, "steps": 100}
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario

@@ -8,9 +8,9 @@ import pytest
 from tests.tuning.methods.problems import P0, A, C, Q, R, at, linear, task_of
 from tuning.evaluation.evaluate import values_of
 from tuning.likelihood.gradient import tune_by_gradient
-from tuning.methods.okf import Factors, _squares
+from tuning.methods.okf import Factors
 from tuning.methods.registry import METHODS, find_method
-from tuning.methods.searches import BACKWARD, FORWARD
+from tuning.methods.searches import BACKWARD, FORWARD, _squares
 from tuning.methods.task import Budget, Task
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 from tuning.thruster.scenario import find_scenario

@@ -26,8 +26,7 @@ from tuning.experiments.methods.problems import (
     Protocol,
 )
 from tuning.experiments.methods.runs import Regret, Result, regrets, within
-from tuning.methods.registry import ALONE, METHODS
-from tuning.methods.scoring import GRADIENT, TRUTH
+from tuning.methods.registry import ALONE, GRADIENT, METHODS, TRUTH
 from tuning.search.objectives import LIKELIHOOD
 
 # Methods that look at no true state; but searches minimise an error where there are true states.
