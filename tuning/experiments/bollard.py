@@ -51,6 +51,9 @@ COLUMNS = ("pwm_us", "rpm", "current_A", "voltage_V", "force_kgf")
 CENTRE, SPAN = 1500.0, 400.0  # pulse width at rest, and from there to full throttle [us]
 SLOWEST = 0.25  # fraction of full speed; slower rows are not used
 STANDARD_GRAVITY = 9.80665  # m/s^2, N in a kgf
+FITTED = ("lift_coefficient", "drag_coefficient", "thrust_asymmetry", "motor_damping", "voltage_gain")
+SMALL_ERROR = 0.02  # relative; larger ones are the model's, and are weighted linearly, not by their square
+DEAD_BAND = 28.0  # half of the dead band [us]; 24 to 40 in the table of the T200
 
 
 class BollardTable(NamedTuple):
@@ -138,11 +141,6 @@ def _fast(table: BollardTable) -> np.ndarray:
                 raise ValueError(f"the propeller must turn {'ahead' if ahead else 'astern'} at {supply:g} V")
             fast |= rows & (table.speed > SLOWEST * full)
     return fast
-
-
-FITTED = ("lift_coefficient", "drag_coefficient", "thrust_asymmetry", "motor_damping", "voltage_gain")
-SMALL_ERROR = 0.02  # relative; larger ones are the model's, and are weighted linearly, not by their square
-DEAD_BAND = 28.0  # half of the dead band [us]; 24 to 40 in the table of the T200
 
 
 class PulseWidthMap(NamedTuple):

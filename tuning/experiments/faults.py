@@ -26,6 +26,7 @@ BIASES = (0.5, 1.0, 2.0, 5.0)  # in standard deviations of the measurement noise
 DRIFT, NOISE, LOST = 0.05, 2.0, 0.8  # deviations a step; factor on the deviation; factor on the thrust
 BETWEEN = 100_000.0  # steps between false alarms
 FIRST_SEED = 7_000  # of runs that nothing else here uses
+LOST_BLADES = f"thrust factor {LOST:g}"
 
 
 class Plant(NamedTuple):
@@ -89,7 +90,6 @@ FAULTS: Mapping[str, Callable[[np.ndarray, float, np.random.Generator], None]] =
     "stuck": stuck,
     "noise doubled": noisy,
 }
-LOST_BLADES = f"thrust factor {LOST:g}"
 
 
 def delays(plant: Plant, runs: int = RUNS, monitor: Monitor | None = None) -> dict[str, Delay]:

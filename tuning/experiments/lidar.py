@@ -3,12 +3,11 @@
     x' = x + v + a/2,   v' = v + a,   z = (r + 2 m n_1)(cos, sin)(theta + 1.5 deg n_2)
 
 A target begins within +-600 m at 30 to 90 m/s; four to six intervals of 5 to 8 steps have each one acceleration,
-N(0, 2^2) along the path and uniform within +-15 across it. Only positions count.
+N(0, 2^2) along the path and uniform within +-15 across it. Only positions count. Our methods are compared with the
+package `Optimized-Kalman-Filter` on equal data; without that package, of the extra `peers`, they run alone.
 
 Source: the example of I. Greenberg, N. Yannay, S. Mannor (2023), "Optimization or architecture: how to hack Kalman
-filtering", NeurIPS, arXiv 2310.00675, in their package Optimized-Kalman-Filter; written anew.
-
-The package is `Optimized-Kalman-Filter` (PyPI), in the extra `peers`; without it the rest is computed.
+filtering", NeurIPS, arXiv 2310.00675, in that package; written anew.
 """
 
 from __future__ import annotations
@@ -39,6 +38,22 @@ ALONG, ACROSS = 2.0, 15.0  # [m/s^2]
 PRIOR = 1000.0  # variance of each state before the first measurement, whose position is taken
 A = np.eye(4) + np.eye(4, k=2)
 C = np.eye(2, 4)
+LEARN, TEST = 700, 300  # runs of a draw
+DRAWS = 3
+FULL = {"full_q": True, "full_r": True}
+OKF, NOISE, GRADIENT = "OKF, default", "noise estimation", "MSE by its gradient"
+IN_A_FIFTH = "the same in a fifth of OKF's time"
+METHODS: Mapping[str, tuple[str, Mapping[str, bool]]] = {  # names of rows, with the method and its options
+    NOISE: ("noise-estimation", FULL),
+    "ours, the method okf": ("okf", FULL),
+    GRADIENT: ("mse", FULL),
+    "-log p(z) by its gradient": ("likelihood", FULL),
+    "EM": ("em", FULL),
+    "log score by its gradient": ("log-score", FULL),
+    "MSE by its gradient, diagonal": ("mse", {}),
+    "log score by its gradient, diagonal": ("log-score", {}),
+}
+RESAMPLES = 2000
 
 
 class Run(NamedTuple):
@@ -108,24 +123,6 @@ def lidar_problem(runs: list[Run], held_out: int) -> RunsProblem:
 
 
 # OKF's lidar: our methods of tuning beside the package that the example is from, in its own filter, on equal data.
-
-
-LEARN, TEST = 700, 300  # runs of a draw
-DRAWS = 3
-FULL = {"full_q": True, "full_r": True}
-OKF, NOISE, GRADIENT = "OKF, default", "noise estimation", "MSE by its gradient"
-IN_A_FIFTH = "the same in a fifth of OKF's time"
-METHODS: Mapping[str, tuple[str, Mapping[str, bool]]] = {  # names of rows, with the method and its options
-    NOISE: ("noise-estimation", FULL),
-    "ours, the method okf": ("okf", FULL),
-    GRADIENT: ("mse", FULL),
-    "-log p(z) by its gradient": ("likelihood", FULL),
-    "EM": ("em", FULL),
-    "log score by its gradient": ("log-score", FULL),
-    "MSE by its gradient, diagonal": ("mse", {}),
-    "log score by its gradient, diagonal": ("log-score", {}),
-}
-RESAMPLES = 2000
 
 
 class Row(NamedTuple):

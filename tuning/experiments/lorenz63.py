@@ -50,6 +50,13 @@ SUBSTEP, SUBSTEPS = 0.01, 25  # an analysis every 0.25
 STEPS, BURN_IN = 1000, 64  # analyses, and those that do not count: the first 16 units of time
 START, START_VARIANCE = (1.509, -1.531, 25.46), 2.0
 R = 2.0
+SETTINGS: dict[str, Any] = {
+    "steps": STEPS,
+    "first_scored_step": BURN_IN + 1,
+    "scale": [1.0] * 3,
+    "dt": SUBSTEP * SUBSTEPS,
+}
+KERNEL = (4.0 / 5.0) ** (1.0 / 7.0)  # our kernel's width over the published one's N^(-1/7), for three states
 
 
 class Constants(NamedTuple):
@@ -109,17 +116,9 @@ def model(inflation: float = 1.0, jitter: float = 0.0) -> StateSpaceModel:
     )
 
 
-SETTINGS: dict[str, Any] = {
-    "steps": STEPS,
-    "first_scored_step": BURN_IN + 1,
-    "scale": [1.0] * 3,
-    "dt": SUBSTEP * SUBSTEPS,
-}
 problem = noise_free_problem(model(), **SETTINGS)
 faded = ModelProblem(model(), model, parameters=[Parameter("inflation", 1.0, 10_000.0)], **SETTINGS)
 jittered = ModelProblem(model(), model, parameters=[Parameter("jitter", 1e-4, 10.0)], **SETTINGS)
-
-KERNEL = (4.0 / 5.0) ** (1.0 / 7.0)  # our kernel's width over the published one's N^(-1/7), for three states
 
 
 def particles(size: int, width: float, threshold: float) -> dict[str, float]:

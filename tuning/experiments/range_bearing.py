@@ -36,6 +36,15 @@ from tuning.search.trials import best_trial
 
 
 START = datetime.datetime(2024, 1, 1)
+DT, STEPS = 1.0, 100  # [s]
+TRUE_SIGMA = 0.2  # [m/s^1.5]
+DEVIATIONS = 0.005, 2.0  # of bearing [rad] and range [m]
+PRIOR_MEAN, PRIOR_COV = (-800.0, -3.0, 45.0, -4.0), (25.0, 1.0, 25.0, 1.0)
+POSITION = [0, 2]
+POINTS = {"alpha": 0.5, "beta": 2.0, "kappa": -1.0}  # of the unscented filters
+TRIALS = 20
+SIGMA = Parameter("sigma_a", 0.01, 10.0, unit="m/s^1.5", default=2.0)  # the default is a guess, as users make one
+SCALE = (2.0, 0.5, 2.0, 0.5)  # what errors are measured in: about those of a good filter [m, m/s]
 
 
 def check_installed() -> None:
@@ -98,15 +107,6 @@ def stone_soup_means(
     return means
 
 
-DT, STEPS = 1.0, 100  # [s]
-TRUE_SIGMA = 0.2  # [m/s^1.5]
-DEVIATIONS = 0.005, 2.0  # of bearing [rad] and range [m]
-PRIOR_MEAN, PRIOR_COV = (-800.0, -3.0, 45.0, -4.0), (25.0, 1.0, 25.0, 1.0)
-POSITION = [0, 2]
-POINTS = {"alpha": 0.5, "beta": 2.0, "kappa": -1.0}  # of the unscented filters
-TRIALS = 20
-
-
 def move(x, u, c):
     """One step at constant velocity."""
     return (x[0] + DT * x[1], x[1], x[2] + DT * x[3], x[3])
@@ -133,8 +133,6 @@ def model(sigma_a: float = TRUE_SIGMA) -> StateSpaceModel:
     )
 
 
-SIGMA = Parameter("sigma_a", 0.01, 10.0, unit="m/s^1.5", default=2.0)  # the default is a guess, as users make one
-SCALE = (2.0, 0.5, 2.0, 0.5)  # what errors are measured in: about those of a good filter [m, m/s]
 problem = ModelProblem(model(), model, steps=STEPS, dt=DT, parameters=[SIGMA], scale=SCALE)
 
 

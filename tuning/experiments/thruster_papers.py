@@ -3,26 +3,14 @@
 Truth and filter share the model x' = A_d x + w, z = H x + v with Q = R = q I and zero input. The input has no
 effect: it is known to truth and filters, and the errors of a linear filter do not depend on it.
 
-The start. The papers print neither x_0 nor P_0. Here x_0 and the filter's prior are N(0, P_inf), P_inf being
-the steady-state covariance of the *predicted* state. Our filters are updated with z_0 before they first
-predict, so with this prior the Kalman filter's posterior covariance is the steady state's at every step, and
-its mean square error has the Riccati optimum as expectation. Were P_inf the posterior covariance, the update
-with z_0 would make the first steps better than the steady state. A second start, N(0, I), shows how little
-this matters.
+The start. The papers print neither x_0 nor P_0. Here x_0 and the filter's prior are N(0, P_inf), P_inf being the
+steady-state covariance of the *predicted* state. Our filters are updated with z_0 before they first predict, so
+with this prior the Kalman filter's posterior covariance is the steady state's at every step, and its mean square
+error has the Riccati optimum as expectation. Were P_inf the posterior covariance, the update with z_0 would make
+the first steps better than the steady state. A second start, N(0, I), shows how little this matters.
 
-Source: M. Kiki (2020) and H. Nurhadi, M. Kiki, D. Adzkiya, T. Herlambang (2022), cited in full in `kiki2020`
-and `nurhadi2022`; the model goes back to A. J. Healey et al. (1995), "Toward an improved understanding of
-thruster dynamics for underwater vehicles", IEEE J. Oceanic Engineering 20(4).
-
-Source: M. Kiki (2020), final project KM184801, Department of Mathematics, Institut Teknologi Sepuluh
-Nopember, Surabaya (in Indonesian). One run of 100 steps of 0.01 s, it seems; x_0, P_0, V_s, U_0 and the
-ensemble size are not printed.
-
-Source: H. Nurhadi, M. Kiki, D. Adzkiya, T. Herlambang (2022), "Estimation of water momentum and propeller
-velocity in bow thruster model of autonomous surface vehicle using modified Kalman filter", International
-Journal of Electrical and Computer Engineering (IJECE) 12(6), 5988-5997,
-doi:10.11591/ijece.v12i6.pp5988-5997. One run of 100 steps of 0.01 s, it seems; x_0, P_0, V_s, U_0 and the
-ensemble size are not printed.
+Source: `KIKI2020` and `NURHADI2022`, cited in full there; the model goes back to A. J. Healey et al. (1995),
+"Toward an improved understanding of thruster dynamics for underwater vehicles", IEEE J. Oceanic Engineering 20(4).
 """
 
 from __future__ import annotations
@@ -48,15 +36,28 @@ from thruster_env.model.simulate import Truth, simulate
 from thruster_env.thruster.analysis import STATES
 from thruster_env.thruster.linear import PUBLISHED, SAMPLE_TIME
 
-# The runs of the bow thruster papers: systems, settings, and the form of a table.
-
-
 # The cases by the names of the papers.
 SYSTEMS = {"tunnel": PUBLISHED["tunnel"], "open-bladed": PUBLISHED["open_bladed"]}
-
 STEPS = 100
 H = SYSTEMS["tunnel"].c  # the measurement matrix of both cases: the tunnel's C serves the open-bladed case too
 NOISE_LEVELS = (0.5, 0.6, 0.8, 1.0)  # q in Q = R = q I
+_BLOCK = 128  # runs at a time, whose members fit the processor's cache
+RUNS = 200
+MOST_RUNS = 100_000  # which take a gigabyte
+MEMBERS = 200  # the RMSE is about 0.6 % above the Kalman filter's; with 100 members it is 1.2 %
+RESAMPLES = 2000
+
+# Of the comparison with published values.
+CLOSE = 2.0  # standard deviations of a single run within which a published value is explained
+EQUAL = 0.06  # relative difference up to which the errors of the two states are called equal
+UNSEEN_RATIO = H[0][1] / H[0][0]  # omega_m over U_a [rad/m] of errors that are not observable by H
+
+# Of the pictures.
+LINES = {
+    "truth": TRUTH,
+    "KF": plot_style("kf") | {"linewidth": 1.2},
+    "EnKF": plot_style("enkf") | {"linewidth": 1.2, "linestyle": (0, (3, 2))},  # in whose gaps the other is seen
+}
 
 
 class PublishedRMSE(NamedTuple):
@@ -83,9 +84,9 @@ class PublishedTable(NamedTuple):
     remarks: tuple[str, ...]  # what a reader of the paper should know
 
 
-# RMSE of KF and EnKF on the linear bow thruster, as printed by Kiki (2020).
-
-
+# RMSE of KF and EnKF on the linear bow thruster, as printed by M. Kiki (2020), final project KM184801, Department
+# of Mathematics, Institut Teknologi Sepuluh Nopember, Surabaya (in Indonesian). One run of 100 steps of 0.01 s, it
+# seems; x_0, P_0, V_s, U_0 and the ensemble size are not printed.
 KIKI2020 = PublishedTable(
     name="kiki2020",
     source="M. Kiki (2020), final project KM184801, Institut Teknologi Sepuluh Nopember, Surabaya",
@@ -125,9 +126,10 @@ KIKI2020 = PublishedTable(
 )
 
 
-# RMSE of KF and EnKF on the linear bow thruster, as printed by Nurhadi et al. (2022).
-
-
+# The same, and as little about the run, as printed by H. Nurhadi, M. Kiki, D. Adzkiya, T. Herlambang (2022),
+# "Estimation of water momentum and propeller velocity in bow thruster model of autonomous surface vehicle using
+# modified Kalman filter", International Journal of Electrical and Computer Engineering (IJECE) 12(6), 5988-5997,
+# doi:10.11591/ijece.v12i6.pp5988-5997.
 NURHADI2022 = PublishedTable(
     name="nurhadi2022",
     source="H. Nurhadi, M. Kiki, D. Adzkiya, T. Herlambang (2022), IJECE 12(6), 5988-5997",
@@ -167,9 +169,6 @@ NURHADI2022 = PublishedTable(
 
 
 # A wrong ensemble Kalman filter that explains published errors: its analysis never updates the ensemble.
-
-
-_BLOCK = 128  # runs at a time, whose members fit the processor's cache
 
 
 def unupdated_ensemble_means(
@@ -217,12 +216,6 @@ def unupdated_ensemble_means(
             mean = mean + gain * ((truth[:, k] - mean) @ h)[:, None]
             means[first : first + _BLOCK, k] = mean
     return means
-
-
-RUNS = 200
-MOST_RUNS = 100_000  # which take a gigabyte
-MEMBERS = 200  # the RMSE is about 0.6 % above the Kalman filter's; with 100 members it is 1.2 %
-RESAMPLES = 2000
 
 
 class Score(NamedTuple):
@@ -357,11 +350,6 @@ def compare_all(
 # Published values against ours: their distance in standard deviations of one run, and its reason.
 
 
-CLOSE = 2.0  # standard deviations of a single run within which a published value is explained
-EQUAL = 0.06  # relative difference up to which the errors of the two states are called equal
-UNSEEN_RATIO = H[0][1] / H[0][0]  # omega_m over U_a [rad/m] of errors that are not observable by H
-
-
 class Finding(NamedTuple):
     """One published cell beside ours; distances in standard deviations of the RMSE of a single run."""
 
@@ -489,13 +477,6 @@ def _span(results: list[Finding], state: int | None = None) -> str:
 
 
 # One run of each linear system at each noise level over time: truth, Kalman and ensemble Kalman filter.
-
-
-LINES = {
-    "truth": TRUTH,
-    "KF": plot_style("kf") | {"linewidth": 1.2},
-    "EnKF": plot_style("enkf") | {"linewidth": 1.2, "linestyle": (0, (3, 2))},  # in whose gaps the other is seen
-}
 
 
 class Series(NamedTuple):

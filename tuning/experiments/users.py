@@ -1,15 +1,7 @@
 """Tuning on problems as users have them: whether a tuned filter is ever worse than what they had before.
 
 Each filter is tuned on each problem of a panel. Results are stored in a file per case, and an existing one is not
-computed again.
-
-Whether one filter is significantly worse than another one: a score is the mean over states of RMSE over scale, s =
-mean_i sqrt(m_i)/c_i, of mean squares m_i pooled over runs. The influence of one run on it is linear in that run's
-squares, so the standard error of log(s_a/s_b) is that of a mean of paired differences (the delta method), and
-Student's t gives a p-value at any level, where a bootstrap ends at one over the number of its resamples.
-
-Sources: B. Efron, R. Tibshirani (1993), An Introduction to the Bootstrap (influence and delta method); S. Holm
-(1979), "A simple sequentially rejective multiple test procedure", Scand. J. Statistics 6, 65-70.
+computed again. Holm's procedure finds the significant losses among all cases.
 """
 
 from __future__ import annotations
@@ -42,6 +34,17 @@ PANEL = tuple(f"tests.users.{name}:problem" for name in PANEL_NAMES.split())
 FILTERS = ("ekf", "ukf", "enkf", "ekf-robust")
 TRIALS = 50
 QUICK_TRIALS = 4
+KINDS: dict[str, type] = {  # of a file's entries
+    **dict.fromkeys(("problem", "filter", "gave_way", "error"), str),
+    **dict.fromkeys(("score", "nis", "seconds"), float),
+    "restarts": int,
+}
+OnCase = Callable[[str, int, int], None]  # what begins, cases that are done, all cases
+LEVEL = 0.05  # of a whole table: the chance that Holm's procedure calls any pair worse where none is
+MARK = "!"  # of a ratio that is significantly above 1
+FIRST = ("given", "scaled default", "rule of thumb", "noise estimation")  # the order of columns; others follow
+TAIL = 0.025  # of a 95 % interval on one side
+RESULTS = Path("out") / "users"
 
 
 class Panel(NamedTuple):
@@ -75,14 +78,6 @@ class Case(NamedTuple):
     baselines: Mapping[str, Paired]
     seconds: float
     error: str = ""
-
-
-KINDS: dict[str, type] = {  # of a file's entries
-    **dict.fromkeys(("problem", "filter", "gave_way", "error"), str),
-    **dict.fromkeys(("score", "nis", "seconds"), float),
-    "restarts": int,
-}
-OnCase = Callable[[str, int, int], None]  # what begins, cases that are done, all cases
 
 
 def found_problems(names: Sequence[str]) -> list[Problem]:
@@ -194,16 +189,17 @@ def _read(file: Path, key: Mapping) -> Case | None:
         raise ValueError(f"{file} must be a whole file of results, but cannot be read: {error}") from None
 
 
-# Significance.
-
-
-LEVEL = 0.05  # of a whole table: the chance that Holm's procedure calls any pair worse where none is
+# The significance of losses.
 
 
 def chance_if_no_worse(a: Evaluation, b: Evaluation) -> float:
     """One-sided p-value: the chance of a ratio of scores a/b as large as this one, if a is no worse than b.
 
-    1 where both made the same errors in each run.
+        s = mean_i sqrt(m_i)/c_i,    m_i mean squares pooled over runs, c_i the scale of state i
+
+    The influence of one run on s is linear in that run's squares, so the standard error of log(s_a/s_b) is that of
+    a mean of paired differences (the delta method). Student's t gives a p-value at any level, where a bootstrap
+    ends at one over the number of its resamples. The p-value is 1 if both made the same errors in each run.
 
     Args:
         a: a filter's errors on some seeds.
@@ -211,6 +207,8 @@ def chance_if_no_worse(a: Evaluation, b: Evaluation) -> float:
 
     Raises:
         ValueError: if there are fewer than two runs.
+
+    Source: B. Efron, R. Tibshirani (1993), An Introduction to the Bootstrap.
     """
     if len(a.mean_squares) < 2:
         raise ValueError(f"a p-value needs at least two runs, but got {len(a.mean_squares)}")
@@ -231,6 +229,8 @@ def holm(chances: Sequence[float], level: float = LEVEL) -> list[bool]:
 
     With m of them in increasing order, p_(1), ..., p_(m), those before the first with p_(k) > level/(m + 1 - k)
     are. Whatever their dependence, the chance that any is called so wrongly is at most `level`.
+
+    Source: S. Holm (1979), "A simple sequentially rejective multiple test procedure", Scand. J. Statistics 6.
     """
     significant, count = [False] * len(chances), len(chances)
     for rank, index in enumerate(np.argsort(chances, kind="stable")):
@@ -258,11 +258,6 @@ def _influences(evaluation: Evaluation) -> tuple[float, np.ndarray]:
 
 
 # Tables and sentences: scores over those of each baseline, and where tuning lost.
-
-
-MARK = "!"  # of a ratio that is significantly above 1
-FIRST = ("given", "scaled default", "rule of thumb", "noise estimation")  # the order of columns; others follow
-TAIL = 0.025  # of a 95 % interval on one side
 
 
 class Loss(NamedTuple):
@@ -386,9 +381,6 @@ def _ratio(paired: Paired | None, is_worse: bool) -> str:
     if low == high == 1.0:
         return "1, the same"
     return f"{value:.3f} [{low:.3f}, {high:.3f}]" + f" {MARK}" * is_worse
-
-
-RESULTS = Path("out") / "users"
 
 
 @cache

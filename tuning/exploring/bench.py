@@ -1,10 +1,8 @@
-"""`Bench`: a filter on a problem whose numbers one may change, and what one then sees.
+"""`Bench`: a filter on a problem, as a value whose numbers one may change, and the results for any of them.
 
-What is seen on a bench for use elsewhere: a tuned file, Python lines, the command.
-
-Six guided scenes: what Q, R, an ensemble's size and a model's constants do, each to be seen by hand.
-
-A scene is data: where one starts, what one changes, and what one then sees, which the tests hold.
+In order: export as a tuned file, Python lines or a command; maps and studies of a bench; the bench; and six guided
+scenes on Q, R, an ensemble's size and a model's constants. A scene is data: a start, the changes, and the effect
+that one then sees, which the tests check.
 """
 
 from __future__ import annotations
@@ -59,6 +57,9 @@ LINES = """from filters import make_filter
 model = problem.model({model})
 filter_ = make_filter({numbers})
 """
+MOST_SEEDS = 64
+MOST_ACROSS = 128  # values of each number on a map
+OWN = {"Q11": 1.0, "Q22": 4e-4, "R": 0.25}  # the plant's own Q and R, in (rad/s)^2, (m/s)^2 and N^2
 
 
 def file_of(choice: Choice, plan: Plan) -> str:
@@ -191,10 +192,6 @@ def trials_of(plan: Plan, start: Choice, trials: int) -> Iterator[Trial]:
         scores = list(last.intermediate_values.values())
         score = sum(scores) / len(scores) if pruned and scores else last.values[0]
         yield Trial(dict(last.params), score, pruned)
-
-
-MOST_SEEDS = 64
-MOST_ACROSS = 128  # values of each number on a map
 
 
 @dataclass(frozen=True)
@@ -423,8 +420,6 @@ class Scene(NamedTuple):
         """What one sees at a step."""
         return self.bench(step).view(self.steps[step].values, seeds)
 
-
-OWN = {"Q11": 1.0, "Q22": 4e-4, "R": 0.25}  # the plant's own Q and R, in (rad/s)^2, (m/s)^2 and N^2
 
 SCENES = {
     scene.name: scene

@@ -1,10 +1,7 @@
-"""What one sees of a filter: estimates with their bands, innovations, consistency over time, and figures.
+"""`View`: a filter's estimates with their bands, innovations, consistency over time, and figures.
 
-NEES is the normalised estimation error squared, NIS the normalised innovation squared.
-
-The data that a bench shows: runs of a plant, or recorded logs as a whole with the blocks they are cut into.
-
-The numbers that one may change on a bench, with their ranges and the values that are known for them.
+In order: the data of a bench, which are runs of a plant or whole logs; the view; the disturbances of a plant as
+numbers; and the numbers that one may change, with their ranges and known values.
 """
 
 from __future__ import annotations
@@ -31,6 +28,12 @@ from tuning.problems.problem import Parameter, Problem, score_label
 from tuning.problems.scenario import BaseScenario, plain
 from tuning.search.parameters import PRIOR, Correlation, FilterParameter, MeasurementVariance, ProcessVariance, Q
 from tuning.search.space import Choice, everything_of, neutral, parameters, parameters_of
+
+LOWER, HIGHER, NEAR = "lower", "higher", "near"  # what is better in a figure
+SENSORS, AMPLIFIER = "sensors", "amplifier"  # fields of a scenario that hold effects
+SIGMA = "sigma"  # unit of what is said in standard deviations of the sensor's noise
+KNOWN = ("given", "rule of thumb", "scaled default", "oracle")  # baselines that are marked
+GROUPS = ("Q", "R", "model", "filter", "prior", "correlations", "disturbances")
 
 
 class PageData(NamedTuple):
@@ -78,9 +81,6 @@ def _whole(problem: LogProblem) -> Data:
     states = padded([truth for log in logs if (truth := log.true_states(model)) is not None], rows)
     known = only(data.counted, ~np.isnan(states).any(axis=-1))
     return data._replace(states=states, counted=known).read_only()
-
-
-LOWER, HIGHER, NEAR = "lower", "higher", "near"  # what is better in a figure
 
 
 class Figure(NamedTuple):
@@ -226,10 +226,6 @@ def _whiteness(estimates: Estimates, data: Data) -> tuple[np.ndarray, float]:
 # Disturbances of a scenario as numbers that one may change: outliers, dropout, bias, a dead band.
 
 
-SENSORS, AMPLIFIER = "sensors", "amplifier"  # fields of a scenario that hold effects
-SIGMA = "sigma"  # unit of what is said in standard deviations of the sensor's noise
-
-
 class Disturbance(NamedTuple):
     """One number of an effect, which is there where the number is positive."""
 
@@ -357,10 +353,6 @@ def _sensor_deviations(problem: Any) -> list[float]:
     noise_cov = problem.measurement_noise_cov
     variances = noise_cov if isinstance(noise_cov, list | tuple) else [noise_cov]
     return [math.sqrt(variance) for variance in variances]
-
-
-KNOWN = ("given", "rule of thumb", "scaled default", "oracle")  # baselines that are marked
-GROUPS = ("Q", "R", "model", "filter", "prior", "correlations", "disturbances")
 
 
 class Knob(NamedTuple):

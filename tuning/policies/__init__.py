@@ -1,14 +1,15 @@
 """Policies on raw, filtered and true state. Needs the extra `rl`; importing this package alone does not.
 
-`NativeVecEnv` is what Stable-Baselines3 takes: a vector env of this package, all copies stepped in one call.
+Stable-Baselines3 takes a `NativeVecEnv`: a vector env of this package, all copies stepped in one call. Wrappers of
+VecEnvs add the views of the state and the corrections of a controller, so they serve native and single envs alike.
+Learnt and classical policies share `predict`, run on the same envs and are scored by the same code (`score`).
+Controllers plan with the plant's own code (`thruster_env.thruster.planning`), so their cost cannot drift from the
+reward.
 
-Learned and classical policies share `predict`, run on the same envs and are scored by the same code (`score`).
-Controllers plan with the plant's own code (`thruster_env.thruster.planning`), so their cost cannot drift
-from the reward. A policy may correct a controller: a wrapper of VecEnvs adds the two actions. Views of the state
-are wrappers of VecEnvs (`views`), which serve native and single envs alike. Infos are empty but at the end of an
-episode: a dictionary a copy and step costs more than the plant. Torch is set up for small networks
-(`torch_settings`): fused optimizers and minibatches as views take a step from 36 to 28 us and change rounding
-alone. A setup is plain data beside each saved network, with the numbers of its tuned file and not its path.
+Infos are empty except at the end of an episode: a dictionary per copy and step costs more than the plant. Torch is
+set up for small networks (`learn`): fused optimizers and minibatches as views take a step from 36 to 28 us and
+change only rounding. A configuration is plain data beside each saved network, with the numbers of its tuned file
+and not its path.
 """
 
 from __future__ import annotations

@@ -49,6 +49,7 @@ POLICY_ARGUMENTS = (
     ),
     *("share_features_extractor", "lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm"),
 )
+NEEDED = ("torch", "stable_baselines3", "sb3_contrib")
 
 
 class Algorithm(NamedTuple):
@@ -118,9 +119,6 @@ ALGORITHMS: dict[str, Algorithm] = {
 def find_algorithm(name: str) -> Algorithm:
     """The algorithm of a name; raises ValueError for an unknown one."""
     return ALGORITHMS[one_of("algo", name, tuple(ALGORITHMS))]
-
-
-NEEDED = ("torch", "stable_baselines3", "sb3_contrib")
 
 
 def check_installed() -> None:

@@ -1,28 +1,9 @@
-"""The policies of a comparison and their noise levels: a list of runs, each a training or a classical policy.
+"""A comparison of policies: its runs, each a training or a classical policy, their execution, and figures.
 
-Beside the three noise levels, at medium noise: filters with other Q and R (`untuned`, `tuned`), and three
-situations in which filter and controller assume a wrong model (`WRONG`). A policy is trained in the situation
-itself.
-
-Run a comparison, in parallel on the cores; finished runs are stored, and never repeated.
-
-Means over training seeds, with intervals for the variation of both policies and episodes.
-
-A figure is a number with its values when one training seed, or one episode, is left out. So differences and ratios
-of figures are figures, and their intervals follow from the jackknife: each source of variation k has a variance
-
-    v_k = (n_k - 1)/n_k sum_i (f_(i) - mean f_(i))^2,    f_(i) the figure without its i-th seed or episode
-
-and the interval is f -+ t sqrt(sum_k v_k), with Student's t of (sum v_k)^2/sum (v_k^2/(n_k - 1)) degrees of
-freedom. For one mean it is Student's interval, for a difference Welch's. Episodes are one source, because they are
-the same for all policies; the training seeds of each policy are a separate source, because two policies are
-trained independently. (The variation of one policy in one episode is in both sources, which is conservative.) With
-five seeds it covers 95 %, where the middle 95 % of bootstrap resamples cover less than 90 %; a test simulates
-both.
-
-Sources: B. Efron, C. Stein (1981), "The jackknife estimate of variance", Annals of Statistics 9(3), 586-596;
-B. L. Welch (1947), "The generalization of Student's problem when several different population variances are
-involved", Biometrika 34, 28-35.
+Beside the three noise levels there are variants at medium noise: filters with other Q and R (`untuned`, `tuned`),
+and three situations in which filter and controller assume a wrong model (`WRONG`); a policy is trained in the
+situation itself. Finished runs are stored and never repeated. A `Figure` is a mean over training seeds whose
+interval contains the variation of policies and of episodes.
 """
 
 from __future__ import annotations
@@ -82,6 +63,11 @@ VARIANTS = (
     ("ekf", "unknown flow"),
 )
 TUNING_TRIALS = 60
+
+# Of stored results.
+RUNS = "runs"
+STEPS_APART = 40_000  # training steps between points of a learning curve: an evaluation has 16 000 steps
+EPISODES = "episodes"  # the source of variation that all figures share
 
 
 class Comparison(NamedTuple):
@@ -201,8 +187,6 @@ def _plain(arguments: Mapping) -> dict:
     return {name: np.asarray(value).tolist() for name, value in arguments.items()}
 
 
-RUNS = "runs"
-STEPS_APART = 40_000  # training steps between points of a learning curve: an evaluation has 16 000 steps
 OnRun = Callable[[Run, int, int], None]  # a finished run, number of finished runs, number of all runs
 
 
@@ -334,12 +318,12 @@ def _file(folder: Path, run: Run) -> Path:
     return folder / RUNS / f"{run.name}.json"
 
 
-EPISODES = "episodes"  # the source of variation that all figures share
-
-
 @dataclass(frozen=True)
 class Figure:
-    """A number, and by source of variation its values (n_k,) with one seed or episode left out each."""
+    """A number, and by source of variation its values (n_k,) with one seed or episode left out each.
+
+    So differences and ratios of figures are figures; `as_interval` gives the interval of any of them.
+    """
 
     value: float
     without: Mapping[Hashable, np.ndarray] = field(default_factory=dict)
@@ -396,7 +380,21 @@ def typical_error(results: Sequence[Result], part: str) -> Figure:
 
 
 def as_interval(figure: Figure) -> Interval:
-    """The figure with its 95 % interval."""
+    """The figure with its 95 % interval, by the jackknife.
+
+        v_k = (n_k - 1)/n_k sum_i (f_(i) - mean f_(i))^2,    f_(i) the figure without its i-th seed or episode
+        f -+ t sqrt(sum_k v_k),    Student's t of (sum v_k)^2/sum (v_k^2/(n_k - 1)) degrees of freedom
+
+    for sources of variation k. For one mean it is Student's interval, for a difference Welch's. Episodes are one
+    source, because they are the same for all policies; the training seeds of each policy are a separate source,
+    because policies are trained independently. (The variation of one policy in one episode is in both sources,
+    which is conservative.) With five seeds it covers 95 %, where the middle 95 % of bootstrap resamples cover less
+    than 90 %; a test simulates both.
+
+    Sources: B. Efron, C. Stein (1981), "The jackknife estimate of variance", Annals of Statistics 9(3), 586-596;
+    B. L. Welch (1947), "The generalization of Student's problem when several different population variances are
+    involved", Biometrika 34, 28-35.
+    """
     variances, freedoms = [], []
     for values in figure.without.values():
         if len(values) > 1:

@@ -1,9 +1,7 @@
-"""Tables of a comparison: one for each noise level, and a summary with a row for each question.
+"""The page of a comparison: tables in Markdown, sentences that answer its questions, and two pictures.
 
-The sentences that answer each question are in `answers`.
-
-The two pictures of a comparison: learning curves by observation set, and cost against observation error. The
-page of a comparison: tables in Markdown, answers, two pictures.
+There is a table for each noise level, and a summary with a row for each question. The pictures are learning curves
+by observation set, and cost against observation error.
 """
 
 from __future__ import annotations
@@ -63,6 +61,25 @@ RATIOS = [
     (("ppo+mpc", "ekf"), ("mpc", "ekf")),
     (("ppo", "stack"), ("ppo", "ekf")),
 ]
+
+# Of the pictures.
+COLOURS = {
+    "raw": "#999999",
+    "raw+action": "#cc79a7",
+    "stack": "#e69f00",
+    "ekf": colour_of("ekf"),
+    "enkf": colour_of("enkf"),
+    "belief": "#009e73",
+    "true": DARK,
+}
+GREY = "#666666"
+MARKERS = {"low": "o", "medium": "s", "high": "^"}
+COST = "cost of an episode: minus the return [-]"
+
+# Of the page.
+PAGE = "policies.md"
+CURVES, ERRORS = "policies_curves.png", "policies_errors.png"
+ROUGH = "**Rough**, by `--quick`: it shows that everything runs, not which policy is better."
 
 
 def by_policy(results: Sequence[Result]) -> dict[Key, list[Result]]:
@@ -268,20 +285,6 @@ def _verdict(value: Interval) -> str:
     return "worse" if value.high < 0 else "no significant difference"
 
 
-COLOURS = {
-    "raw": "#999999",
-    "raw+action": "#cc79a7",
-    "stack": "#e69f00",
-    "ekf": colour_of("ekf"),
-    "enkf": colour_of("enkf"),
-    "belief": "#009e73",
-    "true": DARK,
-}
-GREY = "#666666"
-MARKERS = {"low": "o", "medium": "s", "high": "^"}
-COST = "cost of an episode: minus the return [-]"
-
-
 def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
     """Cost over training steps, one panel for each noise level: mean and range over seeds."""
     groups = by_policy(results)
@@ -360,10 +363,6 @@ def _make_logarithmic(axis) -> None:
     axis.yaxis.set_major_formatter("{x:g}")
 
 
-PAGE = "policies.md"
-CURVES, ERRORS = "policies_curves.png", "policies_errors.png"
-
-
 def check_page(page: Path) -> None:
     """Raise ValueError unless the tables can be written there: into a new page, or one with a place for them."""
     if page.suffix != ".md":
@@ -374,9 +373,6 @@ def check_page(page: Path) -> None:
     ):
         rule = "a page that is there must have a place for a table, such as <!-- table summary --> <!-- end -->"
         raise ValueError(f"{rule}, but {page} has none")
-
-
-ROUGH = "**Rough**, by `--quick`: it shows that everything runs, not which policy is better."
 
 
 def write_report(results: Sequence[Result], comparison: Comparison, page: Path, rough: bool = False) -> list[Path]:

@@ -1,9 +1,6 @@
-"""Controllers of plants as policies, and policies that correct a controller.
+"""Classical controllers as policies, PI, LQR, LQG and predictive ones, and policies that correct them.
 
-The thruster's classical policies: PI, LQR (LQG with an estimator), and the predictive controllers.
-
-They use the observation sets of `tuning.policies.observations`, so that they can be compared with learnt
-policies.
+They use the observation sets of `tuning.policies.observations`, so they can be compared with learnt policies.
 """
 
 from __future__ import annotations
@@ -21,6 +18,10 @@ from thruster_env.thruster.controllers import LQRController, PIController
 from thruster_env.thruster.dynamics import Constants
 from thruster_env.thruster.planning import HORIZONS, PredictiveController
 from tuning.policies.observations import TrainingReturns, size_of
+
+# Factors on the gains of `gains.lambda_gains`, tried for each observation set.
+GAINS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0)
+GAIN_SEEDS = 16
 
 
 class Controller(Protocol):
@@ -92,17 +93,6 @@ class CorrectController(VecEnvWrapper):
             infos[i]["terminal_observation"] = np.concatenate([last, action])
         self._actions, self._state = self._controller.predict(observations, self._state, dones)
         return np.concatenate([observations, self._actions], axis=1), rewards, dones, infos
-
-
-GAINS = (
-    0.5,
-    1.0,
-    2.0,
-    3.0,
-    4.0,
-    6.0,
-)  # factors on the gains of `gains.lambda_gains`, tried for each observation set
-GAIN_SEEDS = 16
 
 
 def predictive(name: str, env: gym.Env) -> ClassicalPolicy:

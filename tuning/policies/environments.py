@@ -1,7 +1,7 @@
-"""The envs of a training configuration, for Stable-Baselines3: native vectorised ones, or single ones.
+"""The envs of a training configuration for Stable-Baselines3: native vectorised ones, or single ones.
 
-`NativeVecEnv`: a Gymnasium vector env as the VecEnv that Stable-Baselines3 asks for. Vectorised observations
-of a policy: an output of a state, or the last measurements and actions.
+`NativeVecEnv` gives a Gymnasium vector env the interface of Stable-Baselines3's VecEnv. `ShowOutput` and
+`ShowHistory` change what a policy observes: an output of the state, or the last measurements and actions.
 """
 
 from __future__ import annotations

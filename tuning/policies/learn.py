@@ -1,10 +1,7 @@
 """Train a policy, with evaluations, checkpoints and TensorBoard; an interrupted training can be continued.
 
-The model of Stable-Baselines3 that a training configuration asks for.
-
-Settings of torch while a policy learns: the fastest for such small networks on a CPU.
-
-torch's comes from Intel's library, and takes ten times as long on an AMD: longer than a layer's product.
+In order: settings with which torch trains such small networks fastest on a CPU; the model of Stable-Baselines3
+that a training configuration asks for; the training.
 """
 
 from __future__ import annotations
@@ -54,6 +51,11 @@ from tuning.policies.setup import TrainingConfiguration
 from tuning.problems.data import SEEDS_APART, training_seeds
 from tuning.search.study import stop_on_interrupt
 
+TAKEN = torch.float32, torch.float64
+VALIDATION_EPISODES = 32  # of an evaluation during training; always the same ones
+KEPT = 2  # checkpoints
+OnProgress = Callable[[int, float], None]  # steps, and the mean return of the last evaluation (NaN before it)
+
 # `EpochBuffer`: rollouts that are put into random order once an epoch, and handed out as views.
 
 
@@ -88,10 +90,7 @@ def epoch_minibatches(model: BaseAlgorithm) -> Iterator[None]:
         holder.rollout_buffer = before
 
 
-# tanh, the activation of a policy's hidden layers, by NumPy, whose vector code serves processors of all makers.
-
-
-TAKEN = torch.float32, torch.float64
+# tanh, the activation of a policy's hidden layers, by NumPy, whose vector code is fast on all processors.
 
 
 class _Tanh(torch.autograd.Function):
@@ -125,7 +124,10 @@ def _evaluate(x: Tensor) -> Tensor:
 
 @contextmanager
 def numpys_tanh(network: nn.Module) -> Iterator[None]:
-    """Within this context each `torch.nn.Tanh` of a network is NumPy's; saved files do not record it."""
+    """Within this context each `torch.nn.Tanh` of a network is NumPy's; saved files do not record it.
+
+    torch's comes from Intel's library and takes ten times as long on an AMD, longer than a layer's product.
+    """
     activations = [
         (parent, name, child)
         for parent in network.modules()
@@ -210,11 +212,6 @@ def new_model(setup: TrainingConfiguration, envs: VecEnv, tensorboard: Path | No
     normalised = VecNormalize(envs, gamma=numbers["gamma"])
     log = None if tensorboard is None else str(tensorboard)
     return kind(algorithm.policy, normalised, seed=setup.seed, tensorboard_log=log, device="cpu", **numbers)
-
-
-VALIDATION_EPISODES = 32  # of an evaluation during training; always the same ones
-KEPT = 2  # checkpoints
-OnProgress = Callable[[int, float], None]  # steps, and the mean return of the last evaluation (NaN before it)
 
 
 class Trained(NamedTuple):

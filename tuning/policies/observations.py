@@ -1,7 +1,6 @@
 """Observation sets: the choices of a policy's observation.
 
-Every observation ends with the reference of the next step. What comes before it is,
-in float32,
+Every observation ends with the reference of the next step. What comes before it is, in float32,
 
 | observation set | entries |
 |---|---|
@@ -13,9 +12,7 @@ in float32,
 | true | true thrust, omega_m and U_a |
 
 Thrust is a nonlinear function of the state, and the reward compares it with the reference. Raw observations
-contain thrust; it is added to estimates so that no policy has to learn the equation of the propeller.
-
-Policies observe and act in boxes only.
+contain thrust, so estimates have it added: no policy has to learn the equation of the propeller.
 """
 
 from __future__ import annotations
@@ -33,6 +30,10 @@ if TYPE_CHECKING:
     from tuning.policies.controllers import ClassicalPolicy
 
 STACKED = 8
+MEMBERS = MappingProxyType({"ensemble_size": 50})
+
+# Returns (copies, episodes) of so many copies of a policy, stepped side by side, on the same training seeds.
+TrainingReturns = Callable[["ClassicalPolicy", int, int], np.ndarray]
 
 
 class ObservationSet(NamedTuple):
@@ -51,7 +52,6 @@ class ObservationSet(NamedTuple):
         return self.is_true or self.filter is not None
 
 
-MEMBERS = MappingProxyType({"ensemble_size": 50})
 OBSERVATION_SETS: dict[str, ObservationSet] = {
     "raw": ObservationSet("the measured thrust"),
     "raw+action": ObservationSet("the measured thrust and the last voltage", pairs=1),
@@ -71,12 +71,8 @@ def find_observation_set(name: str) -> ObservationSet:
     return OBSERVATION_SETS[one_of("observe", name, tuple(OBSERVATION_SETS))]
 
 
-# Returns (copies, episodes) of so many copies of a policy, stepped side by side, on the same training seeds.
-TrainingReturns = Callable[["ClassicalPolicy", int, int], np.ndarray]
-
-
 def box_of(space: gym.Space) -> gym.spaces.Box:
-    """The same space; ValueError unless it is a Box."""
+    """The same space; ValueError unless it is a Box, for policies observe and act in boxes only."""
     if not isinstance(space, gym.spaces.Box):
         raise ValueError(f"a space must be a Box, but got {space}")
     return space

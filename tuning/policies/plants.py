@@ -42,6 +42,12 @@ from tuning.thruster.scenario import SCENARIOS, Scenario, find_scenario
 if TYPE_CHECKING:
     from tuning.policies.controllers import ClassicalPolicy
 
+TRANSIENT = 0.15  # [s] after a step of the reference; later steps are steady tracking
+STEP_OF_REFERENCE = 0.02  # least change within one sample time that is a step [T_max]
+FIRST_SCORED_STEP = 50  # of the RMSE of the observed thrust, as for all estimates
+SHORTEST_STEP = 0.01  # [s]; with a shorter sample time the vehicle would hardly move in an episode
+PD = "pd"
+
 
 class Task(NamedTuple):
     """An env with its reference or path."""
@@ -137,11 +143,6 @@ class TrainingPlant(ABC):
         """Errors of episodes by name, from recorded values (q, B, K) and whether an episode continues (B, K)."""
 
 
-TRANSIENT = 0.15  # [s] after a step of the reference; later steps are steady tracking
-STEP_OF_REFERENCE = 0.02  # least change within one sample time that is a step [T_max]
-FIRST_SCORED_STEP = 50  # of the RMSE of the observed thrust, as for all estimates
-
-
 class Thruster(TrainingPlant):
     """The bow thruster."""
 
@@ -235,9 +236,6 @@ def _soon_after(events: np.ndarray, length: int) -> np.ndarray:
 
 
 THRUSTER = Thruster()
-
-SHORTEST_STEP = 0.01  # [s]; with a shorter sample time the vehicle would hardly move in an episode
-PD = "pd"
 
 
 def _may_learn(scenario: VehicleScenario) -> bool:

@@ -6,11 +6,7 @@ Such a folder is written under another name and then renamed, so that a reader n
 by a killed process have names that begin with a dot; `mend` removes them. Do not load files of unknown origin:
 Stable-Baselines3 and this module use pickle.
 
-Classical policies on the sets of `tuning.policies.observations`, beside learnt ones.
-
-Scores of policies on held-out episodes: return, and tracking errors.
-
-Learnt and classical policies run in the same loop, on the same seeds, in native envs.
+`score` runs learnt and classical policies in the same loop, on the same held-out episodes, in native envs.
 """
 
 from __future__ import annotations

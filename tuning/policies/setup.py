@@ -27,6 +27,11 @@ from tuning.problems.scenario import BaseScenario, plain
 if TYPE_CHECKING:
     pass
 
+VERSION = 1
+MOST_ENVS = 100_000  # 100 steps of each take a gigabyte
+MOST_STEPS = 10**12
+SHARE = 0.2  # largest correction of a controller, as a fraction of the range of its action
+
 
 def check_configuration(setup: TrainingConfiguration) -> None:
     """Raise ValueError, with rule and value, for an entry of a configuration that is unknown or not data."""
@@ -77,12 +82,6 @@ def _check_data(name: str, value) -> None:
         raise ValueError(
             f"{name} must be data: text, finite numbers, lists and mappings, but got {short_repr(value)}"
         )
-
-
-VERSION = 1
-MOST_ENVS = 100_000  # 100 steps of each take a gigabyte
-MOST_STEPS = 10**12
-SHARE = 0.2  # largest correction of a controller, as a fraction of the range of its action
 
 
 @dataclass(frozen=True, kw_only=True)

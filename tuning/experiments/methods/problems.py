@@ -25,6 +25,24 @@ FULL_Q: Mapping[str, bool] = {"full_q": True}
 HELD_R: Mapping[str, bool] = {"hold_r": True}
 LIDAR_RUNS, LIDAR_SETS = 700, 20  # that are held out, and sets of runs to learn from
 MASSES, STIFFNESS, DAMPING, DT = 5, 200.0, 0.4, 0.02  # of a chain, each mass 1 kg
+GROUPS = {
+    "A": "linear, right",
+    "B": "nonlinear, right",
+    "C": "wrong model",
+    "D": "outliers and a dead band",
+    "E": "small ensembles",
+    "F": "eight to ten states",
+    "G": "no truth to learn from",
+    "H": "little data",
+}
+RUNS, SECONDS = (1e3, 1e4, 1e5), (1.0, 10.0, 100.0)  # budgets
+STARTS = ((1.0, 1.0), (100.0, 1.0), (0.01, 100.0))  # factors on the rule of thumb's Q and R, by turns of data sets
+REFERENCE = "reference"  # the best constant numbers
+START, SCALED, ORACLE = "start", "scaled default", "oracle"
+STUDY, STUDY_LOG_SCORE = "study", "study of log-score"  # of 50 trials, as `thruster tune` makes them
+TRIALS = 50
+WITH_FULL = ", full"  # behind a method: it tunes full Q and R, where the others of a case tune diagonals
+FROM_NOISE = ", full, from noise estimation"  # the same, and begins there: added after the first results
 
 
 class Case(NamedTuple):
@@ -44,18 +62,6 @@ class Case(NamedTuple):
     def model(self) -> str:
         """A name of the filter and what it is of, which cases that differ in their data alone share."""
         return f"{self.name.split(',')[0]} {self.filter}"
-
-
-GROUPS = {
-    "A": "linear, right",
-    "B": "nonlinear, right",
-    "C": "wrong model",
-    "D": "outliers and a dead band",
-    "E": "small ensembles",
-    "F": "eight to ten states",
-    "G": "no truth to learn from",
-    "H": "little data",
-}
 
 
 @cache
@@ -198,14 +204,6 @@ QUICK = (Case("walk", "A", walk, "kf", runs=4), Case("walk, blind", "G", walk, "
 # How much is done: cases, methods, data sets and budgets.
 
 
-RUNS, SECONDS = (1e3, 1e4, 1e5), (1.0, 10.0, 100.0)  # budgets
-STARTS = ((1.0, 1.0), (100.0, 1.0), (0.01, 100.0))  # factors on the rule of thumb's Q and R, by turns of data sets
-REFERENCE = "reference"  # the best constant numbers
-START, SCALED, ORACLE = "start", "scaled default", "oracle"
-STUDY, STUDY_LOG_SCORE = "study", "study of log-score"  # of 50 trials, as `thruster tune` makes them
-TRIALS = 50
-WITH_FULL = ", full"  # behind a method: it tunes full Q and R, where the others of a case tune diagonals
-FROM_NOISE = ", full, from noise estimation"  # the same, and begins there: added after the first results
 FULL_METHODS = (
     *(f"{method}{WITH_FULL}" for method in ("mse", "log-score", "likelihood", "als")),
     *(f"{method}{FROM_NOISE}" for method in ("mse", "log-score")),

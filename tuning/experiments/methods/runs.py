@@ -1,6 +1,7 @@
-"""All results of a protocol: what is done is kept in files, and never repeated.
+"""The results of a protocol: each method on each data set of each case, within a budget.
 
-A method on a data set of a case, within a budget, and the best constant numbers that it is held against.
+Finished results are stored in files and never repeated. Regrets compare methods with the best constant numbers,
+with intervals over data sets.
 """
 
 from __future__ import annotations
@@ -58,6 +59,9 @@ from tuning.search.storage import quiet_optuna
 from tuning.search.study import open_study, run_study
 
 SIMPLEX = 400  # evaluations of a descent to the reference of an ensemble, which has no gradient
+OnResult = Callable[[str, int, int], None]  # what is done, results so far, all
+LEVEL = 0.05
+EQUAL = 0.01  # of log ratios: "equal" is within 1 %
 
 
 class Scored(NamedTuple):
@@ -267,9 +271,6 @@ def _plain(choice: Choice) -> dict[str, Any]:
     return content
 
 
-OnResult = Callable[[str, int, int], None]  # what is done, results so far, all
-
-
 def jobs_of(protocol: Protocol) -> Iterator[tuple[Case, str, int]]:
     """All that there is to do, one data set after the other, so that an early end leaves whole ones."""
     models = {case.model: case for case in reversed(protocol.cases)}
@@ -369,10 +370,6 @@ def _float(value: float | None) -> float:
 
 
 # Regrets of methods with intervals over data sets, and which methods are significantly worse than the best.
-
-
-LEVEL = 0.05
-EQUAL = 0.01  # of log ratios: "equal" is within 1 %
 
 
 def within(kind: str, key: str) -> Callable[[Result], Scored | None]:

@@ -38,6 +38,8 @@ BLIND = (
 SEARCHES = ("nelder-mead", "coordinate-steps", "tpe-only", "gp-only", "cma-es-only", "random-only")
 ENOUGH, ENOUGH_NATS = 0.005, 0.02  # of log ratios and log scores, up to which the cheaper method is taken
 NO_METHODS = (START, ORACLE)  # nobody has these
+LEAST, MOST = 1e-4, 3.0  # of log ratios, at which points are clipped
+MARKS = dict(zip(RUNS, (("o", "0.75"), ("o", "C0"), ("o", "C3")), strict=True))
 
 
 class Situation(NamedTuple):
@@ -242,10 +244,6 @@ def tables(results: Sequence[Result], protocol: Protocol) -> dict[str, Callable[
 
 
 # The picture of the study of methods: regrets by group, at each budget of passes.
-
-
-LEAST, MOST = 1e-4, 3.0  # of log ratios, at which points are clipped
-MARKS = dict(zip(RUNS, (("o", "0.75"), ("o", "C0"), ("o", "C3")), strict=True))
 
 
 def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> Path:

@@ -1,8 +1,7 @@
-"""Structures of the model, each identified from recordings, and errors of thrust estimates against the load cell.
+"""Model structures identified from the recordings, and their errors of thrust against the load cell.
 
-NIS is the normalised innovation squared.
-
-Tables of docs/real_data.md and of `thruster study recordings`.
+In order: the structures; their identification; errors and ratios to the recorder's own estimate; other estimators;
+a larger process noise after reversals; and the tables of docs/real_data.md and of `thruster study recordings`.
 """
 
 from __future__ import annotations
@@ -34,6 +33,34 @@ from tuning.identification.result import Identification, valued
 from tuning.identification.starts import runs_of
 from tuning.problems.digest import digest_of
 from tuning.problems.problem import Parameter
+
+DEGREES = 20.0  # degrees of freedom of the load cell's errors: it rings after each start and reversal
+CHOSEN = "flow and inertia"
+NONE_HELD_OUT = ""
+
+# Of errors against the load cell.
+WINDOW = 5  # rows, 0.2 s, over which estimate and load cell are averaged: the mount swings at 14 Hz
+SHIFTS = np.arange(-0.12, 0.1201, 0.01)  # of the clock [s]; each estimate may have its best one
+SETTLED = 1.2  # after the start, and after every change of the command's sign [s]
+
+# Of the estimators.
+OURS, OWN, DESIRED, STATIC_MAP, LOOKUP = "ours", "recorder's", "desired", "static map", "lookup"
+# Least squares on the table of steady states of the same source, ahead and astern.
+STATIC_FACTORS = 0.968e-3, 0.979e-3  # T = c n|n| [N s^2]
+LOOKUP_FACTORS, LOOKUP_BAND = (2.51, 2.62), 0.84  # T = k (|u| - 0.84)^2 [N/V^2, V]
+
+# Of the noise after reversals.
+AFTER = 0.4  # s after the start and after each reversal
+FACTORS = (1.0, 4.0, 16.0, 64.0, 256.0)  # on Q in that time
+
+# Of the tables.
+RESULTS = Path("out") / "recordings.json"
+MEAN = "mean"
+RATIO_HEADER = ["run", "own, N", "ours, N", "ratio", "best clocks", "raw rows"]
+CLOCK_HEADER = ["run", "offset, s", "first half", "second half"]
+LADDER_HEADER = ["model", "ratio, worst", "ratio, mean", "raw rows, worst", "log-likelihood"]
+NUMBER_HEADER = ["constant", "value", "standard error", "without one run", "unit"]
+Estimates = Mapping[str, Sequence[np.ndarray]]
 
 
 def _positive(name: str, low: float, high: float, unit: str = "", default: float | None = None) -> Parameter:
@@ -73,9 +100,6 @@ NOISE = (
 )
 
 
-DEGREES = 20.0  # degrees of freedom of the load cell's errors: it rings after each start and reversal
-
-
 class Structure(NamedTuple):
     """Effects in the model, and the free parameters."""
 
@@ -98,7 +122,6 @@ def _without(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     return tuple(parameter for parameter in WHOLE if parameter not in parameters)
 
 
-CHOSEN = "flow and inertia"
 STRUCTURES = {
     "static": Structure("thrust by motor speed alone", STATIC, {"flow_factor": 0.0}),
     "flow": Structure("with axial flow", (*STATIC, *FLOW)),
@@ -153,9 +176,6 @@ def thrusts(model: StateSpaceModel, runs: Sequence[Recording], ambient: bool = F
 
 
 # Results of all identifications, stored in a file one by one, so that an interrupted study can be continued.
-
-
-NONE_HELD_OUT = ""
 
 
 class Task(NamedTuple):
@@ -219,11 +239,6 @@ def identify_all(
 # Errors of thrust estimates against the load cell, and their ratios to the recorder's own.
 
 
-WINDOW = 5  # rows, 0.2 s, over which estimate and load cell are averaged: the mount swings at 14 Hz
-SHIFTS = np.arange(-0.12, 0.1201, 0.01)  # of the clock [s]; each estimate may have its best one
-SETTLED = 1.2  # after the start, and after every change of the command's sign [s]
-
-
 class Ratios(NamedTuple):
     """RMSE of an estimate over that of the recorder's own, on one run."""
 
@@ -282,12 +297,6 @@ def ratios(estimate: np.ndarray, run: Recording) -> Ratios:
 # Estimates of thrust on the recorded runs: ours, the recorder's own, and trivial ones.
 
 
-OURS, OWN, DESIRED, STATIC_MAP, LOOKUP = "ours", "recorder's", "desired", "static map", "lookup"
-# Least squares on the table of steady states of the same source, ahead and astern.
-STATIC_FACTORS = 0.968e-3, 0.979e-3  # T = c n|n| [N s^2]
-LOOKUP_FACTORS, LOOKUP_BAND = (2.51, 2.62), 0.84  # T = k (|u| - 0.84)^2 [N/V^2, V]
-
-
 def estimates_of(runs: Sequence[Recording], held_out: Mapping[str, Mapping] | None = None) -> dict[str, list]:
     """Thrust (K + 1,) on each run by every estimator, by name.
 
@@ -337,10 +346,6 @@ def _lookup(run: Recording) -> np.ndarray:
 # The effect of a larger process noise after each reversal of the command on the recordings.
 
 
-AFTER = 0.4  # s after the start and after each reversal
-FACTORS = (1.0, 4.0, 16.0, 64.0, 256.0)  # on Q in that time
-
-
 class Regime(NamedTuple):
     """Results with a factor on Q after reversals."""
 
@@ -382,16 +387,6 @@ def _filtered(model: StateSpaceModel, run: Recording, factor: float) -> tuple[np
     measured = ~np.isnan(run.tachometer)
     squares = estimates.innovations[0, measured, 0] ** 2 / estimates.innovation_covs[0, measured, 0, 0]
     return np.array(thrust), squares, float(estimates.log_likelihoods.sum())
-
-
-RESULTS = Path("out") / "recordings.json"
-MEAN = "mean"
-RATIO_HEADER = ["run", "own, N", "ours, N", "ratio", "best clocks", "raw rows"]
-CLOCK_HEADER = ["run", "offset, s", "first half", "second half"]
-LADDER_HEADER = ["model", "ratio, worst", "ratio, mean", "raw rows, worst", "log-likelihood"]
-NUMBER_HEADER = ["constant", "value", "standard error", "without one run", "unit"]
-
-Estimates = Mapping[str, Sequence[np.ndarray]]
 
 
 class Table(NamedTuple):

@@ -35,6 +35,36 @@ from tuning.identification.result import read_values, valued
 DT = 0.04  # of the recordings [s]
 SUBSTEPS = 4  # of 10 ms: stable for rates of up to 278 1/s
 IDENTIFIED = Path(__file__).with_name("identified.toml")
+STATES = (
+    Quantity("motor speed", "n", "rad/s"),
+    Quantity("tachometer speed", "y", "rad/s"),
+    Quantity("axial flow", "v", "m/s"),
+    Quantity("effective command", "d", "V"),
+)
+MOUNT = (
+    Quantity("force in the mount", "q", "N"),
+    Quantity("rate of the force in the mount", "r", "N/s"),
+)
+INITIAL = (30.0, 30.0, 0.03, 0.0), (5.0, 200.0)  # standard deviations, of the mount last
+PROCESS = (5.0, 1.0, 3e-3, 0.0), (0.0, 0.0)  # standard deviations of the noise of a step
+COMMAND = Quantity("command", "u", "V")
+AMBIENT = Quantity("measured ambient flow", "flow", "m/s")
+TACHOMETER = Quantity("motor speed without its sign", "tach", "rad/s")
+LOAD_CELL = Quantity("load cell", "load", "N")
+SENSORS = (1.8, 1.0)  # standard deviations of tachometer [rad/s] and load cell [N]
+
+# Of the offset between two clocks.
+REACH, STEP = 0.15, 0.001  # range of offsets to either side of zero, and its step [s]
+EDGES = 0.2  # left out at both ends, so that the shifted series covers all samples [s]
+
+# Of the recorded runs.
+FOLDER = "closed_loop_25Hz"
+GATE = 0.12  # larger values of the flow sensor are taken to be wrong [m/s]
+FLOW_RATE = 0.1  # weight of a new sample in the smoothed flow
+# The recorder's thrust T = c_n n|n| - c_nv v|n| - c_v v|v|, for its two kinds of model (Boehm 2019).
+OWN = (1.466934e-3, 0.4146275, 0.0)
+OWN_NONLINEAR = (1.4657e-3, 0.375535, 37.7137)  # of runs named NLO2
+UNKNOWN = "CL1state"  # runs so named had an estimator with other coefficients, which the files do not tell
 
 
 class Constants(NamedTuple):
@@ -58,25 +88,6 @@ class Constants(NamedTuple):
     mount_frequency: float = 14.0  # w/2 pi [Hz]
     mount_damping: float = 0.1  # zeta
     substep: float = DT / SUBSTEPS  # [s]
-
-
-STATES = (
-    Quantity("motor speed", "n", "rad/s"),
-    Quantity("tachometer speed", "y", "rad/s"),
-    Quantity("axial flow", "v", "m/s"),
-    Quantity("effective command", "d", "V"),
-)
-MOUNT = (
-    Quantity("force in the mount", "q", "N"),
-    Quantity("rate of the force in the mount", "r", "N/s"),
-)
-INITIAL = (30.0, 30.0, 0.03, 0.0), (5.0, 200.0)  # standard deviations, of the mount last
-PROCESS = (5.0, 1.0, 3e-3, 0.0), (0.0, 0.0)  # standard deviations of the noise of a step
-COMMAND = Quantity("command", "u", "V")
-AMBIENT = Quantity("measured ambient flow", "flow", "m/s")
-TACHOMETER = Quantity("motor speed without its sign", "tach", "rad/s")
-LOAD_CELL = Quantity("load cell", "load", "N")
-SENSORS = (1.8, 1.0)  # standard deviations of tachometer [rad/s] and load cell [N]
 
 
 def effective(command, c):
@@ -207,10 +218,6 @@ def model() -> StateSpaceModel:
 # The offset between the clocks of two recorders of the same quantity.
 
 
-REACH, STEP = 0.15, 0.001  # range of offsets to either side of zero, and its step [s]
-EDGES = 0.2  # left out at both ends, so that the shifted series covers all samples [s]
-
-
 def clock_offset(times: np.ndarray, here: np.ndarray, other: np.ndarray) -> float:
     """The offset s [s] of least sum of squares of here(t) - other(t + s).
 
@@ -232,15 +239,6 @@ def offset_by_halves(times: np.ndarray, here: np.ndarray, other: np.ndarray) -> 
     halves = slice(None, middle), slice(middle, None)
     first, last = (clock_offset(times[half], here[half], other[half]) for half in halves)
     return first, last
-
-
-FOLDER = "closed_loop_25Hz"
-GATE = 0.12  # larger values of the flow sensor are taken to be wrong [m/s]
-FLOW_RATE = 0.1  # weight of a new sample in the smoothed flow
-# The recorder's thrust T = c_n n|n| - c_nv v|n| - c_v v|v|, for its two kinds of model (Boehm 2019).
-OWN = (1.466934e-3, 0.4146275, 0.0)
-OWN_NONLINEAR = (1.4657e-3, 0.375535, 37.7137)  # of runs named NLO2
-UNKNOWN = "CL1state"  # runs so named had an estimator with other coefficients, which the files do not tell
 
 
 class Recording(NamedTuple):

@@ -1,6 +1,8 @@
-"""Which filters the studies of the vehicle compare, by name.
+"""The filters that the studies of the vehicle compare, by name, and dead reckoning of position and attitude.
 
-Integrals are by the trapezoidal rule. Yaw counts full turns; its errors are the short way round.
+Integrals are by the trapezoidal rule. Yaw counts full turns; its errors are wrapped. Beside the package's filters
+there are an extended filter that takes roll and pitch from its own dead reckoning, and the ensemble filter as
+printed in one paper, whose members are all predicted from the mean.
 
 Source of the transformation by yaw alone: Ngatini, Nurhadi (2019), equations 1 to 4.
 """
@@ -33,6 +35,12 @@ from tuning.experiments.vehicle.papers import FUZZY_HIGH, FUZZY_LOW, papers_mode
 
 
 POSE_ANGLES = (False, False, False, True)  # of x, y, z and yaw
+KEPT = 5  # roll, pitch and the last p, q, r
+MEMBERS = (50, 100, 200, 300)
+NARROW_LOW = (0.5, -0.1, -0.1, -0.1, -0.3, -0.3)  # [m/s], [rad/s]: approximate range on the paths after the start
+NARROW_HIGH = (1.1, 0.1, 0.1, 0.1, 0.3, 0.3)
+MEASUREMENTS = "measurements, no filter"
+EULER = {"integration": "euler"}  # as in the papers; the truth and our other filters use Runge-Kutta
 
 
 @inlined
@@ -104,9 +112,6 @@ def _integral(rates: np.ndarray, dt: float) -> np.ndarray:
 
 
 # An extended Kalman filter of six velocities that takes roll and pitch from its own dead reckoning.
-
-
-KEPT = 5  # roll, pitch and the last p, q, r
 
 
 @lru_cache(maxsize=64)
@@ -190,13 +195,6 @@ class MeanPropagatingEnKF(EnsembleKalmanFilter):
 
     name: ClassVar[str] = "mean-propagating enkf"
     page: ClassVar[Page] = EnsembleKalmanFilter.page._replace(propagate=advance_from_the_mean)
-
-
-MEMBERS = (50, 100, 200, 300)
-NARROW_LOW = (0.5, -0.1, -0.1, -0.1, -0.3, -0.3)  # [m/s], [rad/s]: approximate range on the paths after the start
-NARROW_HIGH = (1.1, 0.1, 0.1, 0.1, 0.3, 0.3)
-MEASUREMENTS = "measurements, no filter"
-EULER = {"integration": "euler"}  # as in the papers; the truth and our other filters use Runge-Kutta
 
 
 class Estimator(NamedTuple):

@@ -1,7 +1,5 @@
 """All filters on the same runs of a path: truth, estimates, scores, and a picture of the paths.
 
-NEES is the normalised estimation error squared.
-
 The papers do not define their paths. These are ours with the same names: each starts at rest at the origin, and on
 IV the planes are chosen so that the path ends at the printed point, (10, 18, 6) m.
 """
@@ -53,6 +51,27 @@ from tuning.experiments.vehicle.papers import (
 THRUST = 2.84531  # [N]; holds 1 m/s, the printed speed
 TORQUE_ARM = -0.006  # propeller's torque over its thrust [m]
 TORQUE = -0.017  # [N m]; that of the constant thrust
+MOST_RUNS = 10_000
+AT_A_TIME = 4  # runs: 31560 steps of eight states and covariances are 23 MB a run, and Ctrl-C waits for them
+SETTLED = 2000  # steps, after which velocities are scored
+OnPart = Callable[[int, int, str], None]  # (done, total, what was done)
+
+# Of the papers' studies.
+OTHER_WORLD = "no restoring moments"
+
+# Of the picture.
+TRUTH = "truth"
+STYLES = {
+    TRUTH: TRUTH_LOOK,
+    "EnKF8 N=50": plot_style("enkf") | {"linewidth": 1.4},
+    "EnKF8 N=100": {"color": GREEN, "linewidth": 1.2, "linestyle": (0, (6, 3))},
+    "EnKF8 N=200": {"color": SKY, "linewidth": 1.2, "linestyle": (0, (3, 3))},
+    "EnKF8 N=300": {"color": PLUM, "linewidth": 1.2, "linestyle": (0, (1, 2))},
+    "EnKF8 N=50 by yaw alone": {"color": BLUE, "linewidth": 1.4, "linestyle": (0, (4, 2))},
+    "fuzzy 0..1": plot_style("fuzzy") | {"linewidth": 1.2, "linestyle": (0, (1, 1))},
+}
+LEAST_SPAN = 2.0  # of an axis [m]: millimetres of a straight path are no shape
+EVERY = 20  # steps between points of a line
 
 
 class Manoeuvre(NamedTuple):
@@ -149,9 +168,6 @@ def position_ratio(a: Scores, b: Scores, field: str) -> Interval:
     return interval(float(np.sqrt(above.mean() / below.mean())), ratios)
 
 
-MOST_RUNS = 10_000
-AT_A_TIME = 4  # runs: 31560 steps of eight states and covariances are 23 MB a run, and Ctrl-C waits for them
-SETTLED = 2000  # steps, after which velocities are scored
 MEASURED_PLACES = tuple("uvwpqr".index(name) for name in MEASURED)
 
 
@@ -182,9 +198,6 @@ class Task(NamedTuple):
     path: str
     world: str
     estimators: Sequence[Estimator]
-
-
-OnPart = Callable[[int, int, str], None]  # (done, total, what was done)
 
 
 def settled(steps: int) -> slice:
@@ -342,7 +355,6 @@ def along_path(world: str, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 PAPERS: dict[str, Paper] = {paper.name: paper for paper in (NGATINI2017, NGATINI2019)}
-OTHER_WORLD = "no restoring moments"
 
 
 def tasks_of(paper: str) -> list[Task]:
@@ -359,20 +371,6 @@ def tasks_of(paper: str) -> list[Task]:
 
 
 # The paths in three dimensions: one run of each, truth and estimates.
-
-
-TRUTH = "truth"
-STYLES = {
-    TRUTH: TRUTH_LOOK,
-    "EnKF8 N=50": plot_style("enkf") | {"linewidth": 1.4},
-    "EnKF8 N=100": {"color": GREEN, "linewidth": 1.2, "linestyle": (0, (6, 3))},
-    "EnKF8 N=200": {"color": SKY, "linewidth": 1.2, "linestyle": (0, (3, 3))},
-    "EnKF8 N=300": {"color": PLUM, "linewidth": 1.2, "linestyle": (0, (1, 2))},
-    "EnKF8 N=50 by yaw alone": {"color": BLUE, "linewidth": 1.4, "linestyle": (0, (4, 2))},
-    "fuzzy 0..1": plot_style("fuzzy") | {"linewidth": 1.2, "linestyle": (0, (1, 1))},
-}
-LEAST_SPAN = 2.0  # of an axis [m]: millimetres of a straight path are no shape
-EVERY = 20  # steps between points of a line
 
 
 class PathRun(NamedTuple):

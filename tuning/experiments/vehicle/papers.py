@@ -19,6 +19,14 @@ MEASURED = ("u", "v", "w", "r")  # H picks these
 POSE = ("x", "y", "z", "psi")  # [m], [m], [m], [rad]
 FUZZY_LOW, FUZZY_HIGH = (0.0,) * 6, (1.0,) * 6  # bounds of the velocities; the rules are the corners
 RUNS = 10  # "mean of 10 runs"
+ANGLE_NOISE = 1e-6  # of roll and pitch, standard deviation per step [rad]: so Q of eight states is not singular
+START = (1e-3,) * 6 + (1e-4,) * 2 + (0.0,) * 4  # standard deviations about rest at the origin; P_0 is not printed
+WORLDS = {"vehicle": SEGOROGENI, "no restoring moments": SEGOROGENI._replace(zG=0.0)}
+"""Segorogeni with our parameters, and the same with the centre of gravity at the centre of buoyancy.
+
+Then nothing depends on roll and pitch, so that the papers' six velocities are a closed system.
+"""
+COUNTS = {"velocities": 6, "motion": 8, "navigation": 12}
 
 
 class PrintedRow(NamedTuple):
@@ -43,16 +51,6 @@ class Paper(NamedTuple):
     name: str
     source: str
     remarks: tuple[str, ...]
-
-
-ANGLE_NOISE = 1e-6  # of roll and pitch, standard deviation per step [rad]: so Q of eight states is not singular
-START = (1e-3,) * 6 + (1e-4,) * 2 + (0.0,) * 4  # standard deviations about rest at the origin; P_0 is not printed
-WORLDS = {"vehicle": SEGOROGENI, "no restoring moments": SEGOROGENI._replace(zG=0.0)}
-"""Segorogeni with our parameters, and the same with the centre of gravity at the centre of buoyancy.
-
-Then nothing depends on roll and pitch, so that the papers' six velocities are a closed system.
-"""
-COUNTS = {"velocities": 6, "motion": 8, "navigation": 12}
 
 
 def papers_model(states: str, world: str = "vehicle", **arguments) -> StateSpaceModel:

@@ -1,7 +1,4 @@
-"""The papers' tables beside ours, and sentences with numbers on them, for docs/auv.md and `thruster reproduce`.
-
-NEES is the normalised estimation error squared.
-"""
+"""The papers' tables beside ours, and sentences with numbers on them, for docs/auv.md and `thruster reproduce`."""
 
 from __future__ import annotations
 
@@ -49,6 +46,14 @@ FIELDS = {
     "planar": "similar to ours by yaw alone, an error that no filter can correct",
 }
 ENKF, FKF = "EnKF8 N=50", "fuzzy 0..1"  # our counterparts of the printed filters
+GOLDEN = math.sqrt((math.sqrt(5.0) - 1.0) / 2.0 * NOISE)  # P = 0.618 R: Q = R, and the state itself is measured
+MEAN_ONLY = math.sqrt(2.0 / 3.0 * NOISE)  # the same for a gain of 1/2
+NO_POSTERIOR_BOUND = (
+    "The bound is the Riccati recursion along the noise-free path. The posterior Cramer-Rao bound is useless "
+    "here: roll and pitch have a noise of 1e-6 rad a step, and its averages over truths take the smallest "
+    "differences of Jacobians for information: a pitch to 3 mrad, where a consistent filter has 10."
+)
+RUNS_OF = {"ngatini2019": 50, "ngatini2017": 10}
 
 
 class Finding(NamedTuple):
@@ -148,15 +153,6 @@ def with_interval(estimate: Interval) -> str:
     """A value with its interval; nothing for NaN."""
     value, low, high = map(digits, estimate)
     return f"{value} [{low}, {high}]" if value else ""
-
-
-GOLDEN = math.sqrt((math.sqrt(5.0) - 1.0) / 2.0 * NOISE)  # P = 0.618 R: Q = R, and the state itself is measured
-MEAN_ONLY = math.sqrt(2.0 / 3.0 * NOISE)  # the same for a gain of 1/2
-NO_POSTERIOR_BOUND = (
-    "The bound is the Riccati recursion along the noise-free path. The posterior Cramer-Rao bound is useless "
-    "here: roll and pitch have a noise of 1e-6 rad a step, and its averages over truths take the smallest "
-    "differences of Jacobians for information: a pitch to 3 mrad, where a consistent filter has 10."
-)
 
 
 def unstable_corners(low=FUZZY_LOW, high=FUZZY_HIGH, world: str = "vehicle") -> tuple[int, float]:
@@ -331,9 +327,6 @@ def _rates(scores: Scores) -> str:
 
 # Tables and a picture of docs/auv.md, of what `thruster reproduce` runs: some minutes on two cores. Seconds of a
 # run are those of the machine, all else repeats.
-
-
-RUNS_OF = {"ngatini2019": 50, "ngatini2017": 10}
 
 
 @cache

@@ -1,7 +1,4 @@
-"""What the page exports: a tuned file, Python lines, the command, or the picture of what is seen.
-
-What the page shows as one figure of matplotlib, for PNG and SVG.
-"""
+"""Export from the page: a tuned file, Python lines, the command, or one matplotlib figure as PNG or SVG."""
 
 from __future__ import annotations
 
@@ -22,6 +19,13 @@ from tuning.exploring.view import View
 WITHIN_95 = 1.959963984540054  # standard normal deviates
 MOST_STATES, MOST_INNOVATIONS = 4, 2
 INK, ESTIMATE = "#1b1f24", "#0b6bb8"
+KINDS = {
+    "tuned": "tuned file",
+    "python": "Python lines",
+    "command": "command",
+    "png": "PNG picture",
+    "svg": "SVG picture",
+}
 
 
 def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) -> Figure:
@@ -104,15 +108,6 @@ def mean_of_runs(values: np.ndarray) -> np.ndarray:
     known = np.isfinite(values)
     total = np.where(known, values, 0.0).sum(axis=0)
     return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
-
-
-KINDS = {
-    "tuned": "tuned file",
-    "python": "Python lines",
-    "command": "command",
-    "png": "PNG picture",
-    "svg": "SVG picture",
-}
 
 
 class File(NamedTuple):

@@ -1,7 +1,7 @@
-"""The pictures of a `View`: states with their band, innovations, NIS and NEES, autocorrelation.
+"""The pictures of the page: those of a `View` over time or lags, and a `Map` of score or NIS over two knobs.
 
-What the page draws next, in one message: as several, they would be drawn in as many frames of the screen. The
-picture of a `Map`: score or NIS over two knobs, the study's trials on it, and the point where one is.
+A `View` has states with their band, innovations, NIS and NEES, and autocorrelation. All that the page draws next
+goes in one message: several would be drawn in as many frames of the screen.
 """
 
 from __future__ import annotations
@@ -29,6 +29,16 @@ from tuning.exploring.page.export import WITHIN_95, mean_of_runs, present
 from tuning.exploring.view import Knob, View
 
 Column = np.ndarray | Sequence[np.ndarray]
+HELD = ("#d55e00", "#009e73", "#cc79a7", "#e69f00")  # Okabe, Ito (2008), "Color universal design"
+HEIGHT = 132  # [px]
+ROOM = 0.06  # of a range, left free at its ends
+KEPT = 0.45  # of an axis that what is drawn has to fill, or the axis is drawn anew
+OF_BAND = 0.98  # of a band's points that are always in the picture: at the start it is often much wider
+SHOWN = 3  # states at first
+Look = tuple[int, int, bool]  # points across, which run, and whether errors are drawn in place of states
+MAP_HEIGHT = 330  # [px]
+BAD = 5.0  # times the least score, where the scale of colours ends
+TICKS = "const size = log ? 10**tick : tick; return size < 1e-2 || size >= 1e4 ? size.toExponential(log ? 0 : 1)"
 
 
 class Sent:
@@ -125,9 +135,6 @@ def corners(*lines: np.ndarray) -> np.ndarray:
 # Colours of the page's pictures on a light and on a dark ground, told apart by all kinds of colour vision.
 
 
-HELD = ("#d55e00", "#009e73", "#cc79a7", "#e69f00")  # Okabe, Ito (2008), "Color universal design"
-
-
 class Colours(NamedTuple):
     """Of one ground."""
 
@@ -166,12 +173,6 @@ def paint(picture: figure, colours: Colours) -> None:
 
 
 # The picture of one quantity over time, or over lags: a line in its band.
-
-
-HEIGHT = 132  # [px]
-ROOM = 0.06  # of a range, left free at its ends
-KEPT = 0.45  # of an axis that what is drawn has to fill, or the axis is drawn anew
-OF_BAND = 0.98  # of a band's points that are always in the picture: at the start it is often much wider
 
 
 def new_figure(name: str, height: int = HEIGHT, **options: Any) -> figure:
@@ -299,10 +300,6 @@ def _set_visible(renderer: Any, visible: bool) -> None:
         renderer.visible = visible
 
 
-SHOWN = 3  # states at first
-Look = tuple[int, int, bool]  # points across, which run, and whether errors are drawn in place of states
-
-
 class Pictures:
     """All pictures over time of one bench, and what they show."""
 
@@ -414,9 +411,6 @@ def lines_of(view: View, i: int, run: int, at: np.ndarray, errors: bool) -> tupl
     return fan[run], None, [errors_of_run for number, errors_of_run in enumerate(fan) if number != run]
 
 
-MAP_HEIGHT = 330  # [px]
-BAD = 5.0  # times the least score, where the scale of colours ends
-TICKS = "const size = log ? 10**tick : tick; return size < 1e-2 || size >= 1e4 ? size.toExponential(log ? 0 : 1)"
 TICKS += " : String(+size.toPrecision(3))"
 
 

@@ -1,16 +1,12 @@
-"""One tab of the page: answers what it asks, and keeps what it shows.
+"""The server of the page, loopback only, and a session for each tab, which answers its questions.
 
-The server of the page: loopback only, and nothing is answered without the random token in its path.
+Access is decided before any handler is chosen, for pages, scripts and websockets alike (`Guarded`):
 
-Who may talk to it is decided before any handler is chosen, for pages, scripts and websockets alike (`Guarded`):
-
-    path    begins with the token, compared in constant time
+    path    begins with the random token, compared in constant time
     Host    is this server's own address, so that another name that leads here does not reach it (DNS rebinding)
     Origin  where a browser sends one, is this server's own; a websocket must send it
 
-Everything else is one empty answer, 404, whether the token is nearly right or not.
-
-The document of a tab: the template around the pictures.
+Anything else gets one empty answer, 404, whether the token is nearly right or not.
 """
 
 from __future__ import annotations
@@ -51,6 +47,21 @@ from tuning.exploring.view import View
 WIDTHS = (200, 4000)  # of a picture, in points
 MOST_TRIALS = 10_000
 log = logging.getLogger(__name__)
+
+# Of the server.
+LOOPBACK = "127.0.0.1"
+NAMES = (LOOPBACK, "localhost")
+LEFT_FOR = 6.0  # [s] without an open page, after which the server ends; a page that is loaded anew takes less
+LOOK_EVERY = 500  # [ms]
+MOST_SENT = 2**20  # bytes of a request, which are read before its token is; the page asks by websocket
+HEADERS = {
+    "Referrer-Policy": "no-referrer",  # the token stands in the address
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+    "Cross-Origin-Resource-Policy": "same-site",
+    "Content-Security-Policy": "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; form-action 'none'",
+}
+SEEDS = 8
 
 
 class Wire(DataModel):
@@ -323,20 +334,6 @@ def _plain(value: Any) -> Any:
     return int(number) if number.is_integer() and abs(number) < 2**53 else number
 
 
-LOOPBACK = "127.0.0.1"
-NAMES = (LOOPBACK, "localhost")
-LEFT_FOR = 6.0  # [s] without an open page, after which the server ends; a page that is loaded anew takes less
-LOOK_EVERY = 500  # [ms]
-MOST_SENT = 2**20  # bytes of a request, which are read before its token is; the page asks by websocket
-HEADERS = {
-    "Referrer-Policy": "no-referrer",  # the token stands in the address
-    "X-Content-Type-Options": "nosniff",
-    "Cache-Control": "no-store",
-    "Cross-Origin-Resource-Policy": "same-site",
-    "Content-Security-Policy": "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; form-action 'none'",
-}
-
-
 class Careful(OutputTransform):
     """Each answer with the headers above; the page loads nothing from elsewhere, and tells nobody its address."""
 
@@ -467,7 +464,6 @@ class Server:
 
 
 HERE = Path(__file__).parent
-SEEDS = 8
 
 
 @cache
