@@ -31,6 +31,8 @@ from filters.pages.page import Page
 from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import at_least, finite, positive
 
+MOST_ITERATIONS = 50  # which programs repeat without a loop
+
 
 def noise_moment(measured, HPH, R, v):
     """E[v v' | z] of v ~ N(0, R) in z = h(x) + v, for the part H P H' of S and an innovation.
@@ -64,8 +66,6 @@ def part_that_is_kept(name: str, value) -> float:
 
 
 # The variational Bayesian filter: an extended Kalman filter with an inverse Wishart belief of R.
-
-MOST_ITERATIONS = 50  # which programs repeat without a loop
 
 
 def initial_variational(model):

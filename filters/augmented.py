@@ -1,7 +1,8 @@
-"""Joint estimation of state and parameters: a model whose unknown constants are states.
+"""Models with other states: unknown constants as states, a larger model's states, and unbounded states.
 
-A model of fewer states within a larger one: further states are kept as they are, and take part in nothing.
-Models in which states that have bounds are replaced by their logarithms or logits, which have none.
+In order: `augmented_model` makes constants of a model states, for joint estimation of state and parameters;
+`embedded_model` adds states that stay constant and take part in nothing; `transformed_model` replaces states with
+bounds by their logarithms or logits, which have none.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Attainable accuracy: Riccati covariances, steady-state and along a path, and the posterior Cramer-Rao bound.
 
 The posterior bound holds for any estimate and is computed from simulated true trajectories under each input. A
-wrapped error of an angle is at most half a turn, so a bound on its plain error is converted
-(`wrapped_variances`).
+wrapped error of an angle is at most half a turn, so a bound on its plain error is converted (`wrapped_variances`).
 """
 
 from __future__ import annotations
@@ -35,6 +34,20 @@ from thruster_env.model.simulate import noise_step, simulate, truth_steps
 from thruster_env.model.state_space import StateSpaceModel
 
 STIFF = 1e8  # S over R, from which an update of covariances loses half of their digits: roots keep them
+
+# Of wrapped variances.
+SMALL = 0.1  # variance [rad^2] up to which half a turn is so far away that nothing changes in float64
+TERMS, POINTS = 24, 400  # of the Fourier series; of the curve
+LEAST, MOST = 5e-3, 1e4  # multipliers mu [rad^4] of the curve's ends but for the last, mu = infinity
+
+# Of the posterior bound.
+ALL_UP_TO = 12  # states, for which the matrices of every sequence cost nothing that counts
+MOST_WORK = 2e10  # truths x steps x n^3, of all sequences of a larger model together
+MOST_STEPS = 3e7  # truths x steps x substeps, of all sequences of any model together
+WORK_AT_ONCE = 2e9  # of the same, some seconds: Ctrl-C is heard in between
+SINGULAR = 1e-13  # least eigenvalue of Q with unit variances, within rounding: Q has no inverse
+ROUNDING = 8 * 2.0**-52  # of slopes by central differences, relative to (|x_i| + s_i)/h_j
+MOST_BYTES, MATRICES = 2**28, 8  # of so many matrices (n, n) a sequence and step at once
 
 
 def riccati_covariances(model: AffineModel) -> tuple[np.ndarray, np.ndarray]:
@@ -107,11 +120,6 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
     return np.where((estimates.divergences > 0)[:, None, None, None], np.nan, estimates.covs)
 
 
-SMALL = 0.1  # variance [rad^2] up to which half a turn is so far away that nothing changes in float64
-TERMS, POINTS = 24, 400  # of the Fourier series; of the curve
-LEAST, MOST = 5e-3, 1e4  # multipliers mu [rad^4] of the curve's ends but for the last, mu = infinity
-
-
 def wrapped_variances(variances: np.ndarray, angles: Sequence[bool]) -> np.ndarray:
     """Bounds (..., n) on mean squares of wrapped errors, from posterior Cramér-Rao bounds P on plain ones.
 
@@ -165,15 +173,6 @@ def _ground_state(mu: float) -> tuple[float, float]:
 
 def _means(order: np.ndarray) -> np.ndarray:
     return np.where(order == 0, np.pi**2 / 3.0, 2.0 * np.where(order % 2, -1.0, 1.0) / np.maximum(order**2, 1))
-
-
-ALL_UP_TO = 12  # states, for which the matrices of every sequence cost nothing that counts
-MOST_WORK = 2e10  # truths x steps x n^3, of all sequences of a larger model together
-MOST_STEPS = 3e7  # truths x steps x substeps, of all sequences of any model together
-WORK_AT_ONCE = 2e9  # of the same, some seconds: Ctrl-C is heard in between
-SINGULAR = 1e-13  # least eigenvalue of Q with unit variances, within rounding: Q has no inverse
-ROUNDING = 8 * 2.0**-52  # of slopes by central differences, relative to (|x_i| + s_i)/h_j
-MOST_BYTES, MATRICES = 2**28, 8  # of so many matrices (n, n) a sequence and step at once
 
 
 def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int = 100, seed: int = 0) -> np.ndarray:

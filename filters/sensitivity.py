@@ -1,7 +1,7 @@
-"""The log-likelihood of innovations, its gradient and its information along parameters of a whole model.
+"""Log-likelihood of innovations and scores on true states, with gradients and Fisher information.
 
-The log-likelihood of innovations and its gradient with respect to Q and R, by sensitivities of the filter.
-Scores of a filter's estimate where the true states are known, with gradients with respect to Q and R.
+`likelihood` and `state_score` have gradients along Q and R, by sensitivities of the filter; `sensitivity` has
+gradient and information along parameters that move all numbers of a model.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Initial beliefs of runs: priors, and restarts of a filter from measurements."""
+"""Initial beliefs of runs, and restarts of a diverged filter: their step, states and likely cause in words."""
 
 from __future__ import annotations
 
@@ -24,6 +24,10 @@ from thruster_env.model.state_space import StateSpaceModel
 Flaw = tuple[np.ndarray, str]  # which states, (n,) bool, and the cause
 Moments = tuple[np.ndarray, np.ndarray]  # mean (n,) and covariance (n, n)
 UNKNOWN = "numbers of the filter itself overflow, or a variance became negative by rounding"
+PRIOR, MEASUREMENT = "prior", "measurement"
+STARTS = (PRIOR, MEASUREMENT)  # where recorded runs may begin
+WIDE = 10.0  # standard deviations of the prior, of which a free start has one
+FAINT = 1e-6  # part of the strongest direction, below which a direction is not seen
 
 
 class RestartWarning(RuntimeWarning):
@@ -309,11 +313,6 @@ def _kind(values: np.ndarray) -> str:
 
 
 # Where the trajectories of a batch begin, if that is not the model's prior; and a prior that is wide.
-
-PRIOR, MEASUREMENT = "prior", "measurement"
-STARTS = (PRIOR, MEASUREMENT)  # where recorded runs may begin
-WIDE = 10.0  # standard deviations of the prior, of which a free start has one
-FAINT = 1e-6  # part of the strongest direction, below which a direction is not seen
 
 
 class Starts(NamedTuple):

@@ -1,7 +1,7 @@
 """Tuned files: a filter's parameters with the model that they were tuned for.
 
-One reader serves all callers. Its values become arguments of filters, so it accepts known keys only, with
-finite numbers or lists of these.
+One reader serves all callers. Its values become arguments of filters, so it accepts known keys only, with finite
+numbers or lists of these.
 """
 
 from __future__ import annotations
@@ -25,6 +25,19 @@ from thruster_env.model.state_space import StateSpaceModel
 
 VECTORS = {"states": "states", "inputs": "input_quantities", "measurements": "measurements"}
 KEYS = ("digest", "dt", *VECTORS)
+FILE_FORMAT = "tuned filter"
+OLD_FORMAT = "thruster-env tuned filter"  # of versions 2 and 3
+FILE_VERSION = (
+    4  # 4: any problem, and its model as data; 3: the plant, and scenarios of files, as data; 2: no such
+)
+READ_VERSIONS = (2, 3, 4)
+NOISE = ("process_noise_cov", "measurement_noise_cov")
+PRIOR = "prior_cov_factor"  # on P_0
+FACTORS = "parameter_factors"  # a mapping of names to factors
+STATES = "states"  # which of its states a model has, by a name that the plant knows
+AUGMENTED = "augmented_constants"  # a mapping of constants that are states to [std, walk, mean]
+OPTION_NAMES = {"sensors": "sensor", "columns": "column", "clock_offset": "clock-offset", "held_out": "held-out"}
+MODEL_KEYS = (*NOISE, PRIOR, FACTORS, STATES, AUGMENTED)  # what every plant with data of its own knows
 
 
 def model_data(model: StateSpaceModel, dt: float | None) -> dict:
@@ -91,20 +104,7 @@ def _listed(entries: list) -> str:
 
 # The tuned file as every program reads it: data, checked entry by entry, that can name no code.
 
-FILE_FORMAT = "tuned filter"
-OLD_FORMAT = "thruster-env tuned filter"  # of versions 2 and 3
-FILE_VERSION = (
-    4  # 4: any problem, and its model as data; 3: the plant, and scenarios of files, as data; 2: no such
-)
-READ_VERSIONS = (2, 3, 4)
-NOISE = ("process_noise_cov", "measurement_noise_cov")
-PRIOR = "prior_cov_factor"  # on P_0
-FACTORS = "parameter_factors"  # a mapping of names to factors
-STATES = "states"  # which of its states a model has, by a name that the plant knows
-AUGMENTED = "augmented_constants"  # a mapping of constants that are states to [std, walk, mean]
-OPTION_NAMES = {"sensors": "sensor", "columns": "column", "clock_offset": "clock-offset", "held_out": "held-out"}
 OPTION_NAMES |= {"grid": "no-grid", "hold_gaps": "hold-gaps"}
-MODEL_KEYS = (*NOISE, PRIOR, FACTORS, STATES, AUGMENTED)  # what every plant with data of its own knows
 
 
 def sealed(content: Mapping[str, Any]) -> dict[str, Any]:

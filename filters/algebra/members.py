@@ -27,6 +27,8 @@ from thruster_env.core.sources import Source, column_reader, column_writer, entr
 from thruster_env.core.streams import exponential
 from thruster_env.graphs.graphs import Number, arctan2, over_members, size_of, where
 
+Kinds = tuple[tuple[tuple[int, ...], bool], ...]  # of arguments: the shape, and whether each member has one
+
 
 def _of_numbers(x) -> bool:
     return x.ndim == 1
@@ -127,8 +129,6 @@ def stretches(before, after, part):
 
 
 # Operations on vectors of members as loops over arrays (n, columns), for `calls`: a column per member.
-
-Kinds = tuple[tuple[tuple[int, ...], bool], ...]  # of arguments: the shape, and whether each member has one
 
 
 def function_of(matrix: Matrix) -> tuple[Callable, bool] | None:

@@ -1,19 +1,15 @@
-"""Operations of pages besides + - @ * / ** and .T: symmetry, angles, missing channels, quotients, Joseph's form.
+"""Operations of pages besides + - @ * / ** and .T, on matrices and on numbers, with their derivatives.
 
 Each is a function of arrays, an operation on Matrices, and a derivative along a parameter, such as
 
     d (C S^-1) = (dC - K dS) S^-1,  K = C S^-1
 
+In order: symmetry and angles; missing channels; quotients and Joseph's form; conditions, traces and counts; slopes
+of graphs; the geometric mean of two covariances. A choice computes both sides, so a page that divides guards its
+divisor, not its quotient. Slopes are Matrices of the same graph as values, so operations that they share, such as
+a gain, a quotient S^-1 v or the product P H', are evaluated once. A slope of None is zero.
+
 Source: Magnus, Neudecker (2019), Matrix Differential Calculus with Applications in Statistics and Econometrics.
-
-The geometric mean of two covariances.
-
-Operations on numbers: conditions and choices, traces, the count of measured channels; and slopes of graphs.
-
-A choice computes both sides. So a page that divides guards its divisor, not its quotient.
-
-Slopes are Matrices of the same graph as values. So operations that they share, such as a gain, a quotient S^-1 v
-or the product P H', are evaluated once. A slope of None is zero.
 """
 
 from __future__ import annotations
@@ -47,6 +43,9 @@ from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import Source, entrywise, is_array, matrix_reader, matrix_writer
 from thruster_env.graphs.graphs import Graph, called, where
 from thruster_env.graphs.programs import CALLED, CALLED_IN_ROUNDS, Place, Program, program_of
+
+ROUNDS = 14  # enough for condition numbers of 1e16: the last rounds each double the number of correct digits
+CLOSE = 1e-10  # if det((a + b)/2)^(1/size), which is at least 1, exceeds 1 by less, one more round is enough
 
 
 def sym(a):
@@ -413,10 +412,6 @@ def slopes_of(wanted: Sequence[Matrix], moves: Mapping[Matrix, Matrix]) -> list[
             moving = any(slope is not None for slope in of)
             slopes[matrix] = matrix.operation.slope(matrix, matrix.arguments, of) if moving else None
     return [slopes[matrix] for matrix in wanted]
-
-
-ROUNDS = 14  # enough for condition numbers of 1e16: the last rounds each double the number of correct digits
-CLOSE = 1e-10  # if det((a + b)/2)^(1/size), which is at least 1, exceeds 1 by less, one more round is enough
 
 
 @operation(same, lambda a, b: True)

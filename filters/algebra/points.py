@@ -1,18 +1,14 @@
-"""Operations of sigma-point filters: the root of a covariance, and points as the columns of a matrix.
+"""Operations of sigma-point and particle filters: roots of covariances, points, weights and log densities.
 
 With L L' = P, the unit vectors U = [0, I, -I] and a vector 1 of ones, the points x, x + g L_i, x - g L_i are the
-columns of x 1' + g L U.
-
-Source of the root's derivative: Murray (2016), "Differentiation of the Cholesky decomposition", arXiv:1602.07527.
-
-Operations on weighted samples, and log densities of innovations.
-
-A particle's x is a vector for each member, its weight or the logarithm of it a number for each member; in NumPy
-these are arrays (n, N) and (N,).
+columns of x 1' + g L U. A particle's x is a vector for each member, its weight or the logarithm of it a number for
+each member; in NumPy these are arrays (n, N) and (N,). Log densities have the derivative
 
     d log N(v; 0, S) = -w' dv + 1/2 tr((w w' - S^-1) dS),  w = S^-1 v
 
 Missing channels have v = 0 and no correlations in S, so they do not contribute.
+
+Source of the root's derivative: Murray (2016), "Differentiation of the Cholesky decomposition", arXiv:1602.07527.
 """
 
 from __future__ import annotations
@@ -41,6 +37,7 @@ from thruster_env.core.streams import LOWEST, parts
 from thruster_env.graphs.graphs import Number, arctan2, largest_of_members, over_members, where
 
 UNKNOWN = 1e-9  # largest slope of a zero pivot, relative to the entry of dP, at which the root has a derivative
+LEVEL = 0.5 * math.log(2.0 * math.pi)
 
 
 @operation(same)
@@ -312,8 +309,6 @@ def weighted_covariance(x, w):
 
 
 # Log densities of innovations, and their derivatives along a parameter.
-
-LEVEL = 0.5 * math.log(2.0 * math.pi)
 
 
 def log_density(v, s, measured):

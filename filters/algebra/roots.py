@@ -1,8 +1,7 @@
-"""Operations of square-root and information filters: inverses, orthogonal triangles, and blocks of matrices.
+"""Operations of square-root, UD and information filters: inverses, orthogonal triangles, blocks, and factors.
 
-Most have no derivative, because filters in these forms are differentiated in the covariance form.
-
-Operations of the UD form of a filter: factors U, D of P = U D U', in one matrix with D on its diagonal.
+The UD form has factors U, D of P = U D U' in one matrix with D on its diagonal. Most of these operations have no
+derivative, because filters in these forms are differentiated in the covariance form.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""A program in C that filters a log, row by row, beside a filter.
-
-The part of a program in C that finds the columns of a log by their headers, and their units.
-"""
+"""A C program that filters a log, row by row: its columns by their headers and units, and its loop."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from inspect import cleandoc
 from math import prod
 from typing import NamedTuple
 
@@ -144,7 +145,7 @@ class FilterPrograms(NamedTuple):
         points: how many points X has, if they are propagated one by one; else 0.
         members: how many members an ensemble has; else 0.
         model: the filter's model.
-        page: the module of the filter's equations.
+        about: the filter's equations and their source, for the header's comment.
     """
 
     start: Program
@@ -158,7 +159,7 @@ class FilterPrograms(NamedTuple):
     points: int
     members: int
     model: StateSpaceModel
-    page: str
+    about: str
 
     @property
     def all(self) -> tuple[Program, ...]:
@@ -173,6 +174,13 @@ class FilterPrograms(NamedTuple):
         )
         substeps = self.model.substeps * max(self.points, 1)
         return represent + substeps * propagate + add_process_noise + summarise, update
+
+
+def about(kind: type) -> str:
+    """A filter's equations and sources: the paragraphs of its docstring before "Attributes:", and on sources."""
+    equations, _, rest = cleandoc(kind.__doc__ or "").partition("\n\nAttributes:")
+    sources = [text for text in rest.split("\n\n") if text.startswith("Source")]
+    return "\n\n".join([equations, *sources])
 
 
 def programs_of(filter_: Filter) -> FilterPrograms:
@@ -217,7 +225,7 @@ def _row_programs(paged: FilterWithPage) -> FilterPrograms:
         for lies in [_where(shape, mean, argument, extra_parts, points)]
     )
     programs = start, represent, propagate, add_process_noise, update, Program([], [], [])
-    return FilterPrograms(*programs, extras, predicted_size, points, 0, model, page.update.__module__)
+    return FilterPrograms(*programs, extras, predicted_size, points, 0, model, about(type(paged)))
 
 
 def _member_programs(paged: EnsembleFilter) -> FilterPrograms:
@@ -244,7 +252,7 @@ def _member_programs(paged: EnsembleFilter) -> FilterPrograms:
         for lies in [_where(shape, "filter->x", argument, extra_parts)]
     )
     programs = start, represent, propagate, add_process_noise, update, summarise
-    return FilterPrograms(*programs, extras, 0, 0, size, model, type(paged).page.update.__module__)
+    return FilterPrograms(*programs, extras, 0, 0, size, model, about(type(paged)))
 
 
 def _nis(v: Matrix, s: Matrix) -> Matrix:

@@ -1,7 +1,7 @@
 """A folder with a filter in C: sources, headers, a program that filters a log, sizes, and an emulated board.
 
-The machine is ARM's MPS2 with the image AN386. Standard input and output of the program are those of the emulator,
-by semihosting.
+The board is ARM's MPS2 with the image AN386. Semihosting connects the program's standard input and output to the
+emulator's.
 """
 
 from __future__ import annotations
@@ -72,6 +72,36 @@ TESTS = """\
     void test_anew() noexcept {{ {name}_test_anew(&filter_); }}
 
 """
+STAND_IN = "another_name"  # of a filter whose own words are asked for
+
+# Of builds.
+CORTEX_M4 = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
+COMPILERS = {"gcc": "", "arm-none-eabi-gcc": CORTEX_M4}  # with arguments
+ONE = '#include "{name}.h"\n\nextern {name} a_filter;\n{name} a_filter;\n'  # a global, which is its size
+BUILD = (
+    "arm-none-eabi-gcc {flags} "
+    f"{CORTEX_M4} --specs=rdimon.specs -T board.ld "
+    "{name}.c main.c board.c -lm -o {name}.elf"
+)
+EMULATE = (
+    "qemu-system-arm -M mps2-an386 -nographic -monitor none -serial none "
+    "-semihosting-config enable=on,target=native -kernel {name}.elf"
+)
+BOARD_README = """
+## On an emulated controller
+
+On a Cortex-M4 that QEMU emulates (gcc-arm-none-eabi and qemu-system-arm of Debian):
+
+    {build}
+    {emulate} < log.csv > estimates.csv
+"""
+LABELS = {"gcc": "this computer's gcc", "arm-none-eabi-gcc": "Cortex-M4"}
+DRAWS = """
+`{name}_init` takes a key, two words of 32 bits, from which all random numbers of the {members} members follow by
+Philox4x32-10. The same key gives the estimates of `filter_.init(key)` in Python; drawing is not counted above.
+Members, their random numbers and scratch lie in the struct. `-O3 -fno-math-errno` makes vector instructions of the
+loops over members, and leaves the numbers as they are.
+"""
 
 
 def class_of(name: str, programs: FilterPrograms, *, single: bool = False, tested: bool = False) -> str:
@@ -96,8 +126,6 @@ def class_of(name: str, programs: FilterPrograms, *, single: bool = False, teste
 
 
 # NAME.h and NAME.c of a filter.
-
-STAND_IN = "another_name"  # of a filter whose own words are asked for
 
 
 class CFilter(NamedTuple):
@@ -154,10 +182,6 @@ def c_filter(
 
 
 # Bytes of a filter in C according to gcc: its struct, its stack and its code.
-
-CORTEX_M4 = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
-COMPILERS = {"gcc": "", "arm-none-eabi-gcc": CORTEX_M4}  # with arguments
-ONE = '#include "{name}.h"\n\nextern {name} a_filter;\n{name} a_filter;\n'  # a global, which is its size
 
 
 class Sizes(NamedTuple):
@@ -244,23 +268,6 @@ SECTIONS
     __end__ = end;
 }
 """
-BUILD = (
-    "arm-none-eabi-gcc {flags} "
-    f"{CORTEX_M4} --specs=rdimon.specs -T board.ld "
-    "{name}.c main.c board.c -lm -o {name}.elf"
-)
-EMULATE = (
-    "qemu-system-arm -M mps2-an386 -nographic -monitor none -serial none "
-    "-semihosting-config enable=on,target=native -kernel {name}.elf"
-)
-BOARD_README = """
-## On an emulated controller
-
-On a Cortex-M4 that QEMU emulates (gcc-arm-none-eabi and qemu-system-arm of Debian):
-
-    {build}
-    {emulate} < log.csv > estimates.csv
-"""
 
 
 # A folder with a filter in C: NAME.h, NAME.c, NAME.hpp, a program that filters a log, and how to build them.
@@ -277,7 +284,6 @@ target_link_libraries({name} PUBLIC m)
 add_executable({name}_log main.c)
 target_link_libraries({name}_log PRIVATE {name})
 """
-LABELS = {"gcc": "this computer's gcc", "arm-none-eabi-gcc": "Cortex-M4"}
 README = """\
 # The filter {filter} in C99, {precision} precision
 
@@ -300,12 +306,6 @@ inputs first: `./{name}_log HEADER ...`.
 A prediction is {predict} operations of floating point, an update {update}. With another compiler:
 `cc -std=c99 -Os -fstack-usage -c {name}.c && size {name}.o && cat {name}.su`.
 {draws}{alarms}{board}"""
-DRAWS = """
-`{name}_init` takes a key, two words of 32 bits, from which all random numbers of the {members} members follow by
-Philox4x32-10. The same key gives the estimates of `filter_.init(key)` in Python; drawing is not counted above.
-Members, their random numbers and scratch lie in the struct. `-O3 -fno-math-errno` makes vector instructions of the
-loops over members, and leaves the numbers as they are.
-"""
 
 
 def write_project(

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-import sys
 from collections.abc import Iterable, Mapping
-from inspect import cleandoc
 from math import prod
 
 import numpy as np
@@ -57,7 +55,6 @@ class Writer:
     def header(self, filter_name: str) -> str:
         """NAME.h."""
         name, model, real = self.name, self.model, self.real
-        page = sys.modules[self.programs.page].__doc__ or ""
         guard, n, m = name.upper(), model.n, model.m
         u, z = self._input_parameters()
         types, members, declared = (
@@ -66,7 +63,7 @@ class Writer:
         return f"""\
 /* The filter {filter_name}, {"single" if self.single else "double"} precision.
 
-{_indented(cleandoc(page))}
+{_indented(self.programs.about)}
 
    Compile without -ffast-math, which takes NaN for a number. */
 #ifndef {guard}_H

@@ -13,6 +13,10 @@ from scipy.special import ndtr, ndtri
 RESAMPLES = 2000  # bootstrap resamples of whole runs
 SLIGHT = 0.005  # difference of a ratio from 1 that makes practically none
 MORE_DIGITS = 3  # for an interval whose ends would else be the same number
+POINTS = 200  # where distribution functions are compared
+BARS = 20  # bars of the histogram, but one a step for up to twice as many steps
+FEWEST_RUNS = 20  # fewer resample too coarsely for a test
+LEVELS = np.arange(0.05, 1.0, 0.05)  # of intervals whose coverage is looked at
 
 
 class Interval(NamedTuple):
@@ -142,10 +146,6 @@ def _weights(count: int) -> np.ndarray:
 
 # Are probabilities or ranks uniform, as they are where a forecast's whole distribution is right?
 
-POINTS = 200  # where distribution functions are compared
-BARS = 20  # bars of the histogram, but one a step for up to twice as many steps
-FEWEST_RUNS = 20  # fewer resample too coarsely for a test
-
 
 class Uniformity(NamedTuple):
     """Values in 0 ... 1 of B runs against the uniform distribution."""
@@ -192,8 +192,6 @@ def uniformity(values: np.ndarray, steps: int = POINTS) -> Uniformity:
 
 
 # Scores of probabilistic estimates: coverage, CRPS (continuous ranked probability score) and ranks.
-
-LEVELS = np.arange(0.05, 1.0, 0.05)  # of intervals whose coverage is looked at
 
 
 def covered(errors: np.ndarray, deviations: np.ndarray, level: float = 0.95) -> np.ndarray:

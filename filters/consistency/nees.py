@@ -1,6 +1,6 @@
 """Is a filter's covariance consistent? NEES, NIS, the whiteness of innovations, and models that blow up.
 
-NEES is the normalised estimation error squared, e' P^-1 e; NIS is the normalised innovation squared, v' S^-1 v.
+NEES is the normalised estimation error squared, e' P^-1 e, NIS the normalised innovation squared, v' S^-1 v.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from thruster_env.core.threads import spread
 
 SINGULAR = 1e-12  # a pivot of P below this part of its variance counts as zero
 LARGEST_BY_ENTRIES = 12  # beyond, operations on single entries take longer than copies of columns
+LAGS = 20
+BLOW_UP = 1e3  # spreads of a channel: no Q or R explains a prediction that is so far off
 
 
 def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
@@ -163,8 +165,6 @@ def band_of_means(freedom: np.ndarray) -> np.ndarray:
 
 # Do innovations contain anything that the filter could have predicted? Their correlation over time.
 
-LAGS = 20
-
 
 class Whiteness(NamedTuple):
     """Correlations of normalised innovations over time, pooled over runs; all zero for a consistent filter."""
@@ -243,8 +243,6 @@ def _all_pairs(mask: np.ndarray, lags: int) -> np.ndarray:
 
 
 # Does a model blow up between samples? Then its predictions are off by more than any Q or R explains.
-
-BLOW_UP = 1e3  # spreads of a channel: no Q or R explains a prediction that is so far off
 
 
 def root_mean_square(values: np.ndarray) -> float:

@@ -1,9 +1,7 @@
-"""All checks of a filter's consistency in one report, from estimates and, where it is known, the truth.
+"""All checks of a filter's consistency in one report, from estimates and, if it is known, the truth.
 
-NEES is the normalised estimation error squared, NIS the normalised innovation squared, CRPS the continuous ranked
-probability score.
-
-Its sentences are each a function of the numbers that they state.
+In order: the report; remedies for symptoms in the innovations that no Q and R can cure; and sentences, each a
+function of the numbers that it states.
 """
 
 from __future__ import annotations
@@ -30,6 +28,21 @@ from filters.consistency.nees import LAGS, SquaresCheck, Whiteness, check_whiten
 from filters.engine.batch import Estimates
 from filters.ensembles.square_root import Members
 from thruster_env.core.angles import difference, is_angle, wrapped
+
+# Of symptoms.
+HEAVY = 6.0  # kurtosis of innovations; of Laplace's distribution
+STUCK = 40  # equal readings in a row, beyond what a quantised sensor at rest gives for long
+
+# Of sentences.
+SLIGHT_FACTOR = 1.2  # a mean NEES or NIS this close to the right one is off by little
+SLIGHT_DISTANCE = 0.02  # so are distributions this close
+SLIGHT_CORRELATION = 0.05  # and correlations this small
+SIGNIFICANT = 0.05
+NEVER = ("dt", "time_step")  # constants that are no quantity of the plant
+EVEN = "even, as far as these runs show"
+MOST_CONSTANTS = 8  # of a model, that are named
+MOST_STATES = 6  # that get a sentence
+NO_TRUTH = "These data have no truth: the following is based on the innovations alone."
 
 
 class EnsembleCheck(NamedTuple):
@@ -293,9 +306,6 @@ def _kurtosis(whitened_ones: np.ndarray, present: np.ndarray | None) -> tuple[fl
 
 # Symptoms in the innovations that no Q and R can cure, and their remedies.
 
-HEAVY = 6.0  # kurtosis of innovations; of Laplace's distribution
-STUCK = 40  # equal readings in a row, beyond what a quantised sensor at rest gives for long
-
 
 def symptoms(report: ConsistencyReport) -> list[str]:
     """A remedy for each symptom of a report, without a full stop."""
@@ -315,17 +325,6 @@ def symptoms(report: ConsistencyReport) -> list[str]:
     if report.divergences:
         remedies.append("more substeps of the model, or a smaller sample time, because estimates blow up")
     return remedies
-
-
-SLIGHT_FACTOR = 1.2  # a mean NEES or NIS this close to the right one is off by little
-SLIGHT_DISTANCE = 0.02  # so are distributions this close
-SLIGHT_CORRELATION = 0.05  # and correlations this small
-SIGNIFICANT = 0.05
-NEVER = ("dt", "time_step")  # constants that are no quantity of the plant
-EVEN = "even, as far as these runs show"
-MOST_CONSTANTS = 8  # of a model, that are named
-MOST_STATES = 6  # that get a sentence
-NO_TRUTH = "These data have no truth: the following is based on the innovations alone."
 
 
 def sentences(report: ConsistencyReport) -> list[str]:

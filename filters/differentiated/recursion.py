@@ -1,9 +1,8 @@
 """The recursion of a filter over runs, with derivatives along parameters.
 
-As many runs lie side by side in memory as a stage works on at once. Sums are kept for each run, so the grouping of
-runs has no effect.
-
-Where numbers lie in the memory of a filter and its derivatives, and the matrices that stand for them.
+In order: the layout of the memory, with the matrices that stand for its numbers; the score of a step and its
+slope; the compiled recursion. A stage works on several runs side by side in memory, but sums are kept for each
+run, so the grouping of runs has no effect.
 """
 
 from __future__ import annotations
@@ -43,6 +42,10 @@ from thruster_env.model.shape import (
     starts_of,
     transition_slopes,
 )
+
+LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # summed over steps
+EXTENDED = ExtendedKalmanFilter.page
+AT_ONCE = 4  # runs of a program: of eight each would take a fifth less, but a run alone twice as long
 
 
 class Memory(NumbersMemory):
@@ -117,8 +120,6 @@ class Memory(NumbersMemory):
 
 # The sum over a filter's steps, with its slopes: densities of innovations, or scores of true states.
 
-LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # summed over steps
-
 
 class Wanted(NamedTuple):
     """The outputs of a recursion: a score with its gradient, and options."""
@@ -170,9 +171,6 @@ def score_of_truth(memory: Memory, off: Matrix, cov: Matrix, moves: dict, score:
 
 
 __all__ = ["LIKELIHOOD", "LOG_SCORE", "SQUARES", "Recursion", "Wanted", "recursion_of", "stages_of"]
-
-EXTENDED = ExtendedKalmanFilter.page
-AT_ONCE = 4  # runs of a program: of eight each would take a fifth less, but a run alone twice as long
 
 
 class Recursion(NamedTuple):

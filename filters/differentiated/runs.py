@@ -1,4 +1,4 @@
-"""The log-likelihood of some runs and its derivatives along parameters of a whole model."""
+"""The log-likelihood of runs and its derivatives along parameters that move all numbers of a model."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ KINDS: tuple[type[PageFilter], ...] = (
     SageHusaFilter,
     VariationalBayesFilter,
 )
+STEP = 1e-6  # of parameters, which are scaled to sensible changes of 1
 
 
 def has_derivatives(kind: type[Filter]) -> bool:
@@ -76,9 +77,6 @@ def differentiable(model: StateSpaceModel, filter_: Filter | None) -> Differenti
     form = {"form": "covariance"} if filter_.forms else {}  # of the same estimates
     used = replace(filter_, model=model, **form)
     return Differentiable(used.kernel_model, used.written_page, used.own_parameters)
-
-
-STEP = 1e-6  # of parameters, which are scaled to sensible changes of 1
 
 
 class ModelSlopes(NamedTuple):

@@ -1,7 +1,6 @@
 """Analyses in parts: each state with the channels near it, or one channel after the other.
 
-The page of such a filter propagates the members and predicts their measurements; its own update moves no member.
-
+The page of such a filter propagates the members and predicts their measurements, but its update moves no member.
 The table has a row for each state, then one for each channel with independent noise of variance 1.
 """
 
@@ -29,6 +28,8 @@ from filters.pages.page import Page
 from thruster_env.core.compiled import inlined
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Functions, Shape
+
+LEAST = 1e-3  # tapers below are set to zero
 
 
 @inlined
@@ -177,9 +178,6 @@ def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: C
         summarise(memory, size)
 
     return plain._replace(update=update, table_rows=max(plain.table_rows, rows), scratch=m)
-
-
-LEAST = 1e-3  # tapers below are set to zero
 
 
 def look(model, x, z, e):

@@ -1,36 +1,6 @@
-"""The base of all ensemble filters: propagation of the members, inflation and its adaptation.
+"""The base of all ensemble filters: propagation of the members, inflation and relaxation.
 
-Inflation and relaxation take a function of a page and return one that does more. Adaptive inflation is
-
-    predict: x_j = mean + t^1/2 (x_j - mean) at the end of the step
-    update:  t = max(1, t + u), u the mode of  (1 + g u) exp(-u^2/(2 deviation^2)),
-             g = d log N(v; 0, (t'/t) A + R)/dt' at t' = t,  A = S - R the forecast's own part of S
-
-The belief keeps one factor t, initially 1. Before each update it is normal with a constant standard deviation, so
-that it can follow a model whose errors change; its likelihood is linearised about the last value. An error of the
-model that is not in Q widens the innovations, and so the ensemble.
-
-With a factor for each state, t_i is that of state i, and its likelihood is that of all channels if only t_i
-changes:
-
-    g_i = d log N(v; 0, D A D + R)/dt' at t' = t_i,  D_kk = (1 + c_ik (t'^1/2 - 1))/(1 + c_ik (t_i^1/2 - 1)),
-    c_ik = taper of i and k times |correlation of x_i and y_k| in the forecast
-
-so that for a single state and a linear h it equals the common factor.
-
-With an inverse gamma prior, p(t') ~ t'^-(a+1) exp(-(a+1) t/t'), whose mode is t, measurements also change the
-standard deviation. The belief keeps it as the width p = 1/(a+1), after the factors:
-
-    (deviation/t)^2 = p/((1 - 2p)^2 (1 - 3p)),  p at first that of `adaptive_inflation`, later between it and
-                      that of `least_deviation`
-    update:  t+ = t (1 + e), the mode of (1 + g (t' - t)) p(t');  p+ = p/(1 - 2d + d^2/p),  d = 1 - t/t+,
-             the inverse gamma density with the posterior's mode and its curvature there;  t = max(1, t+)
-
-Sources: Anderson (2007), "An adaptive covariance inflation error correction algorithm for ensemble filters", for
-one factor; the linear likelihood and factors of states are those of Anderson (2009), "Spatially and temporally
-varying adaptive covariance inflation for ensemble filters", here of all channels at once. The inverse gamma prior:
-El Gharamti (2018), "Enhanced adaptive inflation algorithm for ensemble filters", Monthly Weather Review 146, which
-finds the new deviation from a second point of the posterior instead of its curvature.
+Inflation, its adaptation to the innovations (`adapted`) and relaxation take a page and return one that does more.
 """
 
 from __future__ import annotations
@@ -203,7 +173,40 @@ def factor_and_width(t, p, g, narrowest, widest):
 
 @cache
 def adapted(page: Page) -> Page:
-    """A page with a factor for each number of `model.own.deviation`, or of the `widest` width."""
+    """A page whose inflation adapts to the innovations, by a factor t for each number of `model.own.deviation`.
+
+        predict: x_j = mean + t^1/2 (x_j - mean) at the end of the step
+        update:  t = max(1, t + u), u the mode of  (1 + g u) exp(-u^2/(2 deviation^2)),
+                 g = d log N(v; 0, (t'/t) A + R)/dt' at t' = t,  A = S - R the forecast's own part of S
+
+    The belief keeps the factor, initially 1. Before each update it is normal with a constant standard deviation,
+    so that it can follow a model whose errors change; its likelihood is linearised about the last value. An error
+    of the model that is not in Q widens the innovations, and so the ensemble.
+
+    With a factor for each state, t_i is that of state i, and its likelihood is that of all channels if only t_i
+    changes:
+
+        g_i = d log N(v; 0, D A D + R)/dt' at t' = t_i,  D_kk = (1 + c_ik (t'^1/2 - 1))/(1 + c_ik (t_i^1/2 - 1)),
+        c_ik = taper of i and k times |correlation of x_i and y_k| in the forecast
+
+    so that for a single state and a linear h it equals the common factor.
+
+    With an inverse gamma prior (`model.own` has the `widest` and the `narrowest` width), p(t') ~ t'^-(a+1)
+    exp(-(a+1) t/t'), whose mode is t, measurements also change the standard deviation. The belief keeps it as the
+    width p = 1/(a+1), after the factors:
+
+        (deviation/t)^2 = p/((1 - 2p)^2 (1 - 3p)),  p at first that of `adaptive_inflation`, later between it and
+                          that of `least_deviation`
+        update:  t+ = t (1 + e), the mode of (1 + g (t' - t)) p(t');  p+ = p/(1 - 2d + d^2/p),  d = 1 - t/t+,
+                 the inverse gamma density with the posterior's mode and its curvature there;  t = max(1, t+)
+
+    Sources: Anderson (2007), "An adaptive covariance inflation error correction algorithm for ensemble filters",
+    for one factor; the linear likelihood and factors of states are those of Anderson (2009), "Spatially and
+    temporally varying adaptive covariance inflation for ensemble filters", here of all channels at once. The
+    inverse gamma prior: El Gharamti (2018), "Enhanced adaptive inflation algorithm for ensemble filters", Monthly
+    Weather Review 146, which finds the new deviation from a second point of the posterior instead of its
+    curvature.
+    """
 
     def start(model):
         parameters = model.own
@@ -251,7 +254,7 @@ class EnsembleFilter(FilterWithPage):
         relaxation: fraction, 0 to 1, of each state's loss of spread in an update that is restored.
         adaptive_inflation: standard deviation, in each update, of a factor on the covariance of each forecast, in
             steps of any length; the factor is estimated from the innovations and is at least 1. 0 for no factor.
-            See `filters.ensembles.ensemble`.
+            See `adapted`.
         inflation_by_state: 1 for a factor of adaptive_inflation for each state, 0 for a common one.
         least_deviation: if positive, the factor's prior is an inverse gamma density with the initial standard
             deviation adaptive_inflation; measurements change it, but not below this. Both are relative to the

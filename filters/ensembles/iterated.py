@@ -31,6 +31,9 @@ from thruster_env.core.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Functions, Shape, number_places
 
+MOST_ITERATIONS = 20  # which programs repeat without a loop
+LONGEST_WINDOW = 1000  # steps
+
 
 def linearised_again(model, y, z, Y, v, S, R):
     """Slopes Y T^-1 and innovation z - mean(y) + Y w from y of members that the last Y, v and S have moved."""
@@ -255,10 +258,6 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     scratch = m + m * m + count
     sizes = 1 + length * size_of_step, rows, scratch  # extras of the row, kept rows of the table, scratch
     return Kernels(n, m, used, max(n, m), start, predict, update, summarise, *sizes)
-
-
-MOST_ITERATIONS = 20  # which programs repeat without a loop
-LONGEST_WINDOW = 1000  # steps
 
 
 def update(model, x, z, e):

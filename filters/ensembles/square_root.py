@@ -1,6 +1,6 @@
-"""Ensemble square root filters: transform (ETKF), serial (EnSRF) and finite-size (EnKF-N).
+"""Ensemble filters without perturbed measurements: ETKF, LETKF, EnSRF, EnKF-N and the rank histogram filter.
 
-The rank histogram filter, and recording the members of an ensemble after every step.
+`record_members` keeps the members of any ensemble filter after every step.
 """
 
 from __future__ import annotations
@@ -39,6 +39,9 @@ from thruster_env.core.checks import at_least as check_at_least
 from thruster_env.core.checks import positive
 from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import below, quantile
+
+ROUNDS = 8  # of Newton's method; innovations of up to two standard deviations need six
+FLATTEST = 0.25  # smallest slope by which a round divides
 
 
 def update_transform(model, x, z, e):
@@ -147,9 +150,6 @@ class SerialSquareRootFilter(LocalisedByParts):
 
 
 # The finite-size ensemble Kalman filter: inflation that follows from the innovation and the number of members.
-
-ROUNDS = 8  # of Newton's method; innovations of up to two standard deviations need six
-FLATTEST = 0.25  # smallest slope by which a round divides
 
 
 def variance_factor(parameters, A, R, v):

@@ -1,4 +1,4 @@
-"""The stochastic and the deterministic ensemble Kalman filter, and their localisation."""
+"""The stochastic and the deterministic ensemble Kalman filter, localisation, and random rotations."""
 
 from __future__ import annotations
 

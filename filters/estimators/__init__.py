@@ -1,1 +1,1 @@
-"""Estimators of other packages in the place of a filter."""
+"""Estimators of other packages in place of a filter."""

@@ -1,7 +1,4 @@
-"""The interface of an estimator: it maps inputs and measurements to means, and to covariances if it has them.
-
-Checks of an estimator's output: shapes, finite numbers, valid covariances.
-"""
+"""The interface of an estimator, which maps inputs and measurements to means and covariances, and its checks."""
 
 from __future__ import annotations
 
@@ -12,6 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import as_floats, correlation_flaws, short_repr
+
+PARTS = {"mean": "n", "cov": "nn", "innovation": "m", "innovation_cov": "mm"}
+NAMES = {
+    "mean": "mean",
+    "cov": "covariance",
+    "innovation": "innovation",
+    "innovation_cov": "covariance of the innovation",
+}
+ROUNDING = 1e-4  # of correlations: single precision leaves less
 
 
 class Output(NamedTuple):
@@ -74,16 +80,6 @@ def is_estimator(candidate) -> bool:
     return steps_alone(candidate) or (
         not isinstance(candidate, type) and callable(getattr(candidate, "run", None))
     )
-
-
-PARTS = {"mean": "n", "cov": "nn", "innovation": "m", "innovation_cov": "mm"}
-NAMES = {
-    "mean": "mean",
-    "cov": "covariance",
-    "innovation": "innovation",
-    "innovation_cov": "covariance of the innovation",
-}
-ROUNDING = 1e-4  # of correlations: single precision leaves less
 
 
 class Checks:

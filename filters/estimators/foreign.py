@@ -1,6 +1,6 @@
-"""`ForeignFilter`: an estimator of another package in the place of a filter.
+"""`ForeignFilter`: an estimator of another package in place of a filter, over logs and beside envs.
 
-Estimators at work beside envs: on one trajectory, or on one a copy of a vector env.
+Beside an env it runs on one trajectory, or on one for each copy of a vector env.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from thruster_env.core.checks import short_repr
 from thruster_env.core.modules import error_line
 from thruster_env.core.streams import GLOBAL_GENERATORS, GlobalGenerators, derived_seed, seeded_copy
 from thruster_env.model.continuous import same_dt
+
+DIFFERENCE = 1e-6  # between two runs of a key, relative to the largest number: threads differ by less
 
 
 class EstimatorSession:
@@ -144,9 +146,6 @@ class EstimatorBeliefs:
         return np.array(
             [np.reshape(getattr(session, name), shape) for session in self._sessions], dtype=np.float64
         )
-
-
-DIFFERENCE = 1e-6  # between two runs of a key, relative to the largest number: threads differ by less
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -14,6 +14,8 @@ from thruster_env.core.angles import difference, wrapped_where
 from thruster_env.core.sources import as_value
 from thruster_env.model.state_space import StateSpaceModel
 
+START = datetime(2000, 1, 1)  # of every trajectory: states carry a time, and only differences of it count
+
 # FilterPy's filters as estimators: linear, extended, unscented and their like.
 
 
@@ -183,8 +185,6 @@ def unscented(model: StateSpaceModel, alpha=1.0, beta=2.0, kappa=0.0) -> FilterP
 
 
 # Stone Soup's predictors and updaters as an estimator.
-
-START = datetime(2000, 1, 1)  # of every trajectory: states carry a time, and only differences of it count
 
 
 class StoneSoupEstimator(Estimator):

@@ -1,28 +1,6 @@
 """The extended Kalman filter and its kin: iterated, with a fading memory, Schmidt's, and the H-infinity filter.
 
 All linearise the model along their own estimate. The square-root and the UD form keep twice the digits of P.
-
-An orthogonal Theta from the right makes a matrix lower triangular:
-
-    predict: [F L, Q^(1/2)] Theta = [L, 0]
-    update:  [[R^(1/2), H L], [0, L]] Theta = [[S^(1/2), 0], [K S^(1/2), L]],
-             x += (K S^(1/2)) S^(-1/2) v
-
-No covariance is ever formed from another: P = L L' is for the reader only. L keeps twice the digits that P would,
-of states known a million times better than others.
-
-Source: Kaminski, Bryson, Schmidt (1971), "Discrete square root filtering: a survey of current techniques", IEEE
-Trans. Automatic Control 16(6).
-
-The UD form is
-
-    predict: U D U' = [F U, Q^(1/2)] diag(D, I) [F U, Q^(1/2)]',  by Gram and Schmidt's method with these weights
-    update:  one channel of R^(-1/2) z after the other, each a scalar whose noise has variance one
-
-Both factors lie in one matrix, D on its diagonal.
-
-Source: Bierman (1977), Factorization Methods for Discrete Sequential Estimation, chapter V; Thornton (1976),
-"Triangular covariance factorizations for Kalman filtering".
 """
 
 from __future__ import annotations
@@ -42,6 +20,8 @@ from filters.baselines import places_of
 from filters.pages.page import Page
 from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import at_least, between, one_of, positive, vector
+
+MOST_ITERATIONS = 20
 
 # The extended Kalman filter: the Kalman filter of the model linearised along its own estimate.
 
@@ -67,7 +47,15 @@ def update(model, x, P, z):
     return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
 
 
-# The square-root form of the Kalman filter: the root L of P = L L' is carried, by orthogonal steps.
+# The square-root form of the Kalman filter carries the root L of P = L L', by orthogonal Theta from the right that
+# make a matrix lower triangular:
+#
+#     predict: [F L, Q^(1/2)] Theta = [L, 0]
+#     update:  [[R^(1/2), H L], [0, L]] Theta = [[S^(1/2), 0], [K S^(1/2), L]],  x += (K S^(1/2)) S^(-1/2) v
+#
+# P = L L' is for the reader only: no covariance is formed from another, so L keeps twice the digits of states that
+# are known a million times better than others. Source: Kaminski, Bryson, Schmidt (1971), "Discrete square root
+# filtering: a survey of current techniques", IEEE Trans. Automatic Control 16(6).
 
 
 def initial_root(model):
@@ -111,7 +99,14 @@ def root_result(model, x, both, v, measured):
 SQUARE_ROOT = Page(propagate_root, add_process_noise_root, update_root, represent_root, initial_root)
 
 
-# The UD form of the Kalman filter: a unit upper triangular U and a diagonal D with P = U D U' are carried.
+# The UD form of the Kalman filter carries a unit upper triangular U and a diagonal D with P = U D U', in one
+# matrix with D on its diagonal:
+#
+#     predict: U D U' = [F U, Q^(1/2)] diag(D, I) [F U, Q^(1/2)]',  by Gram and Schmidt's method with these weights
+#     update:  one channel of R^(-1/2) z after the other, each a scalar whose noise has variance one
+#
+# Source: Bierman (1977), Factorization Methods for Discrete Sequential Estimation, chapter V; Thornton (1976),
+# "Triangular covariance factorizations for Kalman filtering".
 
 
 def initial_ud(model):
@@ -159,8 +154,8 @@ class ExtendedKalmanFilter(PageFilter):
                  x += K v,  P = (I - K H) P (I - K H)' + K R K'  (Joseph)
 
     Attributes:
-        form: form of the recursion: "covariance" as above, "square-root" or "ud" (`this module`), which keep
-            twice the digits of P. The estimates are equal to rounding.
+        form: form of the recursion: "covariance" as above, "square-root" or "ud", which keep twice the
+            digits of P. The estimates are equal to rounding.
 
     Raises:
         ValueError: if the form is unknown.
@@ -178,8 +173,6 @@ class ExtendedKalmanFilter(PageFilter):
 
 
 # The iterated extended Kalman filter: each iteration linearises the measurement at the last estimate.
-
-MOST_ITERATIONS = 20
 
 
 def update_iterated(model, x, P, z):

@@ -1,18 +1,4 @@
-"""The Kalman filter: affine models, schedules of operating points, the information form, and the steady gain.
-
-The update of the information form is
-
-    Y = P^-1 + H' R^-1 H,  P = Y^-1,  x += P H' R^-1 v
-
-Every channel adds its own information H' R^-1 H, so many channels and few states are cheap. The update needs no
-gain and no inverse of S; S is only computed for the likelihood. P must be positive definite throughout. Inverses
-are products W' W of inverse Cholesky factors W, symmetric and positive by construction.
-
-Source: Anderson, Moore (1979), Optimal Filtering, section 6.3.
-
-With a schedule the constants c of the affine model are linear in the last input between operating points, and
-constant beyond them; before the first input they are those of u = 0.
-"""
+"""The Kalman filter: affine models, schedules of operating points, the information form, and the steady gain."""
 
 from __future__ import annotations
 
@@ -33,9 +19,21 @@ from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import at_least, covariance, one_of
 from thruster_env.model.affine import AffineModel, linearize
 
+MOST_POINTS = 200  # of a schedule; programs are written out for them
+STABLE = 1.0 - 1e-7  # upper limit of |eigenvalues| of A (I - K C): errors decay within ten million steps
+
 
 def update_information(model, x, P, z):
-    """Update with the measurement z, by the inverse of the covariance; NaN marks missing channels."""
+    """Update with the measurement z, by the inverse of the covariance; NaN marks missing channels.
+
+        Y = P^-1 + H' R^-1 H,  P = Y^-1,  x += P H' R^-1 v
+
+    Every channel adds its own information H' R^-1 H, so many channels and few states are cheap. The update needs
+    no gain and no inverse of S, which is only computed for the likelihood. P must be positive definite throughout.
+    Inverses are products W' W of inverse Cholesky factors W, symmetric and positive by construction.
+
+    Source: Anderson, Moore (1979), Optimal Filtering, section 6.3.
+    """
     measured = present(z)
     H, R = mask_missing(measured, model.H(x)), uncorrelated(measured, model.R)
     v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
@@ -73,9 +71,6 @@ def update_scheduled(model, x, P, z):
 
 
 SCHEDULED = Page(propagate_scheduled, extended.add_process_noise, update_scheduled, initial=initial_scheduled)
-
-
-MOST_POINTS = 200  # of a schedule; programs are written out for them
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -172,8 +167,6 @@ class KalmanFilter(AffineFilter):
 
 
 # The steady-state Kalman filter: one gain for all steps, from Riccati's equation.
-
-STABLE = 1.0 - 1e-7  # upper limit of |eigenvalues| of A (I - K C): errors decay within ten million steps
 
 
 def update_steady(model, x, P, z):

@@ -1,9 +1,9 @@
 """Mixtures of Gaussians: the Gaussian sum filter and the Takagi-Sugeno fuzzy filter.
 
-The moments of a mixture, and its weights:
+A mixture has the moments and, after a measurement, the weights
 
     mean = sum of w_k x_k,  P = sum of w_k (P_k + (x_k - mean)(x_k - mean)')
-    after a measurement:  w_k becomes w_k N(v_k; 0, S_k)/L,  L = sum of w_k N(v_k; 0, S_k)
+    w_k becomes w_k N(v_k; 0, S_k)/L,  L = sum of w_k N(v_k; 0, S_k)
 """
 
 from __future__ import annotations
@@ -43,6 +43,12 @@ from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import Source, lower_pairs
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.shape import Functions, Shape
+
+Shapes = tuple[tuple[str, tuple[int, ...]], ...]  # of parameters, by name
+FEWEST_PARTS, MOST_PARTS = 7, 1000
+REACH = 4.5  # of the outermost parts, in standard deviations of the split component
+OVERLAP = 0.6  # standard deviation of a part, over the distance from one to the next
+BLENDINGS = ("weights", "moments", "output")
 
 
 class Parts(NamedTuple):
@@ -193,9 +199,6 @@ def parts_of(extras: np.ndarray, number: int, n: int) -> tuple[np.ndarray, np.nd
 @inlined
 def nothing(memory, inputs, numbers):
     """Do nothing: the function before the first of several."""
-
-
-Shapes = tuple[tuple[str, tuple[int, ...]], ...]  # of parameters, by name
 
 
 class MixturePage(NamedTuple):
@@ -374,11 +377,6 @@ class MixtureFilter(Filter):
         return parts_of(belief.extras, len(self.of_parts), self.model.n)
 
 
-FEWEST_PARTS, MOST_PARTS = 7, 1000
-REACH = 4.5  # of the outermost parts, in standard deviations of the split component
-OVERLAP = 0.6  # standard deviation of a part, over the distance from one to the next
-
-
 def split(model, x, P):
     """Weights of the parts before a measurement, and the direction g = P e/sqrt(e' P e) of the split."""
     e = model.own.unit
@@ -454,8 +452,6 @@ class GaussianSumFilter(MixtureFilter):
 
 
 # The Takagi-Sugeno fuzzy Kalman filter: one Kalman filter a rule, blended by memberships of the state.
-
-BLENDINGS = ("weights", "moments", "output")
 
 
 def initial_weights(model, x, P):

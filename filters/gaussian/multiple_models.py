@@ -1,6 +1,6 @@
 """Filters of several models: the interacting multiple model filter, and static model probabilities.
 
-Each mode has a filter with its own model; all lie in one row of numbers and are mixed, run, weighed and merged.
+Each mode has a filter with its own model. All lie in one row of numbers, and are mixed, run, weighted and merged.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ from thruster_env.model.shape import Shape, number_places, starts_of
 from thruster_env.model.state_space import StateSpaceModel
 
 LOST = 700.0  # log-likelihood of a mode whose filter restarts: this much below the least of the other modes
+MOST_MODES = 32
+SUM_TOLERANCE = 1e-9
+USUAL_FACTORS = (0.1, 1.0, 10.0)  # on Q
 
 
 class Mode(NamedTuple):
@@ -209,10 +212,6 @@ def _then(before: tuple, kernels: Kernels, offsets: tuple, stride: int) -> tuple
             restart(mode, of_mode, 0)
 
     return start, predict, update
-
-
-MOST_MODES = 32
-SUM_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -462,8 +461,6 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
 
 
 # Multiple model adaptive estimation: which one of several models is right.
-
-USUAL_FACTORS = (0.1, 1.0, 10.0)  # on Q
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,4 +1,4 @@
-"""Sigma-point filters: unscented, its square-root form, and cubature."""
+"""Sigma-point filters: unscented, its square-root form, and cubature; and the rules of a fuzzy filter."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from thruster_env.core.checks import finite, one_of, positive, short_repr, vecto
 from thruster_env.graphs.graphs import where
 from thruster_env.model.affine import AffineModel, linearize
 from thruster_env.model.state_space import StateSpaceModel
+
+MOST_STATES = 8  # premises, for 256 rules
 
 # Sigma points of the scaled unscented transform, and moments of values at them.
 
@@ -249,8 +251,6 @@ class CubatureKalmanFilter(PageFilter):
 
 
 # Rules of a fuzzy filter: a model's affine approximations at the corners of a range of its states.
-
-MOST_STATES = 8  # premises, for 256 rules
 
 
 @operation(lambda x, low, high, premises: (2 ** len(premises),))

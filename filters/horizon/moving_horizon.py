@@ -1,9 +1,8 @@
 """Moving-horizon estimation: the most probable states of the last steps, within bounds, at every step.
 
-Kernels of moving-horizon estimation: passes of a smoother over a window, until its states converge.
-
-Each step of a window keeps its Q, R and constants. Measurements of one time share a step; a second reading of a
-channel gets its own step, to which the state does not move.
+Passes of a smoother over the window are repeated until its states converge. Each step of a window keeps its Q, R
+and constants. Measurements of one time share a step; a second reading of a channel gets its own step, to which the
+state does not move.
 """
 
 from __future__ import annotations
@@ -29,6 +28,8 @@ MOST_PASSES = 100  # besides `iterations`, until the right bounds hold
 HALVINGS = 6  # of a step that increases the cost, if bounds do not change
 ROUNDING = 1e-9  # of a cost
 PATIENCE = 3  # passes without fewer wrong bounds, after which bounds change one by one
+MOST_STEPS, MOST_ITERATIONS = 200, 50
+KERNEL_HORIZONS = 10, 20, 50, 100, MOST_STEPS  # only for these there are kernels, so that studies compile few
 
 
 @lru_cache(maxsize=64)
@@ -282,10 +283,6 @@ def horizon_kernels(
         extras=numbers_place - number,
         scratch=numbers_end + (room + 1) * width,
     )
-
-
-MOST_STEPS, MOST_ITERATIONS = 200, 50
-KERNEL_HORIZONS = 10, 20, 50, 100, MOST_STEPS  # only for these there are kernels, so that studies compile few
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

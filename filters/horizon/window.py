@@ -1,4 +1,4 @@
-"""The window of a moving-horizon estimate: its layout in memory, and the computations of each step.
+"""The window of a moving-horizon estimate: its layout in memory, the computations of each step, and its bounds.
 
 They use deviations d_j = x_j - X_j from the estimate X of the window, about which the model is linearised:
 
@@ -7,20 +7,9 @@ They use deviations d_j = x_j - X_j from the estimate X of the window, about whi
                 l = F_{j-1}' l
 
 with d_j and P_j before the update in the last line. The adjoint l, a vector, needs neither P^-1 nor Q^-1: both may
-be singular. Source: Bryson, Frazier (1963), "Smoothing for linear and nonlinear dynamic systems".
+be singular. Components at a bound are conditioned on it, or released (`limits`).
 
-Bounds within a pass over a window: components that lie at a bound are conditioned on it, or released.
-
-Conditioning a Gaussian d, P on a value of component i is an accurate measurement of it:
-
-    d += k v,  P -= k s k',  k = P e_i/s,  s = (1 + 1e-9) P_ii,  v = value - d_i
-
-The backward pass adds the multiplier v/s - k' l to the adjoint l_i: the force with which the bound pushes. A
-component is released if its bound would have to pull, and held at a bound if its estimate lies beyond it. All
-components change at once; if that does not converge, they change one by one, which converges for a linear problem.
-
-Source: Judice, Pires (1994), "A block principal pivoting algorithm for large-scale strictly monotone linear
-complementarity problems", Computers & Operations Research 21(5).
+Source: Bryson, Frazier (1963), "Smoothing for linear and nonlinear dynamic systems".
 """
 
 from __future__ import annotations
@@ -62,6 +51,8 @@ HUBER, STUDENT, QUADRATIC = LOSSES = "huber", "student", "quadratic"
 OWN = tuple(
     (name, ()) for name in ("threshold", "disturbance_limit", "horizon", "iterations")
 )  # the filter's numbers
+ENOUGH = 1e-9  # rounding error of values beyond a bound, and of forces, in standard deviations
+SLACK = 1e-9  # fraction of a variance that a bound leaves, so that contradictory bounds appear as forces
 
 
 class Kept(NamedTuple):
@@ -242,10 +233,6 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
     return Works(*programs_of(page, functions, shape, stages).works)
 
 
-ENOUGH = 1e-9  # rounding error of values beyond a bound, and of forces, in standard deviations
-SLACK = 1e-9  # fraction of a variance that a bound leaves, so that contradictory bounds appear as forces
-
-
 class Limits(NamedTuple):
     """Functions of scratch and of a step of the belief; sigma bounds disturbances, in standard deviations.
 
@@ -307,7 +294,20 @@ def side_of(value, low, high, spread):
 
 @cache
 def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
-    """Functions that hold states within bounds, and disturbances if they are limited, for a model's sizes."""
+    """Functions that hold states within bounds, and disturbances if they are limited, for a model's sizes.
+
+    Conditioning a Gaussian d, P on a value of component i is an accurate measurement of it:
+
+        d += k v,  P -= k s k',  k = P e_i/s,  s = (1 + 1e-9) P_ii,  v = value - d_i
+
+    The backward pass adds the multiplier v/s - k' l to the adjoint l_i: the force with which the bound pushes. A
+    component is released if its bound would have to pull, and held at a bound if its estimate lies beyond it. All
+    components change at once; if that does not converge, they change one by one, which converges for a linear
+    problem.
+
+    Source: Judice, Pires (1994), "A block principal pivoting algorithm for large-scale strictly monotone linear
+    complementarity problems", Computers & Operations Research 21(5).
+    """
     n, step_layout, at = shape.n, kept_places(shape), scratch_places(shape)
     low, high = [-math.inf] * n, [math.inf] * n
     for bound in bounds:

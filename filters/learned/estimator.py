@@ -1,6 +1,6 @@
-"""`LearnedEstimator`: the base of estimators with a network.
+"""`LearnedEstimator`: the base of estimators with a network, and `Equations`, a model on batches of tensors.
 
-A model's equations over whole steps, on batches of tensors, by machine code with the model's own Jacobians.
+The equations hold over whole steps, by machine code with the model's own Jacobians.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from thruster_env.core.threads import one_thread
 from thruster_env.logs.log import AnyStepModel
 from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
 from thruster_env.model.state_space import StateSpaceModel
+
+MOST = 10_000  # members, or hidden states
 
 
 class Equations:
@@ -139,9 +141,6 @@ def _evaluations(functions: Functions, shape: Shape, interpreting: bool) -> tupl
             store_h_slopes(slopes[b].reshape(-1), h_slopes(at, size, c))
 
     return CompiledOrPython(move), CompiledOrPython(measure)
-
-
-MOST = 10_000  # members, or hidden states
 
 
 class Track(NamedTuple):

@@ -20,6 +20,7 @@ from filters.tensors.filter import TensorBelief
 
 INPUT_WIDTH, OUTPUT_WIDTH = 5, 40  # factors on sizes of inputs and outputs, those of Revach et al. (2022)
 HIDDEN = 3  # recurrent layers of a `GainNetwork`
+MOST = 16  # states or measurements: weights grow with the fourth power, to sixteen million here
 
 
 def compressed(x: Tensor) -> Tensor:
@@ -137,9 +138,6 @@ class GatedRecurrentUnit(LearnedEstimator):
         standardised = self.last(torch.cat([hidden, features], -1))
         mean = self.equations.of_state(self.scale_state_mean + self.scale_state * standardised)
         return Track(mean, None, None, None, (hidden,))
-
-
-MOST = 16  # states or measurements: weights grow with the fourth power, to sixteen million here
 
 
 class Correction(NamedTuple):

@@ -24,6 +24,9 @@ from thruster_env.logs.log import Log
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
 
+SKIPPED = 50  # first rows that do not count, in which a filter settles
+STEP = 1e-4  # of the slopes of outputs, in standard deviations
+
 # A filter over a log on its own stamps: by the clock, as `filter.live()` goes.
 
 
@@ -64,10 +67,6 @@ def noise_by_rates(
     if plant is None or not np.array_equal(plant.noise(dt), model.process_noise_cov):
         return None
     return plant.noise
-
-
-SKIPPED = 50  # first rows that do not count, in which a filter settles
-STEP = 1e-4  # of the slopes of outputs, in standard deviations
 
 
 class LogEstimate(NamedTuple):

@@ -1,12 +1,8 @@
-"""Assessment of a filter's run over a log: its innovations, and its errors against channels it did not see.
+"""Assessment of a filter's run over a log, by its innovations and hidden channels, and a picture of it.
 
-NIS is the normalised innovation squared.
-
-A picture of an estimate of a log: states, outputs and innovations over time, each with its 95 % band.
-
-The hues are near those of Okabe and Ito, with a wine red: colour-blind people can distinguish them. Filters that
-are often drawn together differ in hue, and no two share both hue and dash. Truth is a wide grey line below all,
-measurements are pale.
+The picture has states, outputs and innovations over time, each with its 95 % band. The hues are near those of
+Okabe and Ito, with a wine red: colour-blind people can distinguish them. Filters that are often drawn together
+differ in hue, and no two share both hue and dash. Truth is a wide grey line below all, measurements are pale.
 
 Source: Okabe, Ito (2008), "Color universal design".
 """
@@ -50,6 +46,21 @@ from thruster_env.model.quantities import Quantity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+ALPHA = 0.05  # below which a p-value speaks against white innovations
+
+# Of the picture.
+SOLID, DASHED, DOTTED, BOTH, TWO_DOTS = "-", "--", ":", "-.", (0, (4, 1.5, 1, 1.5, 1, 1.5))
+TRUTH: dict[str, Any] = {"color": TRUE, "linewidth": 3.0, "zorder": 1.8}  # wide, below the estimates
+MEASURED: dict[str, Any] = {"color": PALE, "linewidth": 0.8}
+OTHER = (GREEN, DOTTED)  # an estimator of one's own
+TWO_SIDED = 1.96
+MOST_PANELS = 6  # of states and outputs
+TALL, LOW, WIDTH = 1.5, 1.1, 9.0  # [inch]
+ROOM = 0.6  # for title and legend [inch]
+ALARM = "tab:red"
+MARGIN = 0.06  # of an axis above and below what it shows
+DOTS: dict[str, Any] = {"color": "0.5", "s": 4.0, "linewidths": 0, "label": "measurement", "zorder": 1.5}
 
 
 class Residual(NamedTuple):
@@ -150,8 +161,6 @@ def _residual(quantity: Quantity, errors: np.ndarray) -> Residual:
 
 
 # The results of a filter's run over a log, in words.
-
-ALPHA = 0.05  # below which a p-value speaks against white innovations
 
 
 def verdict(estimate: LogEstimate, log_findings: LogFindings) -> list[str]:
@@ -342,10 +351,6 @@ def header_of(what: str, quantity: Quantity) -> str:
 
 # How each filter is drawn: one colour and one dash, the same in every picture.
 
-SOLID, DASHED, DOTTED, BOTH, TWO_DOTS = "-", "--", ":", "-.", (0, (4, 1.5, 1, 1.5, 1, 1.5))
-TRUTH: dict[str, Any] = {"color": TRUE, "linewidth": 3.0, "zorder": 1.8}  # wide, below the estimates
-MEASURED: dict[str, Any] = {"color": PALE, "linewidth": 0.8}
-OTHER = (GREEN, DOTTED)  # an estimator of one's own
 STYLES: dict[str, tuple[str, Any]] = {
     "kf": (PLUM, SOLID),
     "kf-steady": (PLUM, DOTTED),
@@ -390,15 +395,6 @@ def plot_style(name: str) -> dict[str, Any]:
 def colour_of(name: str) -> str:
     """Colour of a filter by name."""
     return STYLES.get(name, OTHER)[0]
-
-
-TWO_SIDED = 1.96
-MOST_PANELS = 6  # of states and outputs
-TALL, LOW, WIDTH = 1.5, 1.1, 9.0  # [inch]
-ROOM = 0.6  # for title and legend [inch]
-ALARM = "tab:red"
-MARGIN = 0.06  # of an axis above and below what it shows
-DOTS: dict[str, Any] = {"color": "0.5", "s": 4.0, "linewidths": 0, "label": "measurement", "zorder": 1.5}
 
 
 def log_figure(path: str | Path, estimate: LogEstimate, title: str, alarms: LogAlarms | None = None) -> Path:

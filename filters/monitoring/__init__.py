@@ -1,4 +1,4 @@
-"""Monitoring: tests on innovations, which raise an alarm when a sensor or the plant is not as assumed."""
+"""Monitoring: tests on innovations, which raise an alarm if a sensor or the plant deviates from the model."""
 
 from filters.monitoring.monitor import Alarm, Health, Monitor, Watch, tuned_monitor
 

@@ -1,9 +1,8 @@
-"""An alarm when a sensor lies: tests on a filter's innovations with a stated rate of false alarms.
-
-One step of all tests, of one belief: compiled, without an allocation, so that it may run on a boat.
+"""An alarm when a sensor fails: tests on a filter's innovations with a stated rate of false alarms.
 
 Normalised innovations e of a consistent filter are independent and N(0, 1). The average run length is the mean
-number of steps until a test raises an alarm; without a fault it is the mean time between false alarms.
+number of steps until a test raises an alarm; without a fault it is the mean time between false alarms. All tests
+of a step are one compiled function without an allocation, so that it may run on a boat.
 """
 
 from __future__ import annotations
@@ -29,6 +28,19 @@ OUTLIER, CUSUM, GLR, VARIANCE, STUCK, MISSING = range(6)
 # the last one; missing ones; how many innovations are in the ring, and where the next one goes; then the ring.
 ABOVE, ABOVE_SINCE, BELOW, BELOW_SINCE, SQUARES, COUNT, EQUAL, LAST, GONE, FILLED, NEXT, RING = range(12)
 LARGEST = 1e100  # of normalised innovations
+NODES = 80  # of the integral equation
+LARGEST_THRESHOLD = 60.0  # of thresholds, in standard deviations
+MEANING = {
+    "outlier": "a measurement that cannot be",
+    "cusum": "a bias",
+    "glr": "a bias",
+    "variance": "another variance of the noise",
+    "stuck": "equal readings",
+    "missing": "no readings",
+}
+STATISTICAL = 4  # of them have false alarms
+SAFELY = 2  # times the longest run of equal, or missing, readings of what is healthy
+THRESHOLDS = "thresholds"
 
 
 def step_tests(state, k, innovation, cov, z, limits, raised, since, sizes):
@@ -143,9 +155,6 @@ def new_state(channels: int, window: int) -> np.ndarray:
 
 # Thresholds of tests on innovations, from how many steps shall lie between two false alarms of each.
 
-NODES = 80  # of the integral equation
-LARGEST_THRESHOLD = 60.0  # of thresholds, in standard deviations
-
 
 def chi_square(steps: float, degrees: int) -> float:
     """What chi^2 of so many degrees of freedom exceeds once in so many steps."""
@@ -231,15 +240,6 @@ def _where(function: Callable[[float], float], least: float) -> float:
 
 
 TESTS = ("outlier", "cusum", "glr", "variance", "stuck", "missing")  # in the order of `recursion`
-MEANING = {
-    "outlier": "a measurement that cannot be",
-    "cusum": "a bias",
-    "glr": "a bias",
-    "variance": "another variance of the noise",
-    "stuck": "equal readings",
-    "missing": "no readings",
-}
-STATISTICAL = 4  # of them have false alarms
 
 
 class Alarm(NamedTuple):
@@ -446,9 +446,6 @@ class Watch:
 
 
 # A monitor in a tuned file: its attributes as data, and the thresholds that follow from them.
-
-SAFELY = 2  # times the longest run of equal, or missing, readings of what is healthy
-THRESHOLDS = "thresholds"
 
 
 def monitor_for(measurements: np.ndarray, monitor: Monitor | None = None) -> Monitor:

@@ -1,4 +1,4 @@
-"""Particle filters in compiled code: stages of a page, and systematic resampling.
+"""Particle filters in compiled code: the stages of a page, systematic resampling, rejuvenation, and their bases.
 
     x, extras = initial(model, w),  w ~ N(0, I)
     if the ESS is below its threshold: particles are resampled,
@@ -6,22 +6,17 @@
     x, extras = add_process_noise(model, propagate(model, x, u), w),  propagate once for each substep
     x, log_w, v, S, extras = update(model, x, log_w, z, e),  log_w the logarithms of the weights,  e ~ N(0, I)
 
-`extras` is a dictionary of all that a particle carries besides x and log_w, left out if there is nothing; its
-`P` is the covariance of a particle. The sum of e^log_w after an update is the likelihood, by which weights are
-then divided.
-A page with a `lookahead` has particles resampled in the update, by the weights log_w + level:
+`extras` is a dictionary of all that a particle carries besides x and log_w, left out if there is nothing; its `P`
+is the covariance of a particle. The sum of e^log_w after an update is the likelihood, by which weights are then
+divided. A page with a `lookahead` has particles resampled in the update, by the weights log_w + level:
 
     mu, level, v, S = lookahead(model, x, log_w, z),  mu is rejuvenated with its own mean and P,
     x, log_w, extras = update(model, mu, log_w, z, e),  log_w the logarithm of the sum of those weights, less that
                                                         of N and less the level
 
-Weighted samples as a belief: moments, effective size, and the regularised kernel of resampled particles.
-
-`filters.particles.kernels` defines the page of a particle filter.
-
-Sources: Musso, Oudjane, Le Gland (2001), "Improving regularised particle filters"; Kotecha, Djuric (2003),
-"Gaussian particle filtering"; Liu, West (2001), "Combined parameter and state estimation in simulation-based
-filtering", section 10.2.3, whose discount factor d is b^2 = 1 - ((3 d - 1)/(2 d))^2 of `smooth`.
+Sources of rejuvenation: Musso, Oudjane, Le Gland (2001), "Improving regularised particle filters"; Kotecha, Djuric
+(2003), "Gaussian particle filtering"; Liu, West (2001), "Combined parameter and state estimation in
+simulation-based filtering", section 10.2.3, whose discount factor d is b^2 = 1 - ((3 d - 1)/(2 d))^2 of `smooth`.
 """
 
 from __future__ import annotations
@@ -68,6 +63,7 @@ from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Functions, Shape, number_places
 
 LOWEST = -1e300  # of logarithms of weights
+SCRATCH_ROWS = 3
 
 
 class Layout:
@@ -152,8 +148,6 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
 
 
 # Systematic resampling of columns of a table, by weights in one of its rows.
-
-SCRATCH_ROWS = 3
 
 
 @cache

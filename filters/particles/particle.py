@@ -42,6 +42,8 @@ from thruster_env.core.checks import one_of
 from thruster_env.core.streams import FILTER_PROPOSAL, GROUP, fill_normals
 from thruster_env.model.shape import padded
 
+PROPOSALS, RESAMPLINGS = ("prior", "optimal"), ("systematic", "gaussian")
+
 # The auxiliary particle filter: it resamples by how well noise-free predictions fit the measurement.
 
 
@@ -162,9 +164,6 @@ def update_optimal(model, x, log_w, z, e):
 OPTIMAL = Page(
     propagate, add_process_noise_optimal, update_optimal, initial=initial_optimal, per_particle=("noise",)
 )
-
-
-PROPOSALS, RESAMPLINGS = ("prior", "optimal"), ("systematic", "gaussian")
 
 
 def update(model, x, log_w, z, e):

@@ -1,1 +1,1 @@
-"""Estimates that use later measurements, too."""
+"""Smoothers: estimates that also use later measurements."""

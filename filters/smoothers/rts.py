@@ -5,14 +5,11 @@
     P_k = (P_k - G_k predicted P_{k+1} G_k') + G_k smoothed P_{k+1} G_k'
 
 The bracket is computed as a covariance, so that P_k is one. A `Relation`, the page of a smoother, relates two
-successive states by the filter's own linearisation or sigma points.
+successive states by the filter's own linearisation or by its sigma points X = x 1' + g L U, L L' = P, with
 
-Of a sigma-point filter, with
-
-    points X = x 1' + g L U,  L L' = P;  predicted x and P as the filter predicts,
     G = cov(x, f(X)) (predicted P)^-1,  bracket = cov(X - G f(X)) + G Q G'
 
-the bracket equals P - G (predicted P) G' and is a sum of squares.
+a sum of squares that equals P - G (predicted P) G'.
 
 Source: Sarkka (2008), "Unscented Rauch-Tung-Striebel smoother", algorithm 1, with additive noise; for cubature
 points Arasaratnam, Haykin (2011), "Cubature Kalman smoothers".
@@ -45,6 +42,7 @@ from thruster_env.core.threads import spread
 from thruster_env.model.shape import Functions, Shape, number_places
 
 ROUNDING = 1e-12  # of angles that were wrapped [rad]
+Given = tuple[np.ndarray, np.ndarray, np.ndarray]  # means, covariances, and which are restarts, (B, K + 1, ...)
 
 
 class Relation(NamedTuple):
@@ -87,9 +85,6 @@ def back(model, x, P, linked, later):
     (mean, G, C), (later_x, later_P) = linked, later
     x = wrap(x + G @ wrap(later_x - mean, model.state_angles), model.state_angles)
     return x, sym(C + sym(G @ later_P @ G.T))
-
-
-Given = tuple[np.ndarray, np.ndarray, np.ndarray]  # means, covariances, and which are restarts, (B, K + 1, ...)
 
 
 def smooth_backwards(

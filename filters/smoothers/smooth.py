@@ -1,7 +1,8 @@
 """Smoothers: estimates of each state from measurements of later steps as well as from earlier ones.
 
-The ensemble Kalman smoother: each measurement moves the members of earlier steps, too. The fixed-lag smoother
-of a running filter: the state some steps ago, given all measurements up to now.
+In order: the ensemble Kalman smoother, in which each measurement also moves the members of earlier steps;
+`smooth`, forwards and backwards over runs; and the fixed-lag smoother of a running filter, which estimates the
+state some steps ago from all measurements so far.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""A model's equations on batches of tensors: graphs of numbers where they can be traced, else as they stand.
+"""A model's equations on batches of tensors: graphs of numbers if they can be traced, else as they stand.
 
 A component of a state is a tensor (...,), so that an operation of the graph is one of torch for a whole batch, and
-the points of a sigma-point filter are one more dimension. Of an equation that is called, a network for instance,
-the Jacobian is found forwards, by `torch.func.jvp` along each component, unless somebody gives it.
+the points of a sigma-point filter are one more dimension. The Jacobian of an equation that is called, such as a
+network, is found forwards, by `torch.func.jvp` along each component, unless the user gives it.
 
-autograd multiplies slopes, also those of what a choice leaves out: 0 times the infinite slope of a root at zero is
-NaN. Where an operation has no finite slope, its result is a constant (`slopes` has the same rule).
+autograd multiplies slopes, also those of the side that a choice discards: 0 times the infinite slope of a root at
+zero is NaN. So an operation without a finite slope has a constant as its result (`slopes` has the same rule).
 """
 
 from __future__ import annotations
@@ -63,6 +63,10 @@ HAS_SLOPE: dict[str, Callable] = {
 
 
 OF_ZERO = frozenset(HAS_SLOPE) - {"arccosh", "arctanh"}  # of these, operations that have one of a positive number
+POINTS = 64  # at which functions of tensors are compared with those of floats
+ASKING = frozenset("__bool__ __float__ __int__ __index__ __complex__ item".split())
+# Of torch: a function of tensors may do so and give derivatives.
+LEAVING = frozenset("tolist numpy __array__".split())
 
 
 def with_finite_slope(operation: str, function: Callable, arguments: Sequence[Tensor | float]) -> Tensor:
@@ -109,9 +113,6 @@ def values_of(
     return [values[number.place] for number in wanted]
 
 
-POINTS = 64  # at which functions of tensors are compared with those of floats
-
-
 def sizes_of(further_arguments: int, shape: Shape) -> tuple[int, ...]:
     """How many components the arguments (x, u, c) or (x, c) have."""
     return (shape.n, shape.inputs, shape.constants) if further_arguments == 2 else (shape.n, shape.constants)
@@ -146,11 +147,6 @@ class OfGraph:
     def _stacked(wanted: Sequence[Number], order: Sequence[Number], parts: list[tuple[Tensor, ...]]) -> Tensor:
         components = {(p, k): component for p, part in enumerate(parts) for k, component in enumerate(part)}
         return stacked(values_of(wanted, order, components, parts[0][0]), parts)
-
-
-ASKING = frozenset("__bool__ __float__ __int__ __index__ __complex__ item".split())
-# Of torch: a function of tensors may do so and give derivatives.
-LEAVING = frozenset("tolist numpy __array__".split())
 
 
 class _NoNumberAsked(TorchFunctionMode):

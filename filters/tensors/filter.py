@@ -1,4 +1,4 @@
-"""`TensorFilter`: a filter on batches of tensors."""
+"""`TensorFilter`: a filter on batches of tensors, its results, and its compiled likelihood with a gradient."""
 
 from __future__ import annotations
 
@@ -22,6 +22,12 @@ from thruster_env.core.checks import as_floats, one_of, short_repr, switch
 from thruster_env.core.sources import lower_pairs
 from thruster_env.core.streams import filter_keys
 from thruster_env.graphs.programs import Place
+
+DIMENSIONS = {"process_noise_cov": 2, "measurement_noise_cov": 2, "prior_mean": 1, "prior_cov": 2, "constants": 1}
+"""A filter's numbers, those of its model, and how many dimensions each has beside those of a batch."""
+MADE = ("_model", "_own", "_stages", "_traced", "_programs")  # again of a copy
+SYNCHRONOUS = {"cpu"}
+"""Devices that answer at once whether a trajectory is lost; of others it is asked once a run, not in each step."""
 
 # What filters on tensors return.
 
@@ -150,13 +156,6 @@ def _symmetric(entries: Tensor, like: Tensor) -> Tensor | None:
     rows, columns = torch.tensor(lower_pairs(len(like)), device=like.device).T
     matrix[rows, columns] = entries
     return 0.5 * (matrix + matrix.mT)  # halves beside the diagonal, for which there are two places
-
-
-DIMENSIONS = {"process_noise_cov": 2, "measurement_noise_cov": 2, "prior_mean": 1, "prior_cov": 2, "constants": 1}
-"""A filter's numbers, those of its model, and how many dimensions each has beside those of a batch."""
-
-
-MADE = ("_model", "_own", "_stages", "_traced", "_programs")  # again of a copy
 
 
 class TensorFilter:
@@ -432,10 +431,6 @@ def _checked_key(key: Any) -> np.ndarray:
     if key.shape[-1:] != (2,):
         raise ValueError(f"a key must be two whole numbers, (..., 2), but got shape {key.shape}")
     return key
-
-
-SYNCHRONOUS = {"cpu"}
-"""Devices that answer at once whether a trajectory is lost; of others it is asked once a run, not in each step."""
 
 
 def _filtered(

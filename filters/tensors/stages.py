@@ -1,12 +1,11 @@
 """A page's stages as functions of tensors: of a belief, an input, a measurement, and the numbers of a model.
 
-torch's autograd then differentiates it. A vector of each member of an ensemble is a matrix (..., rows, members).
-An operation without a rule here, such as a function of the model, computes on tensors itself.
+torch's autograd then differentiates them. A vector of each member of an ensemble is a matrix (..., rows, members).
+An operation without a rule here, such as a function of the model, computes on tensors itself. An ensemble's
+normals are those of `thruster_env.core.streams`, on any device.
 
-An ensemble's normals on any device: the generator of `thruster_env.core.streams`, of tensors.
-
-Source: Salmon, Moraes, Dror, Shaw (2011), "Parallel random numbers: as easy as 1, 2, 3"; normals by Box and
-Muller (1958).
+Source: Salmon, Moraes, Dror, Shaw (2011), "Parallel random numbers: as easy as 1, 2, 3"; normals by Box and Muller
+(1958).
 """
 
 from __future__ import annotations

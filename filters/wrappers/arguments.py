@@ -1,4 +1,4 @@
-"""From a wrapper's plain arguments to a filter and the model that it assumes.
+"""A filter and the model that it assumes, from a wrapper's plain arguments.
 
     x_{k+1} = f(x_k, (u_k, a_k)) + w,   z_k
 
@@ -35,6 +35,10 @@ from filters.tuned_file import (
 from thruster_env.core.checks import short_repr
 from thruster_env.env.model_env import Split
 from thruster_env.model.state_space import StateSpaceModel
+
+OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
+APPENDED = "appended_entries"  # attribute of an env: entries of its observation after the measurement
+HOOK = "measured_inputs"  # method of an env; what it returns is a `Split`, or None for an ordinary model
 
 # Where a wrapper's model comes from: the env, a factory that the caller names, or the caller.
 
@@ -172,10 +176,6 @@ def _arguments_of(make: Callable) -> set[str]:
         return set()
 
 
-OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
-APPENDED = "appended_entries"  # attribute of an env: entries of its observation after the measurement
-
-
 def given_filter(filter, tuned) -> tuple:
     """The arguments `filter` and `tuned` as a wrapper keeps them; a study becomes its filter.
 
@@ -271,8 +271,6 @@ def _box(name: str, space: gym.Space) -> gym.spaces.Box:
 
 
 # Measured inputs of a model, such as an attitude from an AHRS, appended to the action.
-
-HOOK = "measured_inputs"  # method of an env; what it returns is a `Split`, or None for an ordinary model
 
 
 def split_of(env, model: StateSpaceModel) -> Split:

@@ -1,6 +1,6 @@
-"""`EstimateState`: a filter around any Gymnasium env, its estimate in the observation and in info.
+"""`EstimateState` and `EstimateStates`: a filter around any Gymnasium env, or on every copy of a vector env.
 
-`EstimateStates`: a filter on every copy of a vector env, one compiled call for all.
+The estimate is in the observation and in info. All copies of a vector env are filtered in one compiled call.
 """
 
 from __future__ import annotations
