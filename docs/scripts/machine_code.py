@@ -13,8 +13,8 @@ from filters.gaussian import extended
 from filters.pages import kernels
 from filters.pages.kernels import as_programs
 from filters.pages.page import Equations, RowMemory
-from filters.pages.traced import MOST
 from thruster_env.graphs.programs import Program
+from thruster_env.model.traced import MOST
 
 
 def slowed(x, u, c):

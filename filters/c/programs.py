@@ -21,7 +21,6 @@ from filters.pages.kernels import MembersMemory, numbers_of, stages_of
 from filters.pages.kernels import member_stages_of as stages_of_members
 from filters.pages.page import Equations, RowMemory
 from filters.pages.page_filter import FilterWithPage, with_page
-from filters.pages.traced import MOST, Traced
 from thruster_env.core.angles import difference, wrapped_where
 from thruster_env.core.streams import (
     FILTER_MEASUREMENT,
@@ -36,6 +35,7 @@ from thruster_env.graphs.graphs import Graph, TooLarge
 from thruster_env.graphs.programs import BY_MEMBERS, Place, Program, program_of, work_names
 from thruster_env.model.shape import LANES, Shape, padded
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.traced import MOST, Traced
 
 # Which names a filter in C may have: none that C, C++, their libraries or the files themselves use.
 

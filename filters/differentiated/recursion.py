@@ -29,7 +29,6 @@ from filters.algebra.points import density, density_slope, dot, heavier, outlier
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.pages.kernels import Stage, as_calls, as_programs, as_tuple, stage_of, with_extras
 from filters.pages.page import Equations, NumbersMemory, Page, PagedModel
-from filters.pages.traced import MOST
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.graphs.graphs import uncollected
 from thruster_env.graphs.programs import Place, callable_of
@@ -42,6 +41,7 @@ from thruster_env.model.shape import (
     starts_of,
     transition_slopes,
 )
+from thruster_env.model.traced import MOST
 
 LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # summed over steps
 EXTENDED = ExtendedKalmanFilter.page

@@ -2,14 +2,14 @@
 
 page         a page, its parameters, its matrices in memory, and the model that it gets: f, F, h, H, Q, R
 page_filter  a filter that has a page
-traced       a model's functions and their derivatives as graphs of numbers
 kernels      the stages of a page, also of an ensemble's members, as programs or calls: kernels of the engine
 
 From a page to machine code, in steps:
 
 1. Called with Matrices, a page records its operations (`filters.algebra`); each knows its derivative, so a stage
    with derivatives is a graph of values and one of slopes along a parameter.
-2. The model's functions are traced, and all matrices are expanded into numbers (`thruster_env.graphs`).
+2. The model's functions are traced (`thruster_env.model.traced`), and all matrices are expanded into numbers
+   (`thruster_env.graphs`).
 3. The program of a stage goes to LLVM as instructions for eight runs, or for one belief on scalars. numba
    compiles only the functions that call the programs (`filters.engine`): a batch works on four groups of eight
    beliefs at a time.

@@ -23,7 +23,6 @@ from filters.algebra.members import covariance, mean, on_branch
 from filters.algebra.operations import present, quotient, slopes_of, wrap
 from filters.engine.belief import Kernels, memory_places, own_place, row_access
 from filters.pages.page import Equations, NumbersMemory, Page, PagedModel, RowMemory
-from filters.pages.traced import MOST
 from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import matrix_reader, vector_reader
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
@@ -39,6 +38,7 @@ from thruster_env.graphs.programs import (
     program_of,
 )
 from thruster_env.model.shape import LANES, Functions, Shape, constants_reader, number_places
+from thruster_env.model.traced import MOST
 
 OF_PARAMETER = ("change", "move")  # arrays that differ between parameters
 FREE = ("given", "constant", *CONDITIONS)  # operations whose results are in memory, or cannot be stored as floats

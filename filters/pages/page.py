@@ -37,7 +37,6 @@ import numpy as np
 from filters.algebra.matrices import Matrix, Operation, input_matrix, never, plus, through
 from filters.algebra.points import root
 from filters.engine.belief import memory_places, own_place
-from filters.pages.traced import not_known, traced_model
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.derivatives import RELATIVE_STEP, step_growth, step_of
 from thruster_env.core.sources import Source, entrywise, is_array, scaled_sum, tuple_of, vector_reader, written_out
@@ -50,6 +49,7 @@ from thruster_env.model.shape import (
     observation_slopes,
     transition_slopes,
 )
+from thruster_env.model.traced import not_known, traced_model
 
 
 class Page(NamedTuple):

@@ -19,13 +19,13 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from filters.pages.traced import MOST, Traced
 from filters.tensors.stages import Equation
 from thruster_env.core.sources import is_array
 from thruster_env.core.user_functions import needs_floats
 from thruster_env.graphs.folding import POSITIVE, as_single
 from thruster_env.graphs.graphs import COMPARISONS, Graph, Number, needed_by
 from thruster_env.model.shape import Shape, constants_are_array
+from thruster_env.model.traced import MOST, Traced
 
 # Graphs of numbers evaluated on tensors: one operation of torch for each number, for a whole batch.
 

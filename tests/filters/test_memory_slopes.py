@@ -7,7 +7,6 @@ import pytest
 
 from filters import KalmanFilter, StateSpaceModel, make_filter, run
 from filters.pages.page import Page
-from filters.pages.traced import Traced
 from filters.sensitivity import likelihood, sensitivity, state_score
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_pages import MADE, assert_slopes, wide_pendulum, with_noise
@@ -19,6 +18,7 @@ from tests.slow import slow_but
 from thruster_env.core.streams import episode_keys
 from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.programs import Place, values_of
+from thruster_env.model.traced import Traced
 from tuning.auv.scenario import find_scenario as find_vehicle
 from tuning.cli.templates.filter import Template
 from tuning.likelihood.gradient import tune_by_gradient

@@ -34,7 +34,7 @@ from thruster_env.graphs.programs import (
     values_of,
     work_names,
 )
-from thruster_env.graphs.python_floats import with_python_floats
+from thruster_env.graphs.python_floats import in_python
 from thruster_env.graphs.tracing import traced
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -313,10 +313,10 @@ def python_arithmetic(rng: np.random.Generator, seconds: float) -> str:
             graph_values = values_of(numbers, points)
             for k, one in enumerate(expressions):
                 of_python, sizes = one.values(points)
-                called = with_python_floats(_of_vector(one.function))
+                of_vector = _of_vector(one.function)
                 for i, point in enumerate(points.T):
                     try:
-                        found = np.array([called(tuple(point))[0]], dtype=float)
+                        found = np.array([in_python(of_vector, [tuple(point)])[0]], dtype=float)
                     except (ArithmeticError, ValueError, TypeError):  # of constants and whole numbers alone
                         counts["refused"] += 1
                         continue

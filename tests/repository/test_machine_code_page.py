@@ -11,9 +11,9 @@ from filters import ExtendedKalmanFilter
 from filters.differentiated.recursion import Memory, Wanted, stages_of
 from filters.pages.kernels import as_programs
 from filters.pages.page import Equations
-from filters.pages.traced import MOST
 from filters.sensitivity import likelihood
 from thruster_env.core.compiled import interpreted
+from thruster_env.model.traced import MOST
 
 PAGE = (Path(__file__).parents[2] / "docs" / "machine_code.md").read_text()
 

@@ -33,12 +33,12 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from thruster_env.core.optimising import Which, optimise_once
-from thruster_env.core.user_functions import OURS, code_text, codes_in, names_read, needs_python, stand_in
+from thruster_env.core.user_functions import OURS, code_text, codes_in, names_read
 
 # Where machine code is kept: beside the sources, in the user's cache, or, where both refuse it, a private folder.
 
@@ -215,11 +215,10 @@ _called: weakref.WeakSet[Callable] = weakref.WeakSet()  # of these, functions th
 _apart: weakref.WeakSet[Callable] = weakref.WeakSet()  # of these, functions of which there is one copy
 _narrow: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions whose vectors are as wide as LLVM prefers
 _asked: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that `compiled` has been given
-_only_python: weakref.WeakKeyDictionary[Callable, str] = (
-    weakref.WeakKeyDictionary()
-)  # why functions are not compiled
+_instead: weakref.WeakKeyDictionary[Callable, Callable[[], Instead]] = weakref.WeakKeyDictionary()
 _lessons: list[Callable[[], None]] = [lambda: optimise_once(Which(_asked, _marked, _called, _apart, _narrow))]
 _untaught: weakref.WeakKeyDictionary[Callable, Callable[[Callable], None]] = weakref.WeakKeyDictionary()
+_taught: weakref.WeakSet[Callable] = weakref.WeakSet()  # those of `_instead` that numba knows
 _interpreting = os.environ.get("NUMBA_DISABLE_JIT", "").strip() not in ("", "0")
 
 
@@ -270,29 +269,42 @@ def overloaded(function: Callable, teach: Callable[[Callable], None] | None = No
     return function
 
 
-def compiled_in_place_of(function: Callable, other: Callable, rounded_as: Callable | None = None) -> Callable:
-    """Mark a function in whose place compiled functions have another one; those that need Python run as it.
+class Instead(NamedTuple):
+    """What compiled functions have in place of a function.
 
-    Machine code may reorder and contract what it may of the other one, or of `rounded_as`.
+    Attributes:
+        function: another one, which they call; None if the function runs as Python.
+        key: what else than the code of both determines the machine code.
+        fastmath: what machine code may reorder and contract of it.
+        reason: why the function is not traced, with its name and line; empty if it is.
+        refused: why numba does not compile it either, if that is known before.
+    """
+
+    function: Callable | None
+    key: str = ""
+    fastmath: frozenset[str] = FASTMATH
+    reason: str = ""
+    refused: str = ""
+
+
+def compiled_in_place_of(function: Callable, find: Callable[[], Instead]) -> Callable:
+    """Mark a function in whose place compiled functions have another one: `find()`, asked once, when it is needed.
+
+    `find` must not hold the function itself, which lives as long as somebody has it.
     """
     _marked.add(function)
-    if other in _called:
-        _called.add(function)
-    reason = needs_python(other)
-    if not isinstance(other, types.FunctionType) and not hasattr(other, "py_func"):
-        reason = f"numba compiles plain functions, and no {type(other).__name__}"
-    if reason:
-        _only_python[function] = reason
-    options = fastmath_of(rounded_as or other)
-    _untaught[function] = lambda function: _teach_other(function, other, options)
-    return stand_in(function, other)
+    _instead[function] = functools.cache(find)
+    return function
 
 
-def _teach_other(function: Callable, other: Callable, fastmath: set[str]) -> None:
+def _teach_other(function: Callable) -> None:
     from numba.extending import overload
 
+    other, _, fastmath, *_ = _instead[function]()
+    if other is None:  # whatever calls it runs as Python
+        return
     plain = other if isinstance(other, types.FunctionType) else lambda *arguments: other(*arguments)
-    options: Any = {"forceinline": function not in _called, "no_cfunc_wrapper": True, "fastmath": fastmath}
+    options: Any = {"forceinline": other not in _called, "no_cfunc_wrapper": True, "fastmath": set(fastmath)}
     overload(function, jit_options=options, strict=False)(lambda *arguments: plain)
 
 
@@ -350,6 +362,10 @@ def compiled(function: Callable) -> Callable:
     import numba
     from numba.extending import register_jitable
 
+    for part in _with_callees([function]):
+        if part in _instead and part not in _taught:
+            _taught.add(part)
+            _teach_other(part)
     while _lessons or _untaught:  # a lesson may bring others
         if _lessons:
             _lessons.pop()()
@@ -440,6 +456,8 @@ def function_fingerprint(*functions: Callable | None, within: str) -> str:
     packages = {package_of(__name__), package_of(within)}
     for function in _with_callees(function for function in functions if function is not None):
         digest.update(code_text(function).encode())
+        if function in _instead:
+            digest.update(_instead[function]().key.encode())
         package = package_of(function.__module__ or "")
         if package in _packages:
             packages.add(package)
@@ -491,26 +509,35 @@ class CompiledOrPython:
 
     def _call_first(self, *arguments):
         if not self._proven:
-            reasons = [_only_python[called] for called in _with_callees([self._python]) if called in _only_python]
-            if reasons:
-                warnings.warn(f"the model runs as Python, slowly, because {reasons[0]}", stacklevel=3)
+            of_model = [_instead[called]() for called in _with_callees([self._python]) if called in _instead]
+            if refused := [instead for instead in of_model if instead.function is None]:
+                *_, reason, by_numba = refused[0]
+                more = "" if by_numba in reason else f"; numba refuses it: {by_numba}"
+                warnings.warn(f"{IN_PYTHON}: {reason}{more}", stacklevel=3)
                 self._run, self._proven = self._python, True
                 return self(*arguments)
             try:
                 return self._run(*arguments)
             except Exception as error:  # numba's, of many classes: compiled code itself raises nothing
-                warnings.warn(_refusal(self._python, error), stacklevel=3)
+                reasons = [instead.reason for instead in of_model if instead.reason]
+                warnings.warn(_refusal(self._python, error, *reasons), stacklevel=3)
                 self._run = self._python
             finally:
                 self._proven = True
         return self(*arguments)
 
 
-def _refusal(function: Callable, error: Exception) -> str:
-    """The warning that a function runs as Python, and why: the user's model, this package or the machine."""
+IN_PYTHON = "the model runs as Python, some hundred times slower"
+
+
+def _refusal(function: Callable, error: Exception, *reasons: str) -> str:
+    """The warning that a function runs as Python, and why: the user's model, this package or the machine.
+
+    `reasons` say why functions of the model are not traced.
+    """
     text, ours = str(error), []
     if isinstance(error, (OSError, MemoryError)):
-        return f"the model runs as Python, slowly, because machine code of it could not be made: {text}"
+        return f"{IN_PYTHON}: machine code of it could not be made: {text}"
     for called in _with_callees([function]):
         where = text.find(hex(id(called)))
         if (called.__module__ or "").partition(".")[0] in OURS:
@@ -522,10 +549,10 @@ def _refusal(function: Callable, error: Exception) -> str:
     else:
         _, broken = max(ours, key=lambda pair: pair[0], default=(0, function))  # the innermost comes last
         return (
-            f"the model runs as Python, slowly, because numba refuses {_described(broken)}: {_reason(error)}; "
+            f"{IN_PYTHON}: numba refuses {_described(broken)}: {_reason(error)}; "
             "this is a fault of the package and not of the model: please report it"
         )
-    return f"the model runs as Python, slowly, because numba refuses it: {_reason(error)}"
+    return f"{IN_PYTHON}: {'; '.join([*reasons, 'numba refuses it'])}: {_reason(error)}"
 
 
 def _objects_called(function: Callable) -> list[str]:

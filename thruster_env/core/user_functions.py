@@ -7,7 +7,9 @@ or asks whether a comparison `is True`, which holds for Python's truth values al
 from __future__ import annotations
 
 import builtins
+import copy
 import dis
+import enum
 import functools
 import inspect
 import itertools
@@ -243,21 +245,39 @@ class _Silent:
         return None
 
 
+WRITTEN = "<string>"  # the file of methods that `dataclass` and `NamedTuple` write
+NOT_COPIED = {
+    *"__new__ __init_subclass__ __getattribute__ __getattr__ __setattr__ __delattr__ __replace__".split(),
+    *"_make _replace _asdict".split(),
+}  # methods that say what an object is, and not what it computes
+
+
 class Copies:
-    """Copies of functions and of all plain functions that they call, which find others under some names."""
+    """Copies of functions and of all that they call: functions, classes and objects of a user's.
+
+    They find others under some names, in all modules of MODULES.
+    """
 
     def __init__(
-        self, in_place_of: Callable[[types.ModuleType, str], Any], names: Mapping[str, Any], silent: bool = False
+        self,
+        in_place_of: Callable[[types.ModuleType, str], Any],
+        names: Mapping[str, Any],
+        *,
+        silent: bool = False,
+        of_function: Callable[[types.FunctionType], Callable] = lambda function: function,
+        of_array: Callable[[np.ndarray], np.ndarray] | None = None,
     ):
         """Take what copies find in MODULES, by module and name, and in place of Python's functions.
 
-        Silent copies neither log nor warn.
+        Silent copies neither log nor warn. `of_function` and `of_array` are what copies and arrays become.
         """
         self._in_place_of, self._names, self._silent = in_place_of, names, silent
-        self._copies: dict[int, types.FunctionType] = {}
+        self._finished, self._of_array = of_function, of_array
+        self._copies: dict[int, Any] = {}
+        self._originals: list = []  # which live as long, so that no other value gets the id of one
 
     def of(self, value: Any) -> Any:
-        """The copy of a function; for another value its replacement in copies."""
+        """The copy of a function, class, object or collection; for another value its replacement in copies."""
         value = stands_for(getattr(value, "py_func", value))  # of a function compiled by numba
         if isinstance(value, types.ModuleType) and value in MODULES:
             return Module(value, self._in_place_of)
@@ -268,32 +288,106 @@ class Copies:
             if callable(value) and value is getattr(module, name, None):
                 return self._in_place_of(module, name)
         if isinstance(value, types.MethodType) and isinstance(value.__func__, types.FunctionType):
-            return types.MethodType(self.of(value.__func__), value.__self__)
+            return types.MethodType(self.of(value.__func__), self.of(value.__self__))
         if isinstance(value, functools.partial):
-            return functools.partial(self.of(value.func), *value.args, **value.keywords)
-        return self._of_function(value) if isinstance(value, types.FunctionType) else value
+            return functools.partial(
+                self.of(value.func), *map(self.of, value.args), **self._of_values(value.keywords)
+            )
+        if isinstance(value, functools._lru_cache_wrapper):  # numbers that are not known have no hash
+            return self.of(value.__wrapped__)
+        make = self._maker(value)
+        if make is not None and id(value) not in self._copies:
+            self._originals.append(value)
+            self._copies[id(value)] = value  # for what holds itself
+            self._copies[id(value)] = make(value)
+        return value if make is None else self._copies[id(value)]
 
-    def called(self, value: Any) -> Callable:
-        """The copy of a function, or of an object's `__call__`."""
-        value = stands_for(value)
-        by_class = inspect.getattr_static(type(value), "__call__", None)
-        is_object = isinstance(by_class, types.FunctionType) and _top(value) not in LIBRARIES.union(OURS)
-        return self.of(types.MethodType(by_class, value) if is_object else value)
+    def _maker(self, value: Any) -> Callable[[Any], Any] | None:
+        """What copies a value; None if it stays."""
+        if isinstance(value, types.FunctionType):
+            return self._of_function
+        if type(value) in (list, tuple):
+            return lambda value: type(value)(map(self.of, value))
+        if type(value) is dict:
+            return self._of_values
+        if type(value) is np.ndarray:
+            return self._of_array
+        if isinstance(value, type):
+            return self._of_class if _has_methods(value) else None
+        return self._of_object if _has_methods(type(value)) else None
 
-    def _of_function(self, function: types.FunctionType) -> types.FunctionType:
-        if id(function) not in self._copies:
-            cells = tuple(types.CellType() for _ in function.__closure__ or ())
-            names = vars(builtins) | dict(self._names)
-            importing = {"__import__": lambda *which: self.of(builtins.__import__(*which))}
-            names["__builtins__"] = vars(builtins) | importing  # also for what NumPy imports late
-            copy = types.FunctionType(function.__code__, names, function.__name__, function.__defaults__, cells)
-            copy.__kwdefaults__ = function.__kwdefaults__
-            self._copies[id(function)] = copy
-            read = [name for name in names_read(function.__code__) if name in function.__globals__]
-            names |= {name: self.of(function.__globals__[name]) for name in read}
-            for cell, old in zip(cells, function.__closure__ or (), strict=True):
-                cell.cell_contents = self.of(old.cell_contents)
-        return self._copies[id(function)]
+    def _of_values(self, value: Mapping) -> dict:
+        return {key: self.of(part) for key, part in value.items()}
+
+    def _of_function(self, function: types.FunctionType) -> Callable:
+        cells = tuple(types.CellType() for _ in function.__closure__ or ())
+        names = vars(builtins) | dict(self._names)
+        importing = {"__import__": lambda *which: self.of(builtins.__import__(*which))}
+        names["__builtins__"] = vars(builtins) | importing  # also for what NumPy imports late
+        defaults = function.__defaults__ and tuple(map(self.of, function.__defaults__))
+        other = types.FunctionType(function.__code__, names, function.__name__, defaults, cells)
+        other.__kwdefaults__ = function.__kwdefaults__ and self._of_values(function.__kwdefaults__)
+        self._copies[id(function)] = finished = self._finished(other)
+        read = [name for name in names_read(function.__code__) if name in function.__globals__]
+        names |= {name: self.of(function.__globals__[name]) for name in read}
+        for name, cell, old in zip(function.__code__.co_freevars, cells, function.__closure__ or (), strict=True):
+            # `super()` goes on from the class that has the method.
+            cell.cell_contents = old.cell_contents if name == "__class__" else self.of(old.cell_contents)
+        return finished
+
+    def _of_class(self, kind: type) -> type:
+        """A class derived from a user's, with copies of its methods."""
+        derived = type(kind)(kind.__name__, (kind,), {"__slots__": (), "__module__": kind.__module__})
+        self._copies[id(kind)] = derived
+        for base in reversed(kind.__mro__):
+            for name, member in _methods(base):
+                setattr(derived, name, self._of_member(member))
+        return derived
+
+    def _of_member(self, member: Any) -> Any:
+        if isinstance(member, property):
+            return property(*(part and self.of(part) for part in (member.fget, member.fset, member.fdel)))
+        if isinstance(member, functools.cached_property):  # which may have been computed of other numbers
+            return property(self.of(member.func))
+        if isinstance(member, staticmethod | classmethod):
+            return type(member)(self.of(member.__func__))
+        return self.of(member)
+
+    def _of_object(self, value: Any) -> Any:
+        """An object of the copied class, with copies of its attributes."""
+        kind = self.of(type(value))
+        if isinstance(value, tuple):
+            return tuple.__new__(kind, map(self.of, value))
+        other = copy.copy(value)
+        if other is value:  # there is one of it
+            return value
+        object.__setattr__(other, "__class__", kind)
+        self._copies[id(value)] = other
+        for name, part in getattr(value, "__dict__", {}).items():
+            other.__dict__[name] = self.of(part)
+        return other
+
+
+def _has_methods(kind: type) -> bool:
+    """Whether a class has methods of a user's, and others may be derived from it."""
+    derivable = not isinstance(kind, enum.EnumType) and not hasattr(kind.__init_subclass__, "__func__")
+    return derivable and any(True for base in kind.__mro__ for _ in _methods(base))
+
+
+def _methods(kind: type) -> Iterator[tuple[str, Any]]:
+    """Names and members of a user's class that are functions which the user wrote."""
+    if _top(kind) in LIBRARIES or _top(kind) in (*OURS, ""):
+        return
+    functions = types.FunctionType, property, functools.cached_property, staticmethod, classmethod
+    for name, member in vars(kind).items():
+        is_written = getattr(getattr(member, "__code__", None), "co_filename", "") == WRITTEN
+        if isinstance(member, functions) and name not in NOT_COPIED and not is_written:
+            yield name, member
+
+
+def is_copy(frame: types.FrameType) -> bool:
+    """Whether a frame runs the copy of a function."""
+    return frame.f_globals.get("__name__") == "builtins"
 
 
 _stand_ins: weakref.WeakKeyDictionary[Callable, Callable] = weakref.WeakKeyDictionary()

@@ -4,7 +4,7 @@ graphs, folding  numbers that record operations, their derivatives, and simplifi
 tracing          the graph of a function; branches: of a function that decides
 programs         a graph as a program for some runs side by side, or for members, cut into loops; its C99
 instructions     a program as machine code
-python_floats    functions that run as Python, and those that numba refuses, written out
+python_floats    functions that run as Python
 
 What can be traced, and the arithmetic of programs: docs/machine_code.md. A program is compared with its function
 at a few points, since a function might check the type of its argument.

@@ -10,6 +10,9 @@ so on, and a `where` joins the results. A loop whose length depends on an unknow
 raises TypeError, as does a function with too many outcomes. If the function itself raises an exception, as
 `assert` does, the result is NaN, as in machine code for arithmetic at which Python raises.
 
+Functions that a function calls are joined each by itself (`tracing`), so that their outcomes add up: three calls
+of a function with four outcomes have twelve, and not 64.
+
 Each number y of a graph has a slope y', by the chain rule from the slopes of its arguments. Numbers that do not
 move have none, so nothing is multiplied by zero. Terms that the derivative shares with the value exist once:
 
@@ -26,9 +29,11 @@ whose derivatives are `where`s again, so they hold for slopes of slopes, too.
 
 from __future__ import annotations
 
+import copy
 import dis
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -37,68 +42,113 @@ from thruster_env.graphs.graphs import CONDITIONS, Graph, Number, needed_by, whe
 
 MOST_OUTCOMES = 64  # calls of a function
 MOST_DECISIONS = 64  # in one call
+NUMBERS = Number, int, float, np.generic
 
 
-def on_every_side(function: Callable[[], np.ndarray], graph: Graph) -> np.ndarray:
-    """The result (...) of a function without arguments, as numbers of a graph, joined over all its branches.
+RAISED = object()  # in place of a result, where the function itself raised an exception
+
+
+def on_every_side(function: Callable[[], Any], graph: Graph) -> Any:
+    """The result of a function without arguments, of numbers of a graph, joined over all its branches.
+
+    The result may be a number, an array, a collection or an object of these.
 
     Raises:
         TypeError: if it decides too often, or its results have different shapes.
     """
     calls, failure = 0, None
+    outside, outer = graph.decide, graph.answers
 
-    def outcome(known: dict[int, bool]) -> np.ndarray | None:
+    def outcome(known: dict[int, bool]) -> Any:
         nonlocal calls, failure
         calls += 1
         if calls > MOST_OUTCOMES:
             raise TypeError(f"a function must have at most {MOST_OUTCOMES} outcomes of its decisions")
         asked: list[Number] = []
-        answers = dict(known)
+        answers = outer | known
 
         def decide(number: Number) -> bool:
             if number.value is not None:
                 return number.value != 0.0
             condition = number if number.is_condition else number != 0.0
             if condition.place not in answers:
-                if len(answers) >= MOST_DECISIONS:
+                if len(answers) - len(outer) >= MOST_DECISIONS:
                     raise TypeError(f"a function must decide at most {MOST_DECISIONS} times")
                 answers[condition.place] = True
                 asked.append(condition)
             return answers[condition.place]
 
-        graph.decide = decide
-        result: np.ndarray | None = None
+        graph.decide, graph.answers = decide, answers
         try:
             result = function()
         except Exception as error:
-            if not answers or not _is_raised_there(error):
+            if len(answers) == len(outer) or not _is_raised_there(error):
                 raise
-            failure = error
+            result, failure = RAISED, error
         for k, condition in reversed([*enumerate(asked)]):
             before = {earlier.place: True for earlier in asked[:k]}
-            other = outcome(known | before | {condition.place: False})
-            if result is None or other is None:
-                known_result = result if other is None else other
-                if known_result is None:
-                    continue
-                result, other = (
-                    np.full_like(known_result, np.nan) if side is None else side for side in (result, other)
-                )
-            if other.shape != result.shape:
-                raise TypeError(f"branches must have results of one shape, but got {result.shape}, {other.shape}")
-            pairs = zip(result.ravel(), other.ravel(), strict=True)
-            chosen = [where(condition, a, b) for a, b in pairs]
-            result = np.array([*chosen, None], dtype=object)[:-1].reshape(result.shape)
+            result = joined(condition, result, outcome(known | before | {condition.place: False}))
         return result
 
-    before, graph.decide = graph.decide, None
     try:
         result = outcome({})
     finally:
-        graph.decide = before
-    if result is None:
+        graph.decide, graph.answers = outside, outer
+    if result is RAISED:
         raise failure or TypeError("a function must have a result")
     return result
+
+
+def joined(condition: Number, a: Any, b: Any) -> Any:
+    """The result `a` where a condition holds, else `b`: numbers, or arrays, collections and objects of these.
+
+    Where a side is RAISED, all numbers are NaN. Raises TypeError unless both are of one shape.
+    """
+    if a is b:
+        return a
+    if a is RAISED or b is RAISED:
+        a, b = (_lost(b), b) if a is RAISED else (a, _lost(a))
+    if isinstance(a, NUMBERS) and isinstance(b, NUMBERS):
+        return where(condition, a, b)
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and a.shape == b.shape:
+        return _of_entries([joined(condition, *pair) for pair in zip(a.flat, b.flat, strict=True)], a)
+    if type(a) is type(b):
+        if isinstance(a, tuple | list) and len(a) == len(b):
+            return _of_entries([joined(condition, *pair) for pair in zip(a, b, strict=True)], a)
+        if isinstance(a, dict) and a.keys() == b.keys():
+            return {key: joined(condition, part, b[key]) for key, part in a.items()}
+        if isinstance(a, str) and a == b:
+            return a
+        if hasattr(a, "__dict__"):
+            return _with_attributes(a, joined(condition, vars(a), vars(b)))
+    shapes = (np.shape(side) if isinstance(side, np.ndarray | tuple | list) else type(side) for side in (a, b))
+    raise TypeError("branches must have results of one shape, but got {}, {}".format(*shapes))
+
+
+def _lost(value: Any) -> Any:
+    """A value of the same shape with NaN in place of numbers."""
+    if isinstance(value, NUMBERS):
+        return math.nan
+    if isinstance(value, np.ndarray | tuple | list):
+        return _of_entries(
+            [_lost(part) for part in (value.flat if isinstance(value, np.ndarray) else value)], value
+        )
+    if isinstance(value, dict):
+        return {key: _lost(part) for key, part in value.items()}
+    return _with_attributes(value, _lost(vars(value))) if hasattr(value, "__dict__") else value
+
+
+def _of_entries(entries: list, like: Any) -> Any:
+    """Entries as an array, tuple or list like another one."""
+    if isinstance(like, np.ndarray):
+        return np.array([*entries, None], dtype=object)[:-1].reshape(like.shape)
+    return type(like)(*entries) if hasattr(like, "_fields") else type(like)(entries)
+
+
+def _with_attributes(value: Any, attributes: dict) -> Any:
+    other = copy.copy(value)
+    other.__dict__.update(attributes)
+    return other
 
 
 def _is_raised_there(error: Exception) -> bool:

@@ -86,6 +86,7 @@ class Graph:
         self.numbers: list[Number] = []
         self.size = size
         self.decide: Callable[[Number], bool] | None = None  # what a condition is taken for, see `branches`
+        self.answers: dict[int, bool] = {}  # what conditions are taken for now, by their places
         self.whole: set[int] = set()  # places of numbers that are not taken apart, as along them slopes are taken
         self.exact = False  # whether a model's function is being traced: see `as_written`
         self._made: dict[tuple, Number] = {}

@@ -12,14 +12,18 @@ of which `branches` traces all sides.
 
 from __future__ import annotations
 
+import dis
+import inspect
 import math
 import operator
+import threading
 import types
 from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from thruster_env.core.user_functions import Copies, Module, needs_floats
+from thruster_env.graphs.branches import on_every_side
 from thruster_env.graphs.folding import worked_out
 from thruster_env.graphs.graphs import UNARY, Number, arctan2, where
 
@@ -187,11 +191,6 @@ def _condition(x):
     return (x if x.is_condition else x != 0.0) if isinstance(x, Number) else bool(x)
 
 
-def _filled(value: float) -> Callable:
-    """In place of NumPy's zeros and ones: an array that Numbers may be written to."""
-    return lambda shape, *_, **__: np.full(shape, value, dtype=object)
-
-
 FUNCTIONS: dict[str, Callable] = {
     **{name: _operation(name) for name in (*UNARY, "fmod", "copysign")},
     "absolute": abs,
@@ -273,27 +272,6 @@ class _Float(metaclass=_OfFloats):
         return +value if isinstance(value, Number) else float(value)
 
 
-def _array_of(make: Callable) -> Callable:
-    """In place of NumPy's array and asarray: one of floats holds Numbers, if it gets such."""
-
-    def function(value, dtype=None, **named):
-        if dtype is _Float or dtype is not None and np.dtype(dtype) == np.float64:
-            dtype = object if _has_numbers(value) else np.float64
-        return make(value, dtype=dtype, **named)
-
-    return function
-
-
-ARRAYS: dict[str, Callable] = {
-    "array": _array_of(np.array),
-    "asarray": _array_of(np.asarray),
-    "zeros": _filled(0.0),
-    "empty": _filled(0.0),
-    "ones": _filled(1.0),
-    "float64": _Float,
-}
-"""Replacements for functions of NumPy, for any arguments."""
-
 BUILTINS = {
     "max": _largest,
     "min": _smallest,
@@ -308,20 +286,43 @@ def _replacement(module: types.ModuleType, name: str):
     value, name = getattr(module, name), OTHER_NAMES.get(name, name)
     if value is np.linalg:
         return Module(np.linalg, _replacement)
+    if value is np.float64:
+        return _Float
     of_arrays = OF_MATRICES.get(name) if module is np.linalg else OF_ARRAYS.get(name) if module is np else None
-    known = {} if module is np.linalg else (OF_MATH if module is math else ARRAYS)
-    ours = of_arrays or known.get(name) or (None if module is np.linalg else FUNCTIONS.get(name))
-    if ours is None or module is np and name in ARRAYS:
-        return ours or value
+    of_numbers = None if module is np.linalg else FUNCTIONS.get(name)
+    ours = of_arrays or module is math and OF_MATH.get(name) or of_numbers
+    if not ours and (isinstance(value, type | np.ufunc) or not callable(value)):
+        return value
+    if not (module is math or of_arrays) and ours:
+        ours = _elementwise(ours)
 
     def function(*arguments, **named):
-        if not any(map(_has_numbers, (*arguments, *named.values()))):
-            return value(*arguments, **named)
-        if module is math or of_arrays:
-            return ours(*arguments, **named)
-        return _elementwise(ours)(*arguments, **named)
+        if any(map(_has_numbers, (*arguments, *named.values()))):
+            return (ours or value)(*arguments, **{name: _open_kind(part) for name, part in named.items()})
+        return _open(value(*map(_closed, arguments), **{name: _closed(part) for name, part in named.items()}))
 
     return function
+
+
+def _open(value):
+    """Arrays of floats as such that Numbers may be written to."""
+    if isinstance(value, tuple):
+        return type(value)(*map(_open, value)) if hasattr(value, "_fields") else tuple(map(_open, value))
+    return value.astype(object) if isinstance(value, np.ndarray) and value.dtype == np.float64 else value
+
+
+def _closed(value):
+    """Arrays without Numbers as arrays of floats, and the kind of floats."""
+    if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
+        return type(value)(map(_closed, value))
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        return value.astype(np.float64)
+    return np.float64 if value is _Float else value
+
+
+def _open_kind(value):
+    """The kind of entries of an array that gets Numbers."""
+    return object if value is _Float else value
 
 
 def _elementwise(function: Callable) -> Callable:
@@ -339,28 +340,75 @@ def _elementwise(function: Callable) -> Callable:
 
 def _has_numbers(value) -> bool:
     if isinstance(value, np.ndarray):
-        return value.dtype == object
+        return value.dtype == object and any(isinstance(entry, Number) for entry in value.flat)
     return isinstance(value, Number) or isinstance(value, (list, tuple)) and any(map(_has_numbers, value))
 
 
-def traced(function: Callable) -> Callable:
+def traced(function: Callable, by_function: bool = True) -> Callable:
     """A copy of a function that takes Numbers; it raises TypeError where these cannot replace floats.
+
+    With `by_function` each function that it calls has its branches joined by itself, see `branches`; one that
+    changes its arguments, or returns what cannot be joined, raises TypeError.
 
     Raises:
         TypeError: for a function that needs floats: it catches exceptions, or asks whether a comparison `is` True.
     """
     if reason := needs_floats(function):
         raise TypeError(reason)
-    copy = Copies(_replacement, BUILTINS, silent=True).called(function)
+    now = threading.local()  # the graph, in each thread that traces the function
+
+    def joined_by_itself(copy: types.FunctionType) -> Callable:
+        return _on_all_sides(copy, now) if by_function and _may_decide(copy.__code__) else copy
+
+    copies = Copies(_replacement, BUILTINS, silent=True, of_array=_open, of_function=joined_by_itself)
+    copy = copies.of(function)
 
     def as_written(*arguments):
         known = next(_numbers_in(arguments), None)
         if known is None:
             return copy(*arguments)
+        now.graph = known.graph
         with known.graph.as_written():
             return copy(*arguments)
 
     return as_written
+
+
+def _on_all_sides(function: Callable, now: threading.local) -> Callable:
+    """A function whose branches are joined where it returns, within `on_every_side` of the graph `now`."""
+
+    def joined(*arguments, **named):
+        if now.graph.decide is None:
+            return function(*arguments, **named)
+        before = [*_identities(arguments), *_identities(named)]
+
+        def result():
+            if before != [*_identities(arguments), *_identities(named)]:
+                raise TypeError("a function that decides must not change its arguments")
+            return function(*arguments, **named)
+
+        return on_every_side(result, now.graph)
+
+    return joined
+
+
+def _may_decide(code: types.CodeType) -> bool:
+    """Whether code has branches, and all of it runs when it is called."""
+    runs_later = code.co_flags & (inspect.CO_GENERATOR | inspect.CO_COROUTINE | inspect.CO_ASYNC_GENERATOR)
+    return not runs_later and any("_IF_" in instruction.opname for instruction in dis.get_instructions(code))
+
+
+def _identities(value) -> Iterator[int]:
+    """What tells whether a value was changed: of collections, arrays and objects their entries."""
+    yield id(value)
+    if isinstance(value, Number | type | types.FunctionType):
+        return
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
+    if isinstance(value, np.ndarray):
+        parts = value.ravel().tolist() if value.dtype == object else ()
+        yield hash(value.tobytes()) if value.dtype != object else 0
+    for part in (*parts, *getattr(value, "__dict__", {}).values()):
+        yield from _identities(part)
 
 
 def _numbers_in(value) -> Iterator[Number]:

@@ -23,10 +23,10 @@ from thruster_env.core.checks import as_floats, at_least, covariance, covariance
 from thruster_env.core.derivatives import by_complex_step, complex_step
 from thruster_env.core.equal_functions import first_equal
 from thruster_env.core.modules import error_line
-from thruster_env.core.results import array_valued
 from thruster_env.core.sources import as_value, is_array
 from thruster_env.core.user_functions import as_function, as_made
-from thruster_env.graphs.python_floats import with_floats, with_python_floats
+from thruster_env.graphs.python_floats import with_floats
+from thruster_env.model.called import called_function
 from thruster_env.model.quantities import (
     Positions,
     Quantities,
@@ -49,8 +49,9 @@ class StateSpaceModel:
 
     The functions are `transition(x, u, c)`, `observe(x, c)` and, if known, their Jacobians. They take and return
     tuples of components, Jacobians as tuples of rows (n rows of n, m rows of n), and may use the parameters of the
-    model, `constants` c. Functions made of arithmetic and `math` or `numpy` scalar functions are compiled; others
-    run as Python, slower, with the same results.
+    model, `constants` c. They are plain Python: loops, arrays, dataclasses and a few branches become machine
+    code wherever the model is used (`thruster_env.model.called`). What cannot runs as Python, and a warning says
+    why.
 
     Above 36 states or inputs, or 96 constants in a plain tuple, x, u or c is an array of float64 and not a tuple;
     it is complex if a Jacobian is computed by complex steps (`np.empty_like(x)` makes another such array). It is
@@ -201,10 +202,7 @@ class StateSpaceModel:
         def ready(function: Callable | None, arguments: str, *shape: int) -> Any:
             if function is None or by_complex_step(function):
                 return function
-            if is_array(max(sizes[:2])) or is_array(*shape) or constants_are_array(form):
-                return array_valued(with_python_floats(function), arguments, *shape)
-            of = sizes if "u" in arguments else (n, sizes[2])
-            return array_valued(with_python_floats(function, arguments, of, form, shape), arguments, *shape)
+            return called_function(function, arguments, sizes if "u" in arguments else (n, sizes[2]), form, shape)
 
         return Functions(
             ready(first_equal(self.transition), "x, u, c", n),

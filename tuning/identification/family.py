@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.pages.traced import traced_model
 from thruster_env.core.checks import finite, short_repr
 from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.equal_functions import bound_call, captured_numbers, differ_in_numbers_alone, with_numbers
@@ -24,6 +23,7 @@ from thruster_env.graphs.graphs import Number
 from thruster_env.graphs.tracing import traced
 from thruster_env.logs.log import AnyStepModel, in_any_steps
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.traced import traced_model
 from tuning.problems.problem import Parameter, squared
 from tuning.search.parameters import r_name
 

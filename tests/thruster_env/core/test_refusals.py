@@ -80,7 +80,7 @@ def test_a_broken_outermost_function_is_a_fault_to_report():
 @pytest.mark.parametrize("function", [of_text, of_dictionary, Times(), functools.partial(of_text)])
 def test_a_model_that_numba_refuses_is_none(function):
     said = warning_of(function)
-    assert said.startswith("the model runs as Python, slowly, because numba refuses it: ") and FAULT not in said
+    assert said.startswith(f"{compiled.IN_PYTHON}: numba refuses it: ") and FAULT not in said
 
 
 def test_a_disk_without_room_is_neither(monkeypatch):

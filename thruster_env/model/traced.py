@@ -1,0 +1,228 @@
+"""A model's functions, traced: graphs of numbers, and their derivatives."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from thruster_env.core.derivatives import by_complex_step
+from thruster_env.core.sources import is_array
+from thruster_env.core.user_functions import stands_for
+from thruster_env.graphs.branches import along, on_every_side
+from thruster_env.graphs.graphs import Graph, Number
+from thruster_env.graphs.programs import Place, Program, program_of, values_of
+from thruster_env.graphs.python_floats import in_python
+from thruster_env.graphs.tracing import traced
+from thruster_env.model.shape import Functions, Shape, constants_are_array
+
+MOST = 30_000  # operations of a stage; with more, programs without calls take longer to compile than calls
+POINTS = ((0.1, 0.5), (1.0, 1.0), (1.0, 2.5), (10.0, 4.0))  # magnitudes and phases, where graphs are compared
+
+
+@lru_cache(maxsize=64)
+def traced_model(functions: Functions, shape: Shape, partly: bool = False) -> tuple[Traced | Untraced, ...]:
+    """A model's f and h, traced once for all filters.
+
+    If one cannot be traced: raises TypeError, or with `partly` returns an `Untraced` for it.
+    """
+    f, by_f, h, by_h = functions
+    make: Callable = traced_if_possible if partly else Traced
+    return make(f, by_f, 2, shape), make(h, by_h, 1, shape)
+
+
+def traced_function(function: Callable, *about) -> TracedFunction:
+    """A function of a model, or its Jacobian, traced once for all uses; arguments as of `TracedFunction`."""
+    return _traced_once(stands_for(function), *about)
+
+
+@lru_cache(maxsize=256)
+def _traced_once(*arguments) -> TracedFunction:
+    return TracedFunction(*arguments)
+
+
+class TracedFunction:
+    """A function of a model that takes arrays of Numbers.
+
+    Args:
+        function: of x, perhaps u, and constants c.
+        sizes: number of components of each.
+        form: of the constants, their NamedTuple class, or how many there are in a tuple.
+        shape: of the result: (count,), or (rows, columns) of a tuple of rows.
+
+    Raises:
+        TypeError: if it cannot be traced, or its graph has other values than it has. Whatever else the function
+            raises if it gets Numbers is raised, too.
+    """
+
+    def __init__(self, function: Callable, sizes: tuple[int, ...], form: type | int, shape: tuple[int, ...]):
+        self._sizes, self._form, self._shape = sizes, form, shape
+        plain = _of_plain_constants(function, form)
+        try:
+            self._copy = traced(plain)
+            self._check(plain)
+        except Exception:  # a function that it calls changes its arguments, or returns what cannot be joined
+            self._copy = traced(plain, by_function=False)
+            self._check(plain)
+
+    def __call__(self, *vectors: np.ndarray) -> np.ndarray:
+        """The result for vectors, of which the first has Numbers."""
+        arguments = self._as_vectors(*vectors)
+        for number in (*vectors[0], *vectors[-1]):  # along which slopes are taken
+            if isinstance(number, Number):
+                number.graph.whole.add(number.place)
+
+        def result() -> np.ndarray:
+            value = self._copy(*arguments)
+            values = np.array([[*row] for row in value] if len(self._shape) == 2 else [*value], dtype=object)
+            if values.shape != self._shape:
+                raise TypeError(f"a function must return values of shape {self._shape}, but got {values.shape}")
+            return values
+
+        return on_every_side(result, _graph_of(*vectors))
+
+    def _as_vectors(self, *vectors: np.ndarray) -> list:
+        """Arguments as tuples of Python's floats, or arrays if they are large.
+
+        With NumPy's floats (x > 0) + (y > 0) would be 1 where Python and machine code give 2.
+        """
+        *before, c = vectors
+        plain = [vector if is_array(len(vector)) else tuple(vector.tolist()) for vector in before]
+        return [*plain, c if constants_are_array(self._form) else tuple(c.tolist())]
+
+    def program(self) -> Program:
+        """The program that reads the arguments' components from `numbers` and stores the result in `rows`."""
+        return program_of([(Place("rows", k), number) for k, number in enumerate(self._numbers())], {})
+
+    def _numbers(self) -> list[Number]:
+        graph, ends = Graph(MOST), np.cumsum(self._sizes)
+        components = np.array([graph.given(Place("numbers", k)) for k in range(ends[-1])], dtype=object)
+        return [graph.number(entry) for entry in self(*np.split(components, ends[:-1])).ravel()]
+
+    def _check(self, function: Callable) -> None:
+        """Raise TypeError unless the graph has the function's values at all points where these are finite.
+
+        A function that checks the types of its arguments may treat Numbers differently from floats.
+        """
+        numbers, ends, agreed = self._numbers(), np.cumsum(self._sizes), False
+        points = np.array([magnitude * np.sin(phase + np.arange(ends[-1])) for magnitude, phase in POINTS])
+        points[:, ends[-2] :] = 0.1 + abs(points[:, ends[-2] :])  # constants
+        with np.errstate(all="ignore"):
+            all_computed = values_of(numbers, points.T).T
+        for point, computed in zip(points, all_computed, strict=True):
+            expected = _value_at(function, self._as_vectors(*np.split(point, ends[:-1])))
+            if np.isfinite(expected).all():
+                agreed = np.allclose(computed, expected, rtol=1e-9, atol=1e-9 * abs(expected).max(initial=0.0))
+                if not agreed:
+                    raise TypeError("a function does something else with numbers that are not known yet")
+        if not agreed:
+            raise TypeError("a function has no value at any point where its graph could be compared with it")
+
+
+def _of_plain_constants(function: Callable, form: type | int) -> Callable:
+    """A function that gets its constants as they are in memory, for another one that gets them in their form."""
+    if isinstance(form, int):
+        return function
+
+    def of_plain(*arguments):
+        *vectors, c = arguments
+        return function(*vectors, form(*c))
+
+    return of_plain
+
+
+class Traced:
+    """A function of a model that takes arrays of Numbers, and its derivatives.
+
+    Attributes:
+        parts: the function, its Jacobian, and the slopes of both, as operations of `Equations` take them.
+        of_points: the function and its slope at each column of a matrix.
+    """
+
+    def __init__(self, function: Callable, jacobian: Callable | None, input_count: int, shape: Shape):
+        self._input_count = input_count
+        sizes = (shape.n, shape.inputs, shape.constants) if input_count == 2 else (shape.n, shape.constants)
+        rows = shape.n if input_count == 2 else shape.m
+        self._function = traced_function(function, sizes, shape.form, (rows,))
+        self._jacobian = None
+        if jacobian is not None and not by_complex_step(jacobian):
+            self._jacobian = traced_function(jacobian, sizes, shape.form, (rows, shape.n))
+        self.parts = self._value, self._matrix, self._by_constants, self._slope
+        self.of_points = self._values_of_points, self._slopes_of_points
+
+    def _value(self, x, *inputs):
+        return self._function(x, *inputs)
+
+    def _matrix(self, x, scales, *inputs):
+        if self._jacobian is not None:
+            return self._jacobian(x, *inputs)
+        value = self._value(x, *inputs)
+        return np.array([_along(value, (x, unit)) for unit in np.eye(len(x))], dtype=object).T
+
+    def _by_constants(self, x, scales, *arguments):
+        inputs, (dc, _) = arguments[: self._input_count], arguments[self._input_count :]
+        return _along(self._value(x, *inputs), (inputs[-1], dc))
+
+    def _slope(self, x, scales, *arguments):
+        inputs, (dx, *moves) = arguments[: self._input_count], arguments[self._input_count :]
+        return _along(self._matrix(x, scales, *inputs), (x, dx), *((inputs[-1], dc) for dc in moves[:1]))
+
+    def _values_of_points(self, points, *inputs):
+        return np.array([self._value(x, *inputs) for x in points.T]).T
+
+    def _slopes_of_points(self, points, scales, *arguments):
+        inputs, (changes, *moves) = arguments[: self._input_count], arguments[self._input_count :]
+        of_constants = [(inputs[-1], dc) for dc in moves[:1]]
+        pairs = zip(points.T, changes.T, strict=True)
+        return np.array([_along(self._value(x, *inputs), (x, dx), *of_constants) for x, dx in pairs]).T
+
+
+def _graph_of(*arguments) -> Graph:
+    """The graph to which the Numbers among the arguments belong; those of the state always do."""
+    return next(number.graph for argument in arguments for number in argument if isinstance(number, Number))
+
+
+class Untraced:
+    """A function of a model that cannot be traced: each part raises TypeError if it is evaluated."""
+
+    def __init__(self):
+        self.parts, self.of_points = (not_known,) * 4, (not_known,) * 2
+
+
+def traced_if_possible(*arguments) -> Traced | Untraced:
+    """`Traced` of the arguments, or `Untraced` if the function cannot be traced."""
+    try:
+        return Traced(*arguments)
+    except Exception:  # whatever a user's function raises if it gets Numbers
+        return Untraced()
+
+
+def not_known(*arguments):
+    """Stand in for a function that can only be called."""
+    raise TypeError("a function that is called computes nothing of numbers that are not known yet")
+
+
+def _value_at(function: Callable, arguments: list) -> np.ndarray:
+    """The result of a function, flat; one NaN if it raises an arithmetic error."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return np.array(in_python(function, arguments), dtype=np.float64).ravel()
+        except (ArithmeticError, ValueError, TypeError):  # also of complex numbers
+            return np.array([np.nan])
+
+
+def _along(y: np.ndarray, *moves: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """The slope of y along changes of Numbers, pairs of arrays (numbers, changes)."""
+    pairs = [
+        (number, change) for numbers, changes in moves for number, change in zip(numbers, changes, strict=True)
+    ]
+    graph = pairs[0][0].graph
+    directions: dict = {number.place: graph.number(change) for number, change in pairs}
+    if len(directions) < len(pairs):
+        raise TypeError("numbers that move must differ from one another, but some are equal")
+    directions = {position: None if change.value == 0.0 else change for position, change in directions.items()}
+    slopes = along([graph.number(number) for number in y.ravel()], directions)
+    return np.array([0.0 if slope is None else slope for slope in slopes], dtype=object).reshape(y.shape)
