@@ -12,17 +12,17 @@ import tuning.cli
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.find import find_problem
-from tuning.reporting.matlab import function_name, matlab_function, traced
+from tuning.reporting.matlab import function_name, lines_of, matlab_function
 from tuning.search.space import Choice, untuned_choice
 
 
 def value_of(lines, x, u):
     """What lines of MATLAB come to, by Python's operators."""
     named = {"x": lambda i: x[i - 1], "u": lambda i: u[i - 1], "abs": abs, "sin": sin, "exp": exp}
-    named |= {"mod": lambda a, b: a % b, **IN_PYTHON}
+    named |= IN_PYTHON
     for line in lines[:-1]:
         name, _, told = line.rstrip(";").partition(" = ")
-        named[name] = eval(told.replace("^", "**"), named)
+        named[name] = eval(told.replace("^", "**").replace("~=", "!="), named)
     return [eval(name, named) for name in lines[-1].strip("[]").split("; ")]
 
 
@@ -32,16 +32,17 @@ def test_traced_functions_are_those_of_the_model(name):
     x = [0.3, -0.2, 0.05, 0.1, -0.15, 0.2, 0.12, -0.07][: model.n]
     u, c = [1.5, 0.1, -0.05][: model.inputs], model.given_constants
     names = [f"x({i + 1})" for i in range(model.n)], [f"u({i + 1})" for i in range(model.inputs)]
-    f, h = traced(model.transition, names, c), traced(model.observe, names[:1], c)
+    f, h = lines_of(model.transition, names, c, model.n), lines_of(model.observe, names[:1], c, model.m)
     np.testing.assert_allclose(value_of(f, x, u), model.transition(tuple(x), tuple(u), c), rtol=1e-12)
     np.testing.assert_allclose(value_of(h, x, u), model.observe(tuple(x), c), rtol=1e-12)
 
 
-def test_elementary_functions_are_traced_and_branches_are_not():
-    lines = traced(lambda x, c: (np.sin(x[0]) - c[0] * np.exp(-x[1]), 2.0), [["x(1)", "x(2)"]], (3.0,))
+def test_elementary_functions_and_branches_are_written_out():
+    lines = lines_of(lambda x, c: (np.sin(x[0]) - c[0] * np.exp(-x[1]), 2.0), [["x(1)", "x(2)"]], (3.0,), 2)
     np.testing.assert_allclose(value_of(lines, [0.4, 0.5], []), [sin(0.4) - 3.0 * exp(-0.5), 2.0])
-    with pytest.raises(ValueError, match="test_matlab.py, line .*'with pytest|compares a value"):
-        traced(lambda x, c: (x[0] if x[0] > 0 else 0.0,), [["x(1)"]], ())
+    lines = lines_of(branching, [["x(1)"], []], (), 1)
+    for x in (0.0, -0.7, 1.3):
+        np.testing.assert_allclose(value_of(lines, [x], []), branching((x,), (), ()), rtol=1e-15)
 
 
 def helper(a, b):
@@ -69,21 +70,21 @@ def of_numpy(x, u, c):
 IN_PYTHON = {
     "log": math.log, "atan2": math.atan2, "hypot": math.hypot, "tanh": math.tanh, "min": min, "max": max,
     "rem": math.fmod, "round": round, "floor": math.floor, "sqrt": math.sqrt, "log10": math.log10, "pi": math.pi,
-    "log1p": math.log1p, "asin": math.asin,
+    "log1p": math.log1p, "choose": lambda condition, a, b: a if condition else b,
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("function", [of_math, of_numpy])
 def test_functions_of_math_are_traced_as_those_of_numpy(function):
     x, u = [0.7, 1.3], [0.2]
-    lines = traced(function, (["x(1)", "x(2)"], ["u(1)"]), ())
+    lines = lines_of(function, (["x(1)", "x(2)"], ["u(1)"]), (), len(function((0.7, 1.3), (0.2,), ())))
     np.testing.assert_allclose(value_of(lines, x, u), function(tuple(x), tuple(u), ()), rtol=1e-14)
 
 
 def branching(x, u, c):
-    if x[0] == 0.0:  # this is the line
+    if x[0] < 0.0 or x[0] != x[0]:
         return (1.0,)
-    return (math.sin(x[0]) / x[0],)
+    return (math.sin(x[0]) + 1.0,)
 
 
 def truncating(x, u, c):
@@ -91,11 +92,9 @@ def truncating(x, u, c):
 
 
 def test_what_cannot_be_written_out_says_where():
-    branch = "'if x.0. == 0.0:  # this is the line', compares a value"
-    for function, line in ((branching, branch), (truncating, "int")):
-        with pytest.raises(ValueError, match=rf"but test_matlab.py, line \d+, .*{line}") as caught:
-            traced(function, (["x(1)"], []), ())
-        assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match=r"but truncating \(test_matlab.py, line \d+\) cannot be .*int") as caught:
+        lines_of(truncating, (["x(1)"], []), (), 1)
+    assert "\n" not in str(caught.value)
 
 
 def test_the_template_that_thruster_new_writes_can_be_exported():
@@ -133,7 +132,7 @@ def test_an_affine_model_is_its_matrices():
 
 def test_a_model_that_cannot_be_written_out_says_so():
     model = StateSpaceModel(
-        transition=lambda x, u, c: (x[0] if x[0] > 0 else 0.5 * x[0],),
+        transition=truncating,
         observe=lambda x, c: (x[0],),
         process_noise_cov=[1.0],
         measurement_noise_cov=[1.0],
@@ -141,7 +140,7 @@ def test_a_model_that_cannot_be_written_out_says_so():
         prior_cov=[1.0],
     )
     text = matlab_function(Choice("ekf", {}, {}), model, "mine", None)
-    assert "%   Why: a function to be written out must" in text and "test_matlab.py, line" in text
+    assert "%   Why: a function that is written out must" in text and "test_matlab.py, line" in text
     assert "m.f and m.h are yours to add" in text and "@transition" not in text and "m.dt" not in text
 
 

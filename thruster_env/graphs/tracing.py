@@ -106,6 +106,10 @@ def _nearest_rest(x, n):
     return where(x < 0.0, -rest, rest)
 
 
+def _logarithm(x, base):
+    return x.log() if base.value == math.e else x.log() / base.log()
+
+
 def _step(x, at_zero):
     return where(x > 0.0, 1.0, where(x == 0.0, at_zero, where(x < 0.0, 0.0, x)))
 
@@ -251,6 +255,7 @@ OF_MATRICES: dict[str, Callable] = {
 """The same of `numpy.linalg`."""
 
 OF_MATH: dict[str, Callable] = {
+    "log": lambda x, base=math.e: _logarithm(*_numbers(x, base)),
     "remainder": _nearest_rest,
     "dist": lambda p, q: _hypotenuse(*(a - b for a, b in zip(p, q, strict=True))),
     "fsum": sum,

@@ -3,297 +3,88 @@
 The code runs in MATLAB and in GNU Octave without a toolbox. The functions f and h take columns, as
 `extendedKalmanFilter` and `unscentedKalmanFilter` of MATLAB's toolboxes want them.
 
-It accepts functions made of + - * / // % abs ** min max and the elementary functions of `math` and numpy, and
-their callees. A function that branches on a value cannot be traced.
+They are written from the graphs of the model's functions, from which C and machine code are made, too.
 """
 
 from __future__ import annotations
 
-import builtins
-import linecache
-import math
 import re
-import types
 from collections.abc import Callable, Sequence
-from functools import partial, reduce
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thruster_env.core.user_functions import needs_floats
+from thruster_env.graphs.graphs import COMPARISONS, UNARY, Graph, Number, needed_by
 from thruster_env.model.affine import AffineModel
+from thruster_env.model.called import why_not_traced
+from thruster_env.model.shape import constants_form
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.traced import traced_function
 from tuning.search.space import Choice
 
-# Symbols that stand for numbers, and the functions of `math` and numpy on them, as MATLAB writes them.
+# A function of a model as lines of MATLAB, from its graph.
 
-
-ONE = {  # functions of one number: names in `math` and numpy, and what MATLAB has for them
-    **{name: f"{name}({{}})" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "expm1", "log1p")},
-    **{name: f"{name}({{}})" for name in ("log2", "log10", "sqrt", "floor", "ceil", "sign", "erf", "erfc")},
-    **{f"arc{name}": f"a{name}({{}})" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
-    **{f"a{name}": f"a{name}({{}})" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
-    "log": "log({})",
-    "gamma": "gamma({})",
-    "abs": "abs({})",
-    "absolute": "abs({})",
-    "fabs": "abs({})",
-    "trunc": "fix({})",
-    "fix": "fix({})",
+EXPRESSIONS = {
+    **{name: f"{name}({{}})" for name in (*UNARY, "abs")},
+    **{f"arc{name}": f"a{name}({{}})" for name in "tan tanh sinh cosh".split()},
+    **{operation: f"{{}} {operation} {{}}" for operation in (*"+-*/", *COMPARISONS)},
+    "!=": "{} ~= {}",
+    "and": "{} & {}",
+    "or": "{} | {}",
+    "pow": "{} ^ {}",
+    "negative": "-{}",
     "cbrt": "nthroot({}, 3)",
     "exp2": "2 ^ {}",
-    "square": "{0} * {0}",
-    "reciprocal": "1 / {}",
-    "lgamma": "gammaln({})",
-    **{name: "{} * pi / 180" for name in ("radians", "deg2rad")},
-    **{name: "{} * 180 / pi" for name in ("degrees", "rad2deg")},
-}
-TWO = {  # of two
-    **{name: "atan2({}, {})" for name in ("atan2", "arctan2")},
-    **{name: "{} ^ {}" for name in ("pow", "power")},
-    **{name: "min({}, {})" for name in ("minimum", "fmin")},
-    **{name: "max({}, {})" for name in ("maximum", "fmax")},
+    "arctan2": "atan2({}, {})",
     "hypot": "hypot({}, {})",
     "fmod": "rem({}, {})",
-    "remainder": "{0} - {1} * round({0} / {1})",  # that of `math`; numpy's is `mod`
-    "mod": "mod({}, {})",
-    "copysign": "abs({0}) * (2 * ({1} >= 0) - 1)",
+    "copysign": "abs({}) * (2 * ({} >= 0) - 1)",
+    "rint": "round({0}) - (abs({0} - fix({0})) == 0.5) * mod(round({0}), 2) * sign({0})",  # halves to even numbers
+    "where": "choose({}, {}, {})",
 }
-MODULES = (math, np)
+"""What MATLAB has for the operations of graphs."""
+CHOOSE = """
+function y = choose(condition, a, b)
+if condition, y = a; else, y = b; end
+end
+"""
 
 
-class Branch(TypeError):
-    """A symbol is asked for its value."""
-
-
-class Tape:
-    """Operations in their order, none of them twice."""
-
-    def __init__(self):
-        """Nothing is on it yet."""
-        self._places: dict[str, str] = {}
-        self._used: dict[str, tuple[str, ...]] = {}
-
-    def note(self, expression: str, *parts: str) -> Symbol:
-        """The symbol of an operation on some parts."""
-        name = self._places.setdefault(expression, f"t{len(self._places) + 1}")
-        self._used[name] = parts
-        return Symbol(self, name)
-
-    def lines(self, results: Sequence[str]) -> list[tuple[str, str]]:
-        """Names and expressions of what some results need, in the order of computing."""
-        needed, rest = set(), list(results)
-        while rest:
-            name = rest.pop()
-            if name in self._used and name not in needed:
-                needed.add(name)
-                rest += self._used[name]
-        return [(name, expression) for expression, name in self._places.items() if name in needed]
-
-
-def _both(form: str) -> tuple[Callable, Callable]:
-    """An operator with a symbol on its left, and with one on its right."""
-
-    def note(tape: Tape, first: Any, second: Any) -> Symbol:
-        a, b = text(first), text(second)
-        return tape.note(form.format(a, b), a, b)
-
-    return lambda self, other: note(self.tape, self, other), lambda self, other: note(self.tape, other, self)
-
-
-def _compared(self, other: Any) -> bool:
-    """Nobody knows."""
-    raise Branch("compares a value")
-
-
-class Symbol:
-    """What stands for a number."""
-
-    __hash__ = None  # type: ignore[assignment]  # equality is not known either
-
-    def __init__(self, tape: Tape, name: str):
-        """A symbol of a name on a tape."""
-        self.tape, self.name = tape, name
-
-    __add__, __radd__ = _both("{} + {}")
-    __sub__, __rsub__ = _both("{} - {}")
-    __mul__, __rmul__ = _both("{} * {}")
-    __truediv__, __rtruediv__ = _both("{} / {}")
-    __pow__, __rpow__ = _both("{} ^ {}")
-    __mod__, __rmod__ = _both("mod({}, {})")  # of the sign of the divisor, as Python's
-    __floordiv__, __rfloordiv__ = _both("floor({} / {})")
-    __lt__ = __le__ = __gt__ = __ge__ = __eq__ = __ne__ = _compared
-
-    def __neg__(self) -> Symbol:
-        """Minus a symbol."""
-        return self.tape.note(f"-{self.name}", self.name)
-
-    def __pos__(self) -> Symbol:
-        """The symbol itself."""
-        return self
-
-    def __abs__(self) -> Symbol:
-        """Absolute value of a symbol."""
-        return self.tape.note(f"abs({self.name})", self.name)
-
-    def __bool__(self) -> bool:
-        """Nobody knows."""
-        raise Branch("asks whether a value is true")
-
-    def __getattr__(self, name: str) -> Callable:
-        """What numpy's functions call on objects."""
-        if name not in ONE and name not in TWO:
-            raise AttributeError(name)
-        return partial(applied, name, self)
-
-
-def text(value: Any) -> str:
-    """A symbol's name, or a number as it is written in a product."""
-    if isinstance(value, Symbol):
-        return value.name
-    number = float(value)
-    return f"{number:.17g}" if number >= 0 else f"({number:.17g})"
-
-
-def applied(name: str, *arguments: Any) -> Symbol:
-    """A function of `ONE` or `TWO` on what are not all numbers."""
-    form, count = (ONE[name], 1) if name in ONE and len(arguments) == 1 else (TWO.get(name, ""), 2)
-    if not form or len(arguments) != count:
-        raise TypeError(f"calls {name} with {len(arguments)} values")
-    parts = [text(argument) for argument in arguments]
-    tape = next(argument.tape for argument in arguments if isinstance(argument, Symbol))
-    return tape.note(form.format(*parts), *parts)
-
-
-def _stands_in(name: str, function: Callable) -> Callable:
-    """A function of numbers that also takes symbols."""
-
-    def call(*arguments: Any) -> Any:
-        if not any(isinstance(argument, Symbol) for argument in arguments):
-            return function(*arguments)
-        if name == "log" and len(arguments) == 2:
-            return applied("log", arguments[0]) / call(arguments[1])
-        if name == "clip":
-            return applied("minimum", applied("maximum", arguments[0], arguments[1]), arguments[2])
-        return applied(name, *arguments)
-
-    return call
-
-
-def _least(name: str, function: Callable) -> Callable:
-    """`min` or `max` of any numbers, or of a sequence, also of symbols."""
-
-    def call(*arguments: Any) -> Any:
-        operands = tuple(arguments[0]) if len(arguments) == 1 else arguments
-        if not any(isinstance(operand, Symbol) for operand in operands):
-            return function(operands)
-        return reduce(lambda a, b: _stands_in(name, function)(a, b), operands)
-
-    return call
-
-
-class _Module:
-    """A module whose elementary functions take symbols."""
-
-    def __init__(self, module: types.ModuleType):
-        """Take the module."""
-        self._module = module
-
-    def __getattr__(self, name: str) -> Any:
-        """A function that takes symbols if there is one, otherwise the module's."""
-        return on_symbols(getattr(self._module, name))
-
-
-def on_symbols(value: Any) -> Any:
-    """What stands in for a value of a function's surroundings while it is run on symbols; else the value."""
-    if any(value is module for module in MODULES):
-        return _Module(value)
-    if value is builtins.min or value is builtins.max:
-        return _least("minimum" if value is builtins.min else "maximum", value)
-    name = "mod" if value is np.remainder else getattr(value, "__name__", "")
-    if callable(value) and (name in ONE or name in TWO or name == "clip"):
-        if any(getattr(module, name, None) is value for module in MODULES):
-            return _stands_in(name, value)
-    return value
-
-
-# A function of a model as lines of another language, obtained by running it on symbols.
-
-
-OWN = (__file__, __file__)
-
-
-def traced(function: Callable, arguments: Sequence[Sequence[str]], constants: Any) -> list[str]:
+def lines_of(function: Callable, arguments: Sequence[Sequence[str]], constants: Any, count: int) -> list[str]:
     """Lines "t1 = a + b;" of a function and, last, "[t7; t9]", its results.
 
     Args:
-        function: of a model, which takes tuples of components and the constants last.
-        arguments: names of the components of each tuple.
+        function: of a model, which takes vectors and the constants last.
+        arguments: names of the components of each vector.
         constants: of the model.
+        count: of its results.
 
     Raises:
         ValueError: in one line, with that of the function, where it cannot be traced.
     """
-    rule = "a function to be written out must be made of operators and elementary functions, but"
-    if reason := needs_floats(function):
-        raise ValueError(f"{rule} {reason}")
-    tape = Tape()
+    graph, sizes = Graph(), (*map(len, arguments), len(constants))
+    vectors = [np.array([*map(graph.given, names), None], dtype=object)[:-1] for names in arguments]
     try:
-        run = _rebound(function, {})
-        outputs = run(*(tuple(Symbol(tape, name) for name in names) for names in arguments), constants)
-        results = [text(output) for output in outputs]
-    except (TypeError, AttributeError, ValueError, ArithmeticError, LookupError) as error:
-        what = str(error) if isinstance(error, Branch) else f"cannot be run on symbols ({_first_line(error)})"
-        raise ValueError(f"{rule} {_place(error, function)} {what}") from None
-    return [*(f"{name} = {expression};" for name, expression in tape.lines(results)), f"[{'; '.join(results)}]"]
+        traced = traced_function(function, sizes, constants_form(constants), (count,))
+        results = [graph.number(result) for result in traced(*vectors, np.array(constants, dtype=object))]
+    except Exception as error:  # whatever a user's function raises if it gets Numbers
+        rule = "a function that is written out must be traced, but"
+        raise ValueError(f"{rule} {why_not_traced(function, error)}") from None
+    names: dict[int, str] = {}
+    lines: list[str] = []
+    for number in needed_by(results):
+        names[number.place] = _known(number) or f"t{len(lines) + 1}"
+        if not _known(number):
+            parts = (names[part.place] for part in number.of)
+            lines.append(f"{names[number.place]} = {EXPRESSIONS[number.operation].format(*parts)};")
+    return [*lines, f"[{'; '.join(names[result.place] for result in results)}]"]
 
 
-def _rebound(value: Any, rebound: dict[int, Any]) -> Any:
-    """A function with what it calls by name, and the functions in its closure, put on symbols; else the value."""
-    if not isinstance(value, types.FunctionType):
-        return on_symbols(value)
-    if id(value) in rebound:
-        return rebound[id(value)]
-    code, names = value.__code__, dict(value.__globals__)
-    cells = None if value.__closure__ is None else tuple(types.CellType() for _ in value.__closure__)
-    other = types.FunctionType(code, names, value.__name__, value.__defaults__, cells)
-    other.__kwdefaults__ = value.__kwdefaults__
-    rebound[id(value)] = other
-    for name in _names(code):
-        if name in names:
-            names[name] = _rebound(names[name], rebound)
-        elif hasattr(builtins, name):
-            names[name] = on_symbols(getattr(builtins, name))
-    for cell, before in zip(cells or (), value.__closure__ or (), strict=True):
-        try:
-            cell.cell_contents = _rebound(before.cell_contents, rebound)
-        except ValueError:  # an empty one
-            continue
-    return other
-
-
-def _names(code: types.CodeType) -> set[str]:
-    inner = [_names(constant) for constant in code.co_consts if isinstance(constant, types.CodeType)]
-    return set(code.co_names).union(*inner)
-
-
-def _place(error: BaseException, function: Callable) -> str:
-    """The last line of the user's that an error came through."""
-    innermost, at = None, error.__traceback__
-    while at is not None:
-        if at.tb_frame.f_code.co_filename not in OWN:
-            innermost = at
-        at = at.tb_next
-    if innermost is None:
-        return getattr(function, "__name__", "a function")
-    file = innermost.tb_frame.f_code.co_filename
-    line = linecache.getline(file, innermost.tb_lineno).strip()
-    return f"{Path(file).name}, line {innermost.tb_lineno},{f' {line!r},' if line else ''}"
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+def _known(number: Number) -> str:
+    """The text of an argument or a constant; empty for others."""
+    if number.value is None:
+        return str(number.arguments[0]) if number.operation == "given" else ""
+    return f"{number.value:.17g}" if number.value >= 0.0 else f"({number.value:.17g})"
 
 
 STEPPED = ("kf", "ekf")  # of which there is a step
@@ -425,14 +216,15 @@ def _functions(model: StateSpaceModel) -> tuple[str, list[str]]:
             fields,
         )
     x, u = [f"x({i + 1})" for i in range(model.n)], [f"u({i + 1})" for i in range(model.inputs)]
-    f = traced(model.transition, (x, u), model.given_constants)
-    h = traced(model.observe, (x,), model.given_constants)
+    f = lines_of(model.transition, (x, u), model.constants, model.n)
+    h = lines_of(model.observe, (x,), model.constants, model.m)
     if max(len(f), len(h)) > LONGEST:
         raise ValueError(f"f and h must have at most {LONGEST} lines, but they have {len(f)} and {len(h)}")
     substep = "\n".join(f"    {line}" for line in (*f[:-1], f"x = {f[-1]};"))
     loop = f"for part = 1:{model.substeps}\n{substep}\nend\ny = x;"
     measurement = "\n".join((*h[:-1], f"z = {h[-1]};"))
-    return f"\nfunction y = transition(x, u)\n{loop}\nend\n\nfunction z = measurement(x)\n{measurement}\nend\n", []
+    text = f"\nfunction y = transition(x, u)\n{loop}\nend\n\nfunction z = measurement(x)\n{measurement}\nend\n"
+    return text + CHOOSE * ("choose(" in text), []
 
 
 def _matrix(values: np.ndarray) -> str:
