@@ -297,6 +297,11 @@ def compiled_in_place_of(function: Callable, find: Callable[[], Instead]) -> Cal
     return function
 
 
+def is_machine_code(function: Callable) -> bool:
+    """Whether a function marked by `compiled_in_place_of` is traced; of others numba knows when it is asked."""
+    return not _instead[function]().reason
+
+
 def _teach_other(function: Callable) -> None:
     from numba.extending import overload
 

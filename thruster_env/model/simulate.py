@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from thruster_env.core.checks import as_floats
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import (
+    CompiledOrPython,
+    function_fingerprint,
+    inlined,
+    is_interpreting,
+    is_machine_code,
+)
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.core.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
 from thruster_env.model.shape import Functions, Shape, constants_reader, number_places, padded
@@ -112,6 +119,23 @@ def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
                     measurements[b, k, i] = z[i]
 
     return CompiledOrPython(simulate)
+
+
+def seconds_as_python(model: StateSpaceModel) -> float:
+    """The time [s] that f and h of a step take, of a model that runs as Python; 0 for one of machine code.
+
+    Of functions that are not traced numba is asked, which warns if it takes them neither.
+    """
+    functions = model.functions
+    if is_interpreting() or is_machine_code(functions.transition) and is_machine_code(functions.observe):
+        return 0.0
+    key, inputs = np.zeros((1, 2)), np.zeros((1, 1, model.inputs))
+    simulate(model, key, inputs)
+    if not _simulation(*truth_steps_of(model), model.n, model.m, is_interpreting()).in_python:
+        return 0.0
+    started = time.perf_counter()
+    simulate(model, key, inputs)
+    return 0.5 * (time.perf_counter() - started)  # of two measurements and a step
 
 
 def simulate(model: StateSpaceModel, keys: np.ndarray, inputs: np.ndarray) -> Truth:

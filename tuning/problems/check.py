@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from weakref import WeakValueDictionary
@@ -17,12 +18,14 @@ from thruster_env.core.compiled import CompiledOrPython, made_by
 from thruster_env.core.files import write_whole
 from thruster_env.core.sources import as_value
 from thruster_env.model.quantities import Quantities, Quantity
+from thruster_env.model.simulate import seconds_as_python
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.digest import digest_of
 from tuning.problems.problem import Problem
 
 SEEDS = (0, 1)  # with which a problem is checked
+A_MINUTE, RUNS = 60.0, 100  # [s], and of how many runs
 _CHECKED: WeakValueDictionary[int, Problem] = WeakValueDictionary()  # problems that were checked, by their ids
 
 
@@ -57,8 +60,21 @@ def checked_problem(problem, name: str | None = None) -> Problem:
     check_data(data, model, name)
     check_model(model, data, name)
     _check_scale(problem, data, name)
+    _tell_of_python(data, model, name)
     _CHECKED[id(problem)] = problem
     return problem
+
+
+def _tell_of_python(data: Data, model: StateSpaceModel, name: str) -> None:
+    """Warn if the model runs as Python, so that a filter with differences takes over a minute for RUNS."""
+    steps = data.inputs.shape[1]
+    seconds = seconds_as_python(model) * (1 + 2 * model.n) * RUNS * steps
+    if seconds > A_MINUTE:
+        warnings.warn(
+            f"the model of problem {name} runs as Python: a filter may take {seconds / 60:.0f} min for {RUNS} "
+            f"runs of {steps} steps, in each trial of a study",
+            stacklevel=3,
+        )
 
 
 def data_of(problem: Problem, seeds: Sequence[int]) -> Data:

@@ -15,6 +15,10 @@ from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.tracing import traced
 from thruster_env.model import called
 from thruster_env.model.called import called_function
+from thruster_env.model.simulate import seconds_as_python
+from thruster_env.model.state_space import StateSpaceModel
+from tuning.problems import check
+from tuning.problems.model_problem import ModelProblem
 
 GAINS = {"pull": 0.3, "names": ("a", "b")}
 LOGGER = logging.getLogger(__name__)
@@ -184,6 +188,36 @@ def test_the_line_is_that_of_the_helper_which_fails():
         f"helper (test_called.py, line {helper.__code__.co_firstlineno + 2}) cannot be traced"
     )
     assert reason.endswith(called.TABLES)
+
+
+def model_of(transition, **changes):
+    arguments = {
+        "transition": transition,
+        "observe": lambda x, c: (x[0],),
+        "process_noise_cov": [0.1],
+        "measurement_noise_cov": [0.1],
+        "prior_mean": [1.0],
+        "prior_cov": [0.1],
+    }
+    return StateSpaceModel(**arguments | changes)
+
+
+def test_the_time_of_python_is_that_of_models_which_are_no_machine_code():
+    assert seconds_as_python(model_of(lambda x, u, c: (math.sin(x[0]),))) == 0.0
+    assert seconds_as_python(model_of(lambda x, u, c: newton(x, c))) == 0.0
+    with pytest.warns(UserWarning, match=r"runs as Python, .* catching catches exceptions"):
+        assert 0.0 < seconds_as_python(model_of(lambda x, u, c: catching(x, c))) < 0.1
+
+
+def test_a_problem_says_what_python_will_take(monkeypatch):
+    monkeypatch.setattr(check, "seconds_as_python", lambda model: 1e-3)
+    problem = ModelProblem(model_of(newton_step), inputs=np.zeros((400, 0)), scale=(1.0,))
+    with pytest.warns(UserWarning, match="may take 2 min for 100 runs of 400 steps"):
+        check.checked_problem(problem)
+
+
+def newton_step(x, u, c):
+    return newton(x, c)
 
 
 def test_what_fails_otherwise_than_by_a_raise_of_its_own_has_no_outcome():
