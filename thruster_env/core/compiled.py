@@ -205,6 +205,7 @@ FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
 
 JUMPS = frozenset("floor ceil trunc fix rint round fmod mod remainder floor_divide divmod".split())
 
+IN_PYTHON = "the model runs as Python, some hundred times slower"
 MOST_WAITING = 10_000  # functions, above which those that nobody has any more are forgotten
 _packages: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
 
@@ -277,14 +278,12 @@ class Instead(NamedTuple):
         key: what else than the code of both determines the machine code.
         fastmath: what machine code may reorder and contract of it.
         reason: why the function is not traced, with its name and line; empty if it is.
-        refused: why numba does not compile it either, if that is known before.
     """
 
     function: Callable | None
     key: str = ""
     fastmath: frozenset[str] = FASTMATH
     reason: str = ""
-    refused: str = ""
 
 
 def compiled_in_place_of(function: Callable, find: Callable[[], Instead]) -> Callable:
@@ -305,7 +304,7 @@ def is_machine_code(function: Callable) -> bool:
 def _teach_other(function: Callable) -> None:
     from numba.extending import overload
 
-    other, _, fastmath, *_ = _instead[function]()
+    other, _, fastmath, _ = _instead[function]()
     if other is None:  # whatever calls it runs as Python
         return
     plain = other if isinstance(other, types.FunctionType) else lambda *arguments: other(*arguments)
@@ -516,9 +515,7 @@ class CompiledOrPython:
         if not self._proven:
             of_model = [_instead[called]() for called in _with_callees([self._python]) if called in _instead]
             if refused := [instead for instead in of_model if instead.function is None]:
-                *_, reason, by_numba = refused[0]
-                more = "" if by_numba in reason else f"; numba refuses it: {by_numba}"
-                warnings.warn(f"{IN_PYTHON}: {reason}{more}", stacklevel=3)
+                warnings.warn(f"{IN_PYTHON}: {refused[0].reason}", stacklevel=3)
                 self._run, self._proven = self._python, True
                 return self(*arguments)
             try:
@@ -530,9 +527,6 @@ class CompiledOrPython:
             finally:
                 self._proven = True
         return self(*arguments)
-
-
-IN_PYTHON = "the model runs as Python, some hundred times slower"
 
 
 def _refusal(function: Callable, error: Exception, *reasons: str) -> str:

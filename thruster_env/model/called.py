@@ -69,11 +69,10 @@ def _machine_code(function: Callable, arguments: str, sizes: Sequence[int], form
         return Instead(_evaluation(program, arguments, sizes, shape), key)
     except Exception as error:  # whatever a user's function raises if it gets Numbers
         reason = why_not_traced(function, error)
-    refused = needs_python(function)
     if not isinstance(function, types.FunctionType) and not hasattr(function, "py_func"):
-        refused = f"it compiles plain functions, and no {type(function).__name__}"
-    other = None if refused else array_valued(function, arguments, *shape)
-    return Instead(other, "", frozenset(fastmath_of(function)), reason, refused or "")
+        return Instead(None, reason=f"{reason}; numba compiles plain functions, and no {type(function).__name__}")
+    other = None if needs_python(function) else array_valued(function, arguments, *shape)
+    return Instead(other, "", frozenset(fastmath_of(function)), reason)
 
 
 def _evaluation(program: Program, arguments: str, sizes: Sequence[int], shape: Sequence[int]) -> Callable:
