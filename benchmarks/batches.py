@@ -1,4 +1,4 @@
-"""Whole evaluations and many trajectories on all cores, beside the least arithmetic that they need, and JAX."""
+"""Evaluations and many trajectories on all cores, beside the least arithmetic that they need, and JAX."""
 
 from __future__ import annotations
 
@@ -37,6 +37,10 @@ BLOCKS = SEEDS * ENSEMBLE_SIZE // WIDTH
 
 _read_constants = vector_reader(len(Constants._fields))
 _column, _store = column_reader(2), column_writer(2)
+TRAJECTORIES, TRAJECTORY_SIZE = 256, 100
+AGREEMENT = 0.03  # how far the RMSE of two filters that differ in their random numbers alone may lie apart
+ALONE = (("ekf", 2.6), ("ukf", 2.5))  # filters without an ensemble, and the most of the limit that a step may be
+LIMIT_GOAL = 1.9  # of the ensemble filter
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -132,12 +136,6 @@ def _floor_functions() -> tuple[Callable, Callable]:
 
 
 # Filters over many trajectories at once; the ensemble filter beside one written in JAX.
-
-
-TRAJECTORIES, TRAJECTORY_SIZE = 256, 100
-AGREEMENT = 0.03  # how far the RMSE of two filters that differ in their random numbers alone may lie apart
-ALONE = (("ekf", 2.6), ("ukf", 2.5))  # filters without an ensemble, and the most of the limit that a step may be
-LIMIT_GOAL = 1.9  # of the ensemble filter
 
 
 def trajectory_rows(seed: int, quick: bool) -> Iterator[Row]:

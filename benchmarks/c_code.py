@@ -1,4 +1,4 @@
-"""A step of the extended Kalman filter in C, ours beside what CasADi writes of the same equations."""
+"""A step of the extended Kalman filter in C: ours beside CasADi's code of the same equations."""
 
 from __future__ import annotations
 

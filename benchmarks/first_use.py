@@ -1,4 +1,4 @@
-"""What a fresh process waits for: imports, the first call of cached code, and the first use of each filter.
+"""The wait in a fresh process: imports, the first call of cached code, and the first use of each filter.
 
 `python -m benchmarks.first_use` prints the tables of docs/size.md in Markdown, by the size of the model and for
 each model of the vehicle: processor time and memory. Every filter is measured in a process of its own, whose cache
@@ -61,6 +61,10 @@ square_sum(numpy.ones(3))
 """
 IMPORT_GOAL, STEP_GOAL = 2.6, 5.7  # of the time that Gymnasium's import takes, and that of numba's
 EVALUATE_GOAL, COLD_GOAL = 0.6, 5.0  # [s]; a user waits for these, on whatever machine
+SIZES = ((2, 1), (12, 4), (40, 40))
+ON_AFFINE = ("kf", "kf-steady", "fuzzy")  # they would approximate another model
+FEW_RULES = {"fuzzy": {"premises": [0, 5]}}  # u and r; twelve states would make 4096
+WITH_POSITION = ("navigation", "current")  # of which there is no steady state unless a position is measured
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -114,10 +118,6 @@ def processor_time(source: str) -> Measure:
 
 
 # The first use of each filter by the size of the model.
-
-
-SIZES = ((2, 1), (12, 4), (40, 40))
-ON_AFFINE = ("kf", "kf-steady", "fuzzy")  # they would approximate another model
 
 
 def lorenz_96(x, u, c):
@@ -179,10 +179,6 @@ def measured(*arguments: str) -> tuple[float, float]:
 
 
 # The same on each model of the vehicle.
-
-
-FEW_RULES = {"fuzzy": {"premises": [0, 5]}}  # u and r; twelve states would make 4096
-WITH_POSITION = ("navigation", "current")  # of which there is no steady state unless a position is measured
 
 
 def vehicle_filter_of(name: str, states: str) -> Filter:

@@ -1,4 +1,4 @@
-"""FilterPy's filters, set up with the very models that ours run on."""
+"""FilterPy's filters, set up with exactly the models that ours run on."""
 
 from __future__ import annotations
 

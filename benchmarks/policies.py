@@ -23,6 +23,12 @@ from tuning.thruster.scenario import find_scenario
 if TYPE_CHECKING:
     from tuning.policies.setup import TrainingConfiguration
 
+NETWORKS = 2  # one of the action, one of the value, which is a single number, too
+PASSES = 3  # through them in a step of gradient descent: the output, then slopes over weights and over inputs
+COPIES = 64
+GOAL = 0.60  # of the time that Stable-Baselines3 by itself takes
+ACTING_GOAL = 0.12  # of the time that the envs alone take with DummyVecEnv
+
 
 def training(setup: TrainingConfiguration, native: bool, rollouts: int) -> Measure:
     """Seconds a step of a short training, as `thruster train` learns."""
@@ -66,10 +72,6 @@ def _steps_of(model, settings: Callable[[], AbstractContextManager], rollouts: i
 # What a step of learning needs of the processor at least: the products with the weights of its networks.
 
 
-NETWORKS = 2  # one of the action, one of the value, which is a single number, too
-PASSES = 3  # through them in a step of gradient descent: the output, then slopes over weights and over inputs
-
-
 def network_limit(setup: TrainingConfiguration) -> float:
     """Seconds a step of PPO's products with its networks' weights, at torch's rate in one thread."""
     from tuning.policies.environments import make_environments
@@ -96,11 +98,6 @@ def seconds_a_product(rows: int, width: int) -> float:
         return alone(multiply, 100).ours / (rows * width * width)
     finally:
         torch.set_num_threads(threads)
-
-
-COPIES = 64
-GOAL = 0.60  # of the time that Stable-Baselines3 by itself takes
-ACTING_GOAL = 0.12  # of the time that the envs alone take with DummyVecEnv
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:

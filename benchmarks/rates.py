@@ -1,12 +1,13 @@
-"""The arithmetic limit of the machine at hand: how fast it does each kind of operation, measured in this run.
+"""The arithmetic limit of the machine at hand: the rate of each kind of operation, and a program's operations.
 
 Each rate is that of a loop in the widest vectors, in the fastest cache, whose operations depend on one another too
 little to wait and too much to be dropped. The limit of a computation is the time of its operations, one kind after
 the other: that of a program without memory, calls, branches or remainders, and of no other program.
 
-Each number knows the operation and the operands that it was made of. Counted are those operations on which a
-result depends, each once, however often the source writes it: what a compiler drops, or finds twice, is no work.
-Operations on constants alone are done before, and count nothing; so do comparisons, signs, roundings and masks.
+Operations are counted by numbers that know the operation and the operands they are the result of. Those on which a
+result depends count, each once, however often the source writes it: what a compiler drops, or finds twice, is no
+work. Operations on constants alone are done before, and count nothing; so do comparisons, signs, roundings and
+masks.
 """
 
 from __future__ import annotations
@@ -30,9 +31,6 @@ from thruster_env.core.streams import FILTER_PROCESS, normal_block
 from thruster_env.core.threads import cores as all_cores
 from thruster_env.core.threads import spread
 
-# Counts of operations: a computation's source is run on numbers that record their operands.
-
-
 ADD, MULTIPLY, DIVIDE, ROOT, RECIPROCAL_ROOT = "add", "multiply", "divide", "root", "reciprocal root"
 PRODUCT, INTEGER = "integer product", "integer"  # of 32 bits by 32, and shifts, sums and exclusive ors
 
@@ -48,6 +46,15 @@ COMPARISONS = "less", "less_equal", "greater", "greater_equal", "equal", "not_eq
 COMMUTATIVE = "add", "multiply", "bitwise_xor", "bitwise_or"
 NEUTRAL = {"add": 0.0, "multiply": 1.0}  # operands that change nothing
 POWERS = {0.5: ROOT, -0.5: RECIPROCAL_ROOT, 2: MULTIPLY}
+FUSED, ROUND = "fused multiply-add", "product, shift and two exclusive ors"
+IN_A_ROUND = 3  # operations on whole numbers that go with a product in a round of Philox
+WIDTH, REPEATS, ROUNDS = 1024, 500, 15
+PARTS = 8  # of the work on all cores
+NORMALS = 4  # that one block of the generator makes
+FEW = 8, 16  # members that are enough to count, whole vector registers of them
+
+
+# Counts of operations: a computation's source is run on numbers that record their operands.
 
 
 class Counted(NDArrayOperatorsMixin):
@@ -182,11 +189,6 @@ def operations_of(function: Callable, *arguments) -> Counter[str]:
         operands = (tuple(graph.variables(a)) if isinstance(a, np.ndarray) else a for a in arguments)
         return graph.operations(np.array(function(*operands), dtype=object))
 
-
-FUSED, ROUND = "fused multiply-add", "product, shift and two exclusive ors"
-IN_A_ROUND = 3  # operations on whole numbers that go with a product in a round of Philox
-WIDTH, REPEATS, ROUNDS = 1024, 500, 15
-PARTS = 8  # of the work on all cores
 
 _MULTIPLIER_0, _MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 _LOW, _SHIFT, _WEYL = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(0x9E3779B9)
@@ -353,10 +355,6 @@ def vector_bits() -> int:
 
 
 # Operations of one step of an env, of a filter and of noise, for the arithmetic limits of the rows.
-
-
-NORMALS = 4  # that one block of the generator makes
-FEW = 8, 16  # members that are enough to count, whole vector registers of them
 
 
 def step_of_env(env: gym.Env) -> Counter[str]:

@@ -1,4 +1,4 @@
-"""How long a slider's move takes until the page of `thruster explore` shows its picture, measured in Chromium.
+"""The time from a move of a slider until the page of `thruster explore` shows its picture, measured in Chromium.
 
     python -m benchmarks.slider            # EKF on outliers: 8 runs of 500 steps, on 1400 x 1000 pixels
 

@@ -31,6 +31,10 @@ from thruster_env.thruster.task import Task
 ENSEMBLE_SIZE = 50
 HORIZON, HORIZON_GOAL = 10, 1 / 10
 PEER_STEPS = 100  # of FilterPy's slow filters in a round; their time a step does not depend on their number
+COPIES, STEPS = 8192, 200
+PROPAGATED = 65536
+LIMIT_GOAL = 1.8
+FILTERED_COPIES, FILTERED_STEPS = 1024, 100
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -162,11 +166,6 @@ def do_mpc_step(model: StateSpaceModel) -> tuple[Callable[[float, float], np.nda
 # Thousands of thrusters at once: the native vector env, and a Runge-Kutta step of its equations of motion.
 
 
-COPIES, STEPS = 8192, 200
-PROPAGATED = 65536
-LIMIT_GOAL = 1.8
-
-
 def vector_rows(seed: int, quick: bool) -> Iterator[Row]:
     """Measure, one row after the other."""
     rounds = 5 if quick else 40
@@ -234,9 +233,6 @@ def _propagate() -> Callable:
 
 
 # A filter on every copy of a vector env.
-
-
-FILTERED_COPIES, FILTERED_STEPS = 1024, 100
 
 
 def vector_filter_rows(seed: int, quick: bool) -> Iterator[Row]:

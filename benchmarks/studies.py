@@ -1,4 +1,4 @@
-"""Whole studies: two hundred trials beside the same runs of FilterPy's filter, and a hundred on Lorenz-96."""
+"""Complete studies: two hundred trials beside the same runs of FilterPy's filter, and a hundred on Lorenz-96."""
 
 from __future__ import annotations
 
@@ -51,6 +51,11 @@ run_study(open_study("memory", plan, None), plan, {trials})
 status = dict(line.split(":", 1) for line in open("/proc/self/status"))
 print(status["VmHWM"].split()[0])
 """
+INTERPRETER = "DAPPER_PYTHON"
+LORENZ_TRIALS, SEEDS, LARGEST = 100, 8, 60
+FEW = 2, 4  # members that are counted: each has forty states, and takes a second
+PEER_SIZES = (10, 35, 60)  # its time a run is a line over N
+LORENZ_GOAL = 1 / 20
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -159,11 +164,6 @@ def _runs(result: StudyResult) -> list[tuple[int, int]]:
 # and SciPy, so it is run in an environment of its own: DAPPER_PYTHON is the path of that one's interpreter.
 
 
-INTERPRETER = "DAPPER_PYTHON"
-LORENZ_TRIALS, SEEDS, LARGEST = 100, 8, 60
-FEW = 2, 4  # members that are counted: each has forty states, and takes a second
-PEER_SIZES = (10, 35, 60)  # its time a run is a line over N
-LORENZ_GOAL = 1 / 20
 PEER = """
 import json, sys
 from time import perf_counter

@@ -1,4 +1,4 @@
-"""Timing two programs in turns, so that both meet the same load of the machine, and the tables of times."""
+"""Timing two programs in turns, so that both meet the same load of the machine, and tables of the times."""
 
 from __future__ import annotations
 
@@ -22,6 +22,11 @@ from thruster_env.core.text_tables import markdown_table, with_tables
 
 Measure = Callable[[], float]
 """Does one round of work and returns the seconds that a unit of it (a step, say) took."""
+COLUMNS = ["what; peer", "ours", "peer", "ratio", "limit", "x limit", "goal", "met?"]
+PACKAGES = ("numba", "gymnasium", "numpy", "filterpy", "jax", "casadi", "do_mpc", "stable_baselines3", "torch")
+HEADER = ("what", "beside", "ours", "theirs", "ratio", "limit", "x limit", "goal", "met")
+NO_BREAK = "\N{NO-BREAK SPACE}"  # between a number and its unit
+MARK, END = "<!-- table speed: ", "<!-- end -->"
 
 
 class Timing(NamedTuple):
@@ -83,10 +88,6 @@ def seconds_a_call(function: Callable, arguments: Iterable[tuple], prepare: Call
 
 
 # What the benchmark prints: rows of measured times with their goals, and the machine they were taken on.
-
-
-COLUMNS = ["what; peer", "ours", "peer", "ratio", "limit", "x limit", "goal", "met?"]
-PACKAGES = ("numba", "gymnasium", "numpy", "filterpy", "jax", "casadi", "do_mpc", "stable_baselines3", "torch")
 
 
 class Row(NamedTuple):
@@ -221,11 +222,6 @@ def machine_lines(facts: dict) -> list[str]:
 
 
 # The computed parts of docs/speed.md: a section for each machine, with the table of all rows.
-
-
-HEADER = ("what", "beside", "ours", "theirs", "ratio", "limit", "x limit", "goal", "met")
-NO_BREAK = "\N{NO-BREAK SPACE}"  # between a number and its unit
-MARK, END = "<!-- table speed: ", "<!-- end -->"
 
 
 def check_page(path: Path) -> None:

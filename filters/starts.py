@@ -19,8 +19,6 @@ from thruster_env.core.sources import as_value
 from thruster_env.model.shape import number_places, observation_slopes, transition_slopes
 from thruster_env.model.state_space import StateSpaceModel
 
-# Restarts from the prior, in words: how many, the first step and state, and the likely cause.
-
 Flaw = tuple[np.ndarray, str]  # which states, (n,) bool, and the cause
 Moments = tuple[np.ndarray, np.ndarray]  # mean (n,) and covariance (n, n)
 UNKNOWN = "numbers of the filter itself overflow, or a variance became negative by rounding"
@@ -28,6 +26,9 @@ PRIOR, MEASUREMENT = "prior", "measurement"
 STARTS = (PRIOR, MEASUREMENT)  # where recorded runs may begin
 WIDE = 10.0  # standard deviations of the prior, of which a free start has one
 FAINT = 1e-6  # part of the strongest direction, below which a direction is not seen
+
+
+# Restarts from the prior, in words: how many, the first step and state, and the likely cause.
 
 
 class RestartWarning(RuntimeWarning):

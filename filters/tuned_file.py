@@ -21,8 +21,6 @@ from thruster_env.logs.log import of_one_step
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 
-# The model of a tuned file, as data, and its comparison with another one.
-
 VECTORS = {"states": "states", "inputs": "input_quantities", "measurements": "measurements"}
 KEYS = ("digest", "dt", *VECTORS)
 FILE_FORMAT = "tuned filter"
@@ -38,6 +36,9 @@ STATES = "states"  # which of its states a model has, by a name that the plant k
 AUGMENTED = "augmented_constants"  # a mapping of constants that are states to [std, walk, mean]
 OPTION_NAMES = {"sensors": "sensor", "columns": "column", "clock_offset": "clock-offset", "held_out": "held-out"}
 MODEL_KEYS = (*NOISE, PRIOR, FACTORS, STATES, AUGMENTED)  # what every plant with data of its own knows
+
+
+# The model of a tuned file, as data, and its comparison with another one.
 
 
 def model_data(model: StateSpaceModel, dt: float | None) -> dict:

@@ -1,4 +1,4 @@
-"""Docstrings as the reference shows them: indented equations are set, prose is escaped for reStructuredText.
+"""Docstrings in the reference: indented equations are set, prose is escaped for reStructuredText.
 
 Those of envs are Markdown, as Gymnasium's are: their headings and tables become reStructuredText.
 """

@@ -1,4 +1,4 @@
-"""Equations as the docstrings write them, in plain text, to LaTeX.
+"""Equations of docstrings, in plain text, as LaTeX.
 
 `x_{k+1} = f(x_k, u_k) + w,  w ~ N(0, Q)` reads well in a terminal, and it can be set: names of one letter and
 Greek ones are variables, longer ones stand upright, `_` and `^` hold for what follows, ' is a prime.

@@ -11,9 +11,6 @@ from weakref import WeakSet
 import typer
 from typer.cli import get_docs_for_click
 
-# What `thruster COMMAND --help` says, as one page.
-
-
 PAGE = "reference/command_line"
 KINDS = {
     "<path>": "FILE",
@@ -31,6 +28,17 @@ ITEM = re.compile(r"^\* `([^`<]+) (<[^`]+)`(: Folder)?", re.MULTILINE)
 EXAMPLES = re.compile(r"^Example: thruster .*(?:\n\nExample: thruster .*)*$", re.MULTILINE)
 SUMMARY = re.compile(r"^(\* `(\w+)`: ).*\.\.\.$", re.MULTILINE)
 GIVEN_BY_NAME = re.compile(r"\[default: \(([^()]*)\)")
+OPERATIONS_PAGE = "reference/operations"
+ALGEBRA = {
+    "operations": "Symmetry, angles, missing channels, quotients, numbers",
+    "points": "Roots, sigma points, weights, densities",
+    "members": "Means and covariances over an ensemble",
+    "roots": "Inverses, triangles, blocks, factors U and D",
+}
+SHOWN_ONLY = ("ppo",)  # learns for a minute; its own test runs it with few steps
+
+
+# What `thruster COMMAND --help` says, as one page.
 
 
 def commands() -> str:
@@ -72,14 +80,6 @@ def _in_capitals(match: re.Match[str]) -> str:
 
 
 # What a filter's page is written with, as tables.
-
-OPERATIONS_PAGE = "reference/operations"
-ALGEBRA = {
-    "operations": "Symmetry, angles, missing channels, quotients, numbers",
-    "points": "Roots, sigma points, weights, densities",
-    "members": "Means and covariances over an ensemble",
-    "roots": "Inverses, triangles, blocks, factors U and D",
-}
 
 
 def operations() -> str:
@@ -133,7 +133,6 @@ ORDER = (
     "vehicle",
     "networks",
 )
-SHOWN_ONLY = ("ppo",)  # learns for a minute; its own test runs it with few steps
 _shown: WeakSet = WeakSet()
 
 

@@ -37,8 +37,6 @@ from thruster_env.model.shape import LANES, Shape, padded
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.traced import MOST, Traced
 
-# Which names a filter in C may have: none that C, C++, their libraries or the files themselves use.
-
 KEYWORDS = frozenset(  # of C99 to C23 and C++20, and tokens that C++ writes as words
     "alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class "
     "co_await co_return co_yield compl concept const const_cast consteval constexpr constinit continue decltype "
@@ -83,6 +81,9 @@ OF_OTHERS = (
 ).split()
 OF_LIBRARIES = frozenset([*OF_OTHERS, *(name + kind for name in OF_MATH for kind in ("", "f", "l"))])
 FUNCTIONS = "{0}_init", "{0}_predict", "{0}_update", "{0}_test_anew", "{0}_channel"  # of a filter of this name
+
+
+# Which names a filter in C may have: none that C, C++, their libraries or the files themselves use.
 
 
 def is_name(text: str) -> bool:

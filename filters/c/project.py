@@ -21,8 +21,6 @@ from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of
 from thruster_env.core.files import check_target, write_whole
 
-# NAME.hpp: a filter in C as a class of C++.
-
 CLASS = """\
 /* The filter {name} as a class of C++11; link with {name}.c, which a compiler of C makes. */
 #ifndef {guard}_HPP
@@ -102,6 +100,9 @@ Philox4x32-10. The same key gives the estimates of `filter_.init(key)` in Python
 Members, their random numbers and scratch lie in the struct. `-O3 -fno-math-errno` makes vector instructions of the
 loops over members, and leaves the numbers as they are.
 """
+
+
+# NAME.hpp: a filter in C as a class of C++.
 
 
 def class_of(name: str, programs: FilterPrograms, *, single: bool = False, tested: bool = False) -> str:

@@ -25,11 +25,12 @@ from thruster_env.graphs.programs import (
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import LANES, padded
 
-# NAME.h and NAME.c of a filter of mean and covariance.
-
 LARGEST_FLOAT = 1e30  # what is LARGEST in single precision
 TEST_ANEW = "    {name}_test_anew(filter);\n"
 TEST_UPDATE = "    test_update(filter, z);\n"
+
+
+# NAME.h and NAME.c of a filter of mean and covariance.
 
 
 class Writer:

@@ -8,8 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-# Estimates with 95 % intervals, by bootstrap over whole runs: steps of one run are not independent, runs are.
-
 RESAMPLES = 2000  # bootstrap resamples of whole runs
 SLIGHT = 0.005  # difference of a ratio from 1 that makes practically none
 MORE_DIGITS = 3  # for an interval whose ends would else be the same number
@@ -17,6 +15,9 @@ POINTS = 200  # where distribution functions are compared
 BARS = 20  # bars of the histogram, but one a step for up to twice as many steps
 FEWEST_RUNS = 20  # fewer resample too coarsely for a test
 LEVELS = np.arange(0.05, 1.0, 0.05)  # of intervals whose coverage is looked at
+
+
+# Estimates with 95 % intervals, by bootstrap over whole runs: steps of one run are not independent, runs are.
 
 
 class Interval(NamedTuple):

@@ -16,12 +16,13 @@ from filters.consistency.intervals import Interval, Uniformity, mean_interval, u
 from thruster_env.core.checks import at_least
 from thruster_env.core.threads import spread
 
-# Is a filter's covariance consistent? NEES and NIS of many runs against their chi-square distributions.
-
 SINGULAR = 1e-12  # a pivot of P below this part of its variance counts as zero
 LARGEST_BY_ENTRIES = 12  # beyond, operations on single entries take longer than copies of columns
 LAGS = 20
 BLOW_UP = 1e3  # spreads of a channel: no Q or R explains a prediction that is so far off
+
+
+# NEES and NIS of many runs against their chi-square distributions.
 
 
 def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:

@@ -18,9 +18,10 @@ from thruster_env.core.checks import positive, switch
 from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import FILTER_ROTATION, fill_normals
 
-# Localisation: distant states and channels count as uncorrelated, so few members are enough for many states.
-
 SUPPORT = (10.0 / 3.0) ** 0.5  # half the range of a taper, over its radius
+
+
+# Localisation: distant states and channels count as uncorrelated, so few members are enough for many states.
 
 
 def gaspari_cohn(distance: np.ndarray, radius: float) -> np.ndarray:

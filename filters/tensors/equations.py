@@ -27,8 +27,6 @@ from thruster_env.graphs.graphs import COMPARISONS, Graph, Number, needed_by
 from thruster_env.model.shape import Shape, constants_are_array
 from thruster_env.model.traced import MOST, Traced
 
-# Graphs of numbers evaluated on tensors: one operation of torch for each number, for a whole batch.
-
 WORK: dict[str, Callable] = {
     "+": operator.add,
     "-": operator.sub,
@@ -67,6 +65,9 @@ POINTS = 64  # at which functions of tensors are compared with those of floats
 ASKING = frozenset("__bool__ __float__ __int__ __index__ __complex__ item".split())
 # Of torch: a function of tensors may do so and give derivatives.
 LEAVING = frozenset("tolist numpy __array__".split())
+
+
+# Graphs of numbers evaluated on tensors: one operation of torch for each number, for a whole batch.
 
 
 def with_finite_slope(operation: str, function: Callable, arguments: Sequence[Tensor | float]) -> Tensor:

@@ -1,1 +1,1 @@
-"""What all packages use: compilation, random streams, threads, checks, files, plots."""
+"""What all packages use: compilation, random streams, threads, checks, files, matrices and their source text."""

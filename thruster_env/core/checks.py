@@ -1,7 +1,4 @@
-"""Argument checks that state the rule, then the value.
-
-Progress of long computations, reported to a listener.
-"""
+"""Argument checks that state the rule, then the value; and progress of long computations to a listener."""
 
 from __future__ import annotations
 

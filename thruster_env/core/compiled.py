@@ -1,16 +1,13 @@
 """Compilation: plain Python functions in, cached machine code out, one source for both.
 
-Functions marked `inlined` stay ordinary Python and may be called by any function given to `compiled`.
-numba is imported at the first compilation only, which keeps imports light. With the
-environment variable NUMBA_DISABLE_JIT=1 everything runs as Python.
+Functions marked `inlined` stay ordinary Python and may be called by any function given to `compiled`. numba is
+imported at the first compilation only, which keeps imports light. With the environment variable
+NUMBA_DISABLE_JIT=1 everything runs as Python.
 
-Beside sources that pip installed nothing is kept: what pip does not know outlives an uninstallation, and a folder
-of machine code alone is, to Python, a package that hides the one of a checkout.
-
-numba itself gives up where it cannot write. Here what is there already is read, and what is new goes to a folder
-of the user's own among the temporary ones, or lasts as long as the process; one warning says so.
-
-Calls of compiled functions that skip numba's dispatch on the types of arguments.
+Machine code is stored beside the sources, except beside those that pip installed: pip would leave it there, and to
+Python a folder of machine code alone is a package that hides the one of a checkout. Where numba cannot write,
+existing code is read, and new code goes to a private temporary folder or lasts as long as the process; one warning
+says so. `direct` calls machine code without numba's dispatch on the types of arguments.
 """
 
 from __future__ import annotations
@@ -40,11 +37,12 @@ import numpy as np
 from thruster_env.core.optimising import Which, optimise_once
 from thruster_env.core.user_functions import OURS, code_text, codes_in, names_read
 
-# Where machine code is kept: beside the sources, in the user's cache, or, where both refuse it, a private folder.
-
 RULE = "machine code must be kept where it can be written: set NUMBA_CACHE_DIR to a folder of yours; "
 INSTALLED = {"site-packages", "dist-packages"}  # folders of what pip installs
 _changing_config = threading.Lock()
+
+
+# The storage of machine code: beside the sources, in the user's cache, or else in a private folder.
 
 
 def keep_code(dispatcher):

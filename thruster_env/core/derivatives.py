@@ -1,6 +1,6 @@
-"""Jacobians of functions on vectors: analytic where given, else by complex steps or central differences.
+"""Jacobians of functions by complex steps or central differences, and steps of rates with their Jacobians.
 
-Runge-Kutta integration of rates written on tuples of components.
+The steps are those of Runge and Kutta, and of Euler, of rates written on tuples of components.
 """
 
 from __future__ import annotations

@@ -54,6 +54,9 @@ _used: weakref.WeakKeyDictionary[Any, Hashable] = weakref.WeakKeyDictionary()  #
 _copied: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()  # of copies: the function
 _hashes: dict[int, tuple[weakref.ref, bytes]] = {}  # of arrays by their ids
 _finding = threading.RLock()
+MAPPINGS = dict, collections.OrderedDict, collections.defaultdict, types.MappingProxyType
+LARGEST_CAPTURED = 64  # entries of an array that are numbers of their own
+MOST_RESULTS = 128  # results that are kept for a maker, beyond those that something else holds
 
 
 def first_equal(value: Any) -> Any:
@@ -391,9 +394,6 @@ def _content(cell: types.CellType) -> Any:
 
 # Numbers that functions hold in their closures, defaults and objects: listed, and replaced by others.
 
-MAPPINGS = dict, collections.OrderedDict, collections.defaultdict, types.MappingProxyType
-LARGEST_CAPTURED = 64  # entries of an array that are numbers of their own
-
 
 def captured_numbers(function: Any) -> list[float]:
     """The floats that a function holds, in a fixed order, without those of its module and its code."""
@@ -492,8 +492,6 @@ class _Copy:
 
 
 # Generated functions remember what made them, so that models that hold them can be pickled.
-
-MOST_RESULTS = 128  # results that are kept for a maker, beyond those that something else holds
 
 
 def makes_functions(maker: Callable) -> Callable:

@@ -1,6 +1,6 @@
-"""Files that are written completely or not at all: a temporary file is renamed; links are followed.
+"""Files written completely or not at all, TOML files, and the common form of pictures.
 
-The common form of pictures, each saved as one PNG, SVG or PDF file.
+A temporary file is renamed into place; links are followed. Each picture is one PNG, SVG or PDF file.
 """
 
 from __future__ import annotations
@@ -19,6 +19,12 @@ from typing import BinaryIO
 import numpy as np
 
 STREAMS = (1, 2)  # descriptors of standard output and standard error
+
+# Of pictures.
+DARK, BLUE, RUST = "#222222", "#0b6fa4", "#b5541c"
+SKY, MUSTARD, GREEN, PLUM, WINE = "#56b4e9", "#c99700", "#009e73", "#b065a0", "#882255"
+GREY, PALE, TRUE = "#9aa5ad", "#c5ccd1", "#7d848a"
+MOST_POINTS = 600  # of a line, some four in a millimetre
 
 
 def check_target(path: str | Path) -> None:
@@ -171,12 +177,6 @@ def _text(value) -> str:
         characters = (f"\\u{ord(c):04X}" if ord(c) < 32 or c in '"\\\x7f' else c for c in value)
         return '"' + "".join(characters) + '"'
     return repr(float(value)) if isinstance(value, float) else repr(value)
-
-
-DARK, BLUE, RUST = "#222222", "#0b6fa4", "#b5541c"
-SKY, MUSTARD, GREEN, PLUM, WINE = "#56b4e9", "#c99700", "#009e73", "#b065a0", "#882255"
-GREY, PALE, TRUE = "#9aa5ad", "#c5ccd1", "#7d848a"
-MOST_POINTS = 600  # of a line, some four in a millimetre
 
 
 def new_figure(size: tuple[float, float]):

@@ -1,6 +1,6 @@
 """What an uninstalled copy of our packages left behind: folders without sources, which would hide the checkout's.
 
-`python -m thruster_env.core.leftovers`, from the checkout's folder, removes them; `make` does it after each
+`python -m thruster_env.core.leftovers`, from the checkout's folder, removes them; `make` does so after each
 installation.
 """
 

@@ -1,10 +1,9 @@
 """Dense matrices as tuples of rows, with every operation written out for its size, and large ones as arrays.
 
 Compiled, small ones stay in registers and cost nanoseconds where a library call costs hundreds. The source of
-large ones, which would grow with the cube of the size, has loops instead (`thruster_env.core.sources`).
-
-They are compiled once for all sizes. They are loops rather than calls of BLAS, because the threads of BLAS would
-compete with those that work on different trajectories, and because its sums depend on the machine.
+large ones would grow with the cube of the size, so these are loops instead, compiled once for all sizes. They do
+not call BLAS, whose threads would compete with those that work on different trajectories, and whose sums depend on
+the machine.
 """
 
 from __future__ import annotations
@@ -20,9 +19,12 @@ from thruster_env.core.checks import positive, short_repr
 from thruster_env.core.compiled import inlined, not_inlined
 from thruster_env.core.sources import Local, Source, is_array
 
-# Parameters multiplied by factors, for a filter that assumes another plant than the true one.
-
 Parameters = TypeVar("Parameters", bound=NamedTuple)
+NEGLIGIBLE = 1e-13  # a pivot below this part of its variance counts as zero in `careful_factor`
+RESOLUTION = 1e-15  # of the difference of two float64, relative to them
+
+
+# Parameters multiplied by factors, for a filter that assumes another plant than the true one.
 
 
 def scaled(parameters: Parameters, factors: Mapping[str, float], names: Iterable[str]) -> Parameters:
@@ -201,9 +203,6 @@ def solve_rows(b, factor):
 
 
 # Triangular factors of matrices of every size, and solutions with them.
-
-NEGLIGIBLE = 1e-13  # a pivot below this part of its variance counts as zero in `careful_factor`
-RESOLUTION = 1e-15  # of the difference of two float64, relative to them
 
 
 def pivoted_factor(size: int, diagonal: str, **names: float) -> Callable:

@@ -1,4 +1,4 @@
-"""Objects by "module:object", packages that wait for another's import, and how to install optional ones."""
+"""Objects by "module:object", actions that wait for a package's import, and how to install optional packages."""
 
 from __future__ import annotations
 
@@ -12,9 +12,18 @@ from importlib.util import find_spec
 from types import FrameType, ModuleType
 from typing import Any
 
-# Objects by "module:object": code, which only a user's own command line or call may have imported.
-
 SAFE_PATH = "PYTHONSAFEPATH"  # which Python reads as its option -P
+OF_ONE_PACKAGE = {
+    "parquet": "pyarrow",
+    "units": "pint",
+    "frames": "pandas",
+    "samplers": "cmaes",
+    "nuts": "nutpie",
+    "torch": "torch",
+}
+
+
+# Objects by "module:object": code, which only a user's own command line or call may have imported.
 
 
 def is_code(name) -> bool:
@@ -168,15 +177,6 @@ class _Import:
 
 
 # How to install what is not in a plain installation: the optional dependencies of pyproject.toml.
-
-OF_ONE_PACKAGE = {
-    "parquet": "pyarrow",
-    "units": "pint",
-    "frames": "pandas",
-    "samplers": "cmaes",
-    "nuts": "nutpie",
-    "torch": "torch",
-}
 
 
 def to_install(extra: str) -> str:

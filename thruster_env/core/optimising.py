@@ -1,10 +1,10 @@
-"""Machine code is made and optimised once, for the function that is asked for, and not for each that it calls.
+"""Machine code is optimised once, for the outermost function, and not for each function that it calls.
 
 numba compiles each function for itself, together with all that it calls, as if Python could call it, too. For a
 filter of a large model, whose functions call one another over many levels, that would be most of the time.
 
-Loops of ours also get vectors of 512 bits where the processor has them. LLVM would take 256 on Intel's, for the
-sake of the first ones with 512, which slowed down.
+Our loops also get vectors of 512 bits if the processor has them. LLVM would take 256 on Intel's, for the sake of
+the first ones with 512, which slowed down.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Results of users' functions, tuples or arrays, as arrays for large models."""
+"""Results of a user's functions, tuples or arrays, as arrays for large models."""
 
 from __future__ import annotations
 

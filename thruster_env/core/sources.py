@@ -21,10 +21,14 @@ import numpy as np
 
 from thruster_env.core.compiled import inlined
 
-# Functions made of source text, which tracebacks and debuggers show under names that say their sizes.
-
 _shown: Counter[str] = Counter()  # files of texts, with the number of functions made of each
 _MAKERS = (__name__, "thruster_env.core.sources")  # of which the names do not tell anything
+LARGEST_TUPLE = 36  # entries of a vector or matrix that is a tuple: as many have nine sigma points of four states
+LARGEST_SIDE = 5  # of a matrix that is one
+LONGEST_TEXT = 128  # products that are written out: those of two matrices of five rows
+
+
+# Functions made of source text, which tracebacks and debuggers show under names that say their sizes.
 
 
 def tuple_of(expressions: Iterable[str]) -> str:
@@ -81,11 +85,6 @@ def _name_in_tracebacks(name: str, text: str) -> str:
 def made_here(function: Callable) -> bool:
     """Whether a function was generated, so that it returns large results as arrays."""
     return getattr(function, "__module__", None) == __name__
-
-
-LARGEST_TUPLE = 36  # entries of a vector or matrix that is a tuple: as many have nine sigma points of four states
-LARGEST_SIDE = 5  # of a matrix that is one
-LONGEST_TEXT = 128  # products that are written out: those of two matrices of five rows
 
 
 def is_array(*shape: int) -> bool:

@@ -1,14 +1,12 @@
 """Randomness as a function: Philox4x32-10 keyed by an episode, indexed by stream, step and channel.
 
-The same key gives the same numbers in a single env, a vector env, a batch and on any number of threads,
-because a draw depends on its index only and never on what was drawn before. Every expression works on
-scalars, on NumPy arrays and inside numba. Source: Salmon, Moraes, Dror, Shaw (2011), "Parallel random
-numbers: as easy as 1, 2, 3"; normals by Box and Muller (1958).
+The same key gives the same numbers in a single env, a vector env, a batch and on any number of threads, because a
+draw depends on its index only and never on earlier draws. Every expression works on scalars, on NumPy arrays and
+inside numba. In order: the normal distribution, exponential, sine and cosine as vector code; the streams and their
+draws; keys of episodes; the generators of foreign code.
 
-Source: Johnson, Kotz, Balakrishnan (1994), Continuous Univariate Distributions, volume 1, section 13.10.1.
-
-Episode keys of a vector env: copy i gets the keys that a single env with its seed would draw. Generators of
-foreign code: the global ones of Python, NumPy and torch, and those that objects hold.
+Source: Salmon, Moraes, Dror, Shaw (2011), "Parallel random numbers: as easy as 1, 2, 3"; normals by Box and Muller
+(1958).
 """
 
 from __future__ import annotations
@@ -29,9 +27,10 @@ from thruster_env.core.checks import seed as checked_seed
 from thruster_env.core.checks import short_repr
 from thruster_env.core.compiled import inlined, overloaded, when_compiling
 
-# The normal distribution, for compiled code.
-
 HALVINGS = 60  # of an interval of 80 standard deviations, to rounding
+
+
+# The normal distribution, for compiled code.
 
 
 @inlined
@@ -81,6 +80,8 @@ def truncated_normal(low, high):
         d = m(a) - e m(b),  e = exp((a^2 - b^2)/2),  mean = (1 - e)/d,  variance = 1 + (a - b e)/d - mean^2
 
     with Mills' ratio m, in the order in which b >= |a|; with e = 0 for one bound.
+
+    Source: Johnson, Kotz, Balakrishnan (1994), Continuous Univariate Distributions, volume 1, section 13.10.1.
     """
     sign, a, b = 1.0, low, high
     if low + high < 0.0:

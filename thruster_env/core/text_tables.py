@@ -1,4 +1,4 @@
-"""Tables of text: for the terminal, as plain text, and in Markdown."""
+"""Tables of text: in Markdown, for the terminal, and as plain text, with substitutes for missing characters."""
 
 from __future__ import annotations
 

@@ -1,13 +1,11 @@
 """Threads: calls in parts on all cores, worker threads and their flags, and how they wait.
 
-A thread that has gone to sleep wakes up tens of microseconds after it is called. So worker threads wait for
-the next call spinning, during half a millisecond, in compiled code that holds no lock, before they go to sleep;
-unless the wait policy is "passive" (`wait_policy`).
+A thread that has gone to sleep wakes up tens of microseconds after it is called. So worker threads wait for the
+next call spinning, for half a millisecond, in compiled code that holds no lock, before they go to sleep, unless
+the wait policy is "passive". The words are those of OpenMP's OMP_WAIT_POLICY. The environment variable
+THRUSTER_WAIT_POLICY sets the policy of a process and of all that it starts, `waiting` that of a part of a program.
 
-The words are those of OpenMP's OMP_WAIT_POLICY. The environment variable THRUSTER_WAIT_POLICY sets the policy of
-a process and of all that it starts, `waiting` that of a part of a program.
-
-One integer holds the number of the current call. For each part of a call that a worker thread may do, another one
+One integer is the number of the current call. For each part of a call that a worker thread may do, another one
 says whether the part is open, taken or done. Every flag has a cache line of its own, so that writing one does not
 slow down the reading of another.
 """
@@ -27,6 +25,20 @@ import numpy as np
 
 from thruster_env.core.checks import one_of
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, overloaded
+
+VARIABLE = "THRUSTER_WAIT_POLICY"
+ACTIVE, PASSIVE = "active", "passive"
+
+# Of flags.
+LINE = 16  # integers of 8 bytes: two cache lines, for processors that fetch pairs
+CALL = 0  # index of the current call's number
+OPEN, TAKEN, DONE = 0, 1, 2  # what a part of a call may be
+SPINS = 64  # at a number between two moments in which another thread may have the core
+SPIN_ROUNDS = 1000  # such moments in a wait for the next call, of about half a microsecond each
+
+# Of worker threads.
+CALLER = 0  # place of the thread that makes a call; helpers are 1, 2, ...
+BEHIND = 2  # calls that wait for a helper, with which it gets no more
 
 # How many threads torch uses for small networks.
 
@@ -48,9 +60,6 @@ def one_thread() -> Iterator[None]:
 
 
 # How worker threads wait for the next call: "active", spinning for half a millisecond, or "passive", asleep.
-
-VARIABLE = "THRUSTER_WAIT_POLICY"
-ACTIVE, PASSIVE = "active", "passive"
 
 
 _policy: str | None = None  # None: the environment has not been asked yet
@@ -93,12 +102,6 @@ def waiting(policy: str) -> Iterator[None]:
 
 
 # Atomic flags with which compiled code synchronises several threads.
-
-LINE = 16  # integers of 8 bytes: two cache lines, for processors that fetch pairs
-CALL = 0  # index of the current call's number
-OPEN, TAKEN, DONE = 0, 1, 2  # what a part of a call may be
-SPINS = 64  # at a number between two moments in which another thread may have the core
-SPIN_ROUNDS = 1000  # such moments in a wait for the next call, of about half a microsecond each
 
 
 def new_flags(count: int) -> np.ndarray:
@@ -202,9 +205,7 @@ def teach_numba() -> None:
 
 # Work on all cores: calls in parts, and worker threads for calls that take some hundred microseconds.
 
-CALLER = 0  # place of the thread that makes a call; helpers are 1, 2, ...
 _of_thread = threading.local()  # whether a thread of the pool is at work on a part
-BEHIND = 2  # calls that wait for a helper, with which it gets no more
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The column of a file for each quantity of a model, by its header or by the caller's choice."""
+"""The column of a file for each quantity of a model, by its header or the caller's choice, and its unit."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from thruster_env.core.checks import FEW, listed, short_repr
 from thruster_env.core.modules import to_install
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
-
-# Units of columns: as headers have them, and converted to those of a model, rare ones by the package pint.
 
 WORDS = (
     *("V", "mV", "kV", "A", "mA", "W", "kW", "Hz", "kHz", "rpm", "rps", "rad", "mrad", "deg", "turn", "rev"),
@@ -59,6 +57,15 @@ PURE = {"", "-", "1"}  # of a number without a unit
 LENGTHS = ("rad", "deg", "m", "mm", "cm", "km")  # over a time even without "_per_"
 _RATE = re.compile(r"^(?P<base>.*?)_(?P<over>[A-Za-z]+)(?P<per>_per)?_(?P<under>s|min|h)(?P<power>[23]?)$")
 _BRACKETS = re.compile(r"^(?P<base>.*?\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+
+# Kinds of quantities, and names of times.
+INPUT, MEASUREMENT, STATE, OUTPUT = "input", "measurement", "state", "output"
+TIME = "time"
+TIME_NAMES = ("t", "time", "Time", "TIME", "timestamp", "stamp")
+DATE_NAMES = ("timestamp", "datetime", "date_time", "date time")
+
+
+# Units of columns: as headers have them, and converted to those of a model, rare ones by the package pint.
 
 
 def parted(header: str) -> tuple[str, str | None]:
@@ -163,12 +170,6 @@ def conversion(unit: str, wanted: str) -> tuple[float, float, float] | None:
 
 def _example(wanted: str) -> str:
     return f"--column NAME=HEADER[{wanted or 'UNIT'}]"
-
-
-INPUT, MEASUREMENT, STATE, OUTPUT = "input", "measurement", "state", "output"
-TIME = "time"
-TIME_NAMES = ("t", "time", "Time", "TIME", "timestamp", "stamp")
-DATE_NAMES = ("timestamp", "datetime", "date_time", "date time")
 
 
 class Wanted(NamedTuple):

@@ -1,25 +1,7 @@
 """Findings in a recorded run that affect the trust in results from it.
 
-Gaps, rows that were moved, dropped or doubled, inputs without samples, sensors that are stuck or saturated, and
-outliers; and how times were read, where the file does not say it.
-
-Stuck. Identical samples in a row are explained by quantisation where equal neighbours are common, in the channel
-or at this value: if a share p of the other neighbours is equal, so many in a row come by chance with probability
-p^(count - 1), times the number of samples. Less than LEVEL is no chance. At rest, with no input that changes, a
-quantised channel and one that reads 0 may stay where they are.
-
-Saturated. The largest or the smallest value of a channel, unless it is 0, comes in RUNS stretches or more, and
-OFTENER times as often as the value next to it.
-
-Outliers. A sample above both of its neighbours, or below both, by more than SPIKE standard deviations of the noise
-(estimated by the medians of all and of near differences) and by ALONE times the differences of its neighbours from
-each other and from those beyond: a jump or a peak of the signal is not an outlier. A normal one is one in 10^8.
-
-Bursts of outliers. BURST samples or more, none further than APART samples from the next, that are each above both
-of their neighbours, or below both, by more than SPIKE standard deviations of the noise, while no input changes
-beside them: a stretch of garbage, such as of a loose plug. It is at most a tenth of the channel, and the AROUND
-samples before and after it are calm: a plant that shakes more for long is no burst. Outliers that are scattered
-over the log and happen to be near each other are none either: so many come by chance more often than LEVEL.
+They are gaps; rows that were moved, dropped or doubled; inputs without samples; sensors that are stuck or
+saturated; outliers and bursts of them; and the way times were read, if the file does not state it.
 """
 
 from __future__ import annotations
@@ -232,6 +214,9 @@ def _runs_of_equals(values: np.ndarray) -> list[tuple[int, int]]:
 def _by_chance(values: np.ndarray, first: int, count: int, equal: int, pairs: int) -> bool:
     """Whether a run of equal samples is explained by the frequency of equal neighbours elsewhere.
 
+    If a share p of the neighbours elsewhere, in the channel or at this value, is equal, so many in a row come by
+    chance with probability p^(count - 1), times the number of samples; less than LEVEL is no chance.
+
     Args:
         values: of the channel.
         first: index of the first sample of the run.
@@ -247,6 +232,10 @@ def _by_chance(values: np.ndarray, first: int, count: int, equal: int, pairs: in
 
 
 def _stuck(log: Log, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Runs of identical samples in a row that quantisation does not explain.
+
+    At rest, while no input changes, a quantised channel and one that reads 0 may stay where they are.
+    """
     equal, pairs, stretches = int((np.diff(values) == 0).sum()), len(values) - 1, []
     for first, count in sorted(runs, key=lambda run: -run[1]):
         equal, pairs = equal - (count - 1), pairs - (count - 1)  # each is held against those that are shorter
@@ -263,7 +252,11 @@ def _stuck(log: Log, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int,
 def _saturated(
     log: Log, channel: str, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int, int]]
 ) -> tuple[list[Finding], list[float]]:
-    """Findings of saturation, and the values at which the channel saturates."""
+    """Findings of saturation, and the values at which the channel saturates.
+
+    That is the largest or the smallest value of a channel, unless it is 0, if it comes in RUNS stretches or more,
+    and OFTENER times as often as the value next to it.
+    """
     levels, counts = np.unique(values, return_counts=True)
     findings: list[Finding] = []
     ends: list[float] = []
@@ -307,7 +300,14 @@ def _heights(steps: np.ndarray) -> np.ndarray:
 
 
 def _bursts(log: Log, rows: np.ndarray, values: np.ndarray, angle: bool) -> list[tuple[int, int]]:
-    """The first and last index of each burst of outliers among the samples of a channel."""
+    """The first and last index of each burst of outliers among the samples of a channel.
+
+    A burst is a stretch of garbage, such as of a loose plug: BURST samples or more, none further than APART
+    samples from the next, that are each above both of their neighbours, or below both, by more than SPIKE standard
+    deviations of the noise, while no input changes beside them. It is at most a tenth of the channel, and the
+    AROUND samples before and after it are calm: a plant that shakes for longer is no burst. Neither are outliers
+    that are scattered over the log and happen to be near each other: so many come by chance more often than LEVEL.
+    """
     steps, noise = _steps_and_noise(values, angle)
     high, explained, bursts = np.flatnonzero(_heights(steps) > SPIKE * noise) + 1, _explained(log, rows), []
     for group in np.split(high, np.flatnonzero(np.diff(high) > APART) + 1):
@@ -358,7 +358,13 @@ def _explained(log: Log, rows: np.ndarray) -> np.ndarray:
 
 
 def _spikes(rows: np.ndarray, values: np.ndarray, angle: bool) -> np.ndarray:
-    """Indices of samples that stand out from both neighbours."""
+    """Indices of samples that stand out from both neighbours.
+
+    A spike is above both of its neighbours, or below both, by more than SPIKE standard deviations of the noise
+    (estimated by the medians of all and of near differences) and by ALONE times the differences of its neighbours
+    from each other and from those beyond: a jump or a peak of the signal is not a spike. A normal one is one in
+    10^8.
+    """
     steps, noise = _steps_and_noise(values, angle)
     if not np.isfinite(noise):
         return np.empty(0, int)

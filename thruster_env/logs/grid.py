@@ -17,14 +17,7 @@ of the held value over the step.
 Clock offsets. The offset says how far a channel's clock is ahead: its time stamp minus the offset is the log's
 time.
 
-A row is a time at which any channel has a sample; a channel's clock offset is subtracted from its stamps first.
-The first row has the first stamp of the file, and what was sampled before it or after the last one is left out.
-Inputs are held from sample to sample, before the first at its value. Nothing is moved, averaged or interpolated.
-
-Time stamps: when two of them are one, and the steps of a model from one to the next.
-
-Stamps are rounded: float64 leaves 2.4e-7 s of seconds since 1970, and a recorder that writes milliseconds leaves
-1 ms. A step that is longer than the sample time by no more than that is one step.
+Without a grid, a row is a time at which any channel has a sample (`at_own_stamps`).
 """
 
 from __future__ import annotations
@@ -43,9 +36,32 @@ SAME_STAMP = 1e-9  # of a sample time: two stamps that are no further apart are 
 ROUNDING = 1e-6  # of a sample time: so much longer it is still one step
 MOST_STEPS = 1_000_000  # from one stamp to the next; some seconds of an extended filter
 
+# Of the grid.
+TOLERANCE = 0.1  # of the sample time: stamps so close to a multiple of it are it
+CLOSE_TO_GRID = 1e-9  # in steps: rounding
+MOST_DIGITS = 9  # of a sample time
+MOST_HELD = 5  # missing rows in a row over which an input is held; more are a gap
+SURE = 4.0  # standard errors of a sample time within which it is rounded
+SAME_RATE = 0.25  # of a step, over a piece: a sample time that is given is that of the stamps
+NEIGHBOURS = 1.5  # steps: samples that are farther apart are not interpolated
+
+# Of the times of a column.
+MISSING = "nan"
+SINCE_1970 = (6e8, 4.1e9)  # [s]: times from 1989 to 2099, which no clock that starts with its recorder reaches
+SECOND = "s"
+TICKS = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # a second
+STAMP_NAMES = ("timestamp", "stamp")
+SHORTEST_STEP, LONGEST_STEP = 1e-4, 5.0  # [s], of stamps in ms, us or ns
+DOUBTED = 2.0  # [s], of whole stamps, which may as well be in ms
+MOST_SECONDS = 86400.0  # [s], of stamps in seconds
+DAYS, LEAST_SECONDS = 2e4, 2e-5  # stamps beyond the first are dates in days if steps are below the other [s]
+STAMP_DIGITS = 17  # of a float64
+
 
 def resolution_of(latest: float, resolution: float = 0.0) -> float:
     """The largest difference [s] that rounding makes between stamps up to the latest one.
+
+    float64 leaves 2.4e-7 s of seconds since 1970, a recorder that writes milliseconds leaves 1 ms.
 
     Args:
         latest: the stamp of the largest size [s].
@@ -62,7 +78,8 @@ def closeness(dt: float, resolution: float) -> float:
 def count_steps(length: float, dt: float, resolution: float) -> int:
     """How many equal steps of at most dt [s] a time [s] is divided into, for stamps of some resolution [s].
 
-    Both the time and dt, which is often read off stamps, are rounded.
+    Both the time and dt, which is often read off stamps, are rounded, so a step that is longer than the sample
+    time by no more than the rounding is one step.
 
     Raises ValueError for more than MOST_STEPS, as after a clock was set.
     """
@@ -71,15 +88,6 @@ def count_steps(length: float, dt: float, resolution: float) -> int:
         rule = f"two successive stamps must be at most {MOST_STEPS} steps of {dt:g} s apart"
         raise ValueError(f"{rule}, but are {length:.9g} s: after a gap or a clock that was set start anew")
     return max(1, math.ceil(count))
-
-
-TOLERANCE = 0.1  # of the sample time: stamps so close to a multiple of it are it
-CLOSE_TO_GRID = 1e-9  # in steps: rounding
-MOST_DIGITS = 9  # of a sample time
-MOST_HELD = 5  # missing rows in a row over which an input is held; more are a gap
-SURE = 4.0  # standard errors of a sample time within which it is rounded
-SAME_RATE = 0.25  # of a step, over a piece: a sample time that is given is that of the stamps
-NEIGHBOURS = 1.5  # steps: samples that are farther apart are not interpolated
 
 
 class Series(NamedTuple):
@@ -229,9 +237,6 @@ def _lies_on_grid(times: np.ndarray) -> bool:
     return bool((abs(times - np.round(times)) <= CLOSE_TO_GRID * np.maximum(1.0, abs(times))).all())
 
 
-# A log's rows at the times of its samples, without a grid.
-
-
 def at_own_stamps(
     series: Mapping[str, Series],
     inputs: Collection[str],
@@ -241,6 +246,11 @@ def at_own_stamps(
     start: float = 0.0,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """The times (K + 1,) [s] of a log's rows, and each channel at them: inputs (K,), others (K + 1,) with NaN.
+
+    A row is a time at which any channel has a sample; a channel's clock offset is subtracted from its stamps
+    first. The first row has the first stamp of the file, and what was sampled before it or after the last one is
+    left out. Inputs are held from sample to sample, before the first at its value. Nothing is moved, averaged or
+    interpolated.
 
     Args:
         series: samples by channel, at times since the first stamp.
@@ -270,17 +280,6 @@ def at_own_stamps(
 
 
 # Time stamps: dates, as seconds since the first one, and the digits in which times are written.
-
-MISSING = "nan"
-SINCE_1970 = (6e8, 4.1e9)  # [s]: times from 1989 to 2099, which no clock that starts with its recorder reaches
-SECOND = "s"
-TICKS = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # a second
-STAMP_NAMES = ("timestamp", "stamp")
-SHORTEST_STEP, LONGEST_STEP = 1e-4, 5.0  # [s], of stamps in ms, us or ns
-DOUBTED = 2.0  # [s], of whole stamps, which may as well be in ms
-MOST_SECONDS = 86400.0  # [s], of stamps in seconds
-DAYS, LEAST_SECONDS = 2e4, 2e-5  # stamps beyond the first are dates in days if steps are below the other [s]
-STAMP_DIGITS = 17  # of a float64
 
 
 def since_first(dates: np.ndarray) -> np.ndarray:

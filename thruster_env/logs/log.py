@@ -1,11 +1,11 @@
-"""`Log`: inputs, measurements and reference channels of one recorded run, on a regular grid of times.
+"""`Log`: inputs, measurements and reference channels of one recorded run, on a grid or on its own stamps.
 
-Models of steps of any length: the length of a step is one more input.
+A model for rows on their own stamps has the length of a step as one more input:
 
     x_{k+1} = f(x_k, u_k, r_k dt) + w_k,  w_k ~ N(0, r_k Q);   r_k dt is the length of step k
 
-The Q of a model is that of a step of dt; another one's is in proportion (`continuous.noise_for_dt`). A log on
-its own stamps is then rows of numbers, and what takes such rows takes the log.
+The Q of a model is that of a step of dt, and others are in proportion (`continuous.noise_for_dt`). A log on its
+own stamps is then rows of numbers, and whatever takes such rows takes the log.
 """
 
 from __future__ import annotations
@@ -33,6 +33,16 @@ from thruster_env.model.shape import Shape
 from thruster_env.model.state_space import StateSpaceModel
 
 FEWEST_STEPS = 2
+
+# Of inputs without samples.
+LONG = 0.1  # of the log at its end
+LONGER = 10.0  # than the longest time between two samples of the input
+
+# Of rows that two logs share.
+WINDOW = 20  # rows in a row that are the same; of shorter logs half of them
+FEWEST = 4
+FACTOR = np.uint64(0x9E3779B97F4A7C15)  # odd, of the hash of a window
+RATIO = Quantity("length of a step over dt", "step_ratio")
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,9 +276,6 @@ def _with_column(rows: np.ndarray, column: int, values: np.ndarray) -> np.ndarra
 
 # Inputs that are held over a log, or over its end, because they have no samples there.
 
-LONG = 0.1  # of the log at its end
-LONGER = 10.0  # than the longest time between two samples of the input
-
 
 def stale_inputs(inputs: Mapping[str, Series], end: float, dt: float, start: float) -> list[Remark]:
     """Inputs without a sample after the first row, or in the last part of the log.
@@ -296,10 +303,6 @@ def stale_inputs(inputs: Mapping[str, Series], end: float, dt: float, start: flo
 
 
 # Whether two recorded runs have rows in common, so that one cannot be held out of training on the other.
-
-WINDOW = 20  # rows in a row that are the same; of shorter logs half of them
-FEWEST = 4
-FACTOR = np.uint64(0x9E3779B97F4A7C15)  # odd, of the hash of a window
 
 
 def shared_by(first: Sequence[Log], second: Sequence[Log]) -> tuple[Log, Log] | None:
@@ -345,9 +348,6 @@ def _hashes(numbers: np.ndarray, measured: np.ndarray, width: int) -> np.ndarray
         total = total * FACTOR + (numbers[offset : offset + count] + np.uint64(1))
     changes = np.append(0, np.cumsum((np.diff(measured, axis=0) != 0).any(axis=1)))
     return np.unique(total[changes[width - 1 :] - changes[:count] >= width // 2])
-
-
-RATIO = Quantity("length of a step over dt", "step_ratio")
 
 
 class AnyStepModel(StateSpaceModel):

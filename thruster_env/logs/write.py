@@ -1,4 +1,4 @@
-"""Logs and other columns of numbers into files that `read_log` takes: CSV, npz or Parquet."""
+"""Logs and other columns as files that `read_log` takes, CSV, npz or Parquet, and the picture of a log."""
 
 from __future__ import annotations
 
@@ -37,6 +37,11 @@ EXACT = "exact"  # every digit of a number
 LEAST = 10  # digits
 DIGITS = f"%.{LEAST}g"
 PICTURES = (".png", ".svg", ".pdf")  # which figures are written as
+
+# Of the picture.
+WIDTH, PANEL, ROOM = 9.0, 1.5, 0.7  # [inch]
+MOST_PANELS = 12
+SPANS = {GAP: ("gap", MUSTARD), STUCK: ("stuck", WINE)}
 
 
 def check_suffix(path: str | Path, option: str = "--out", suffixes: tuple[str, ...] = SUFFIXES) -> None:
@@ -179,10 +184,6 @@ def _pyarrow():
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-WIDTH, PANEL, ROOM = 9.0, 1.5, 0.7  # [inch]
-MOST_PANELS = 12
-SPANS = {GAP: ("gap", MUSTARD), STUCK: ("stuck", WINE)}
 
 
 def findings_figure(path: str | Path, log: Log) -> Path:

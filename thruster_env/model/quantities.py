@@ -1,7 +1,4 @@
-"""Quantities of a model: names, symbols and units of states, inputs, measurements and outputs.
-
-Bounds on the states of a model, which its estimates keep.
-"""
+"""Quantities of a model: names, symbols and units of its vectors, positions, bounds and scales of its states."""
 
 from __future__ import annotations
 

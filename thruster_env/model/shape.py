@@ -1,4 +1,4 @@
-"""Shape and functions of a model, for which code is compiled."""
+"""Shape and functions of a model, for which code is compiled, and the places of its numbers in a row."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`StateSpaceModel`: the model of a plant that a filter assumes.
-
-Check that a model's functions take and return the declared shapes: one call, as Python, at the prior mean.
-"""
+"""`StateSpaceModel`: the model of a plant that a filter assumes, with checks of its functions and a digest."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""Canvas of the pictures: coordinates in pixels, smooth edges, text, and the colours.
+"""Canvas of the pictures, coordinates in pixels, smooth edges, text and colours; strip charts of the last steps.
 
 pygame is imported with the first canvas, because every env imports this module and few draw.
-
-Strip charts of the last steps, one below the other, with their legend.
 """
 
 from __future__ import annotations

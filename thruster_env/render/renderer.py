@@ -1,4 +1,4 @@
-"""Renderer of an episode of a plant: it keeps the last steps, and shows them as arrays or in a window."""
+"""Renderer of an episode of a plant, as arrays, in a window or as a video file."""
 
 from __future__ import annotations
 

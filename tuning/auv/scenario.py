@@ -42,9 +42,6 @@ from tuning.problems.find import find_in
 from tuning.problems.problem import GIVEN, PATH_BOUND
 from tuning.problems.scenario import BaseScenario, plain
 
-# Inputs of the vehicle's scenarios: any excitation of thrust and planes, and the manoeuvres of the papers.
-
-
 TORQUE = 1  # index of K_prop among the inputs of a manoeuvre
 UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
 RUNS_AT_ONCE = 16  # runs whose covariances of all steps are in memory at the same time
@@ -54,6 +51,9 @@ SAILING = Levels(low=(2.0, -PLANE, -PLANE), high=(4.0, PLANE, PLANE), shortest=6
 """Thrusts of 2 to 4 N and planes within 6 deg, each held for 3 to 8 s."""
 MINUTE: dict[str, Any] = {"excitation": SAILING, "steps": 1200, "first_scored_step": 100}
 DVL = ("u", "v", "w")
+
+
+# Inputs of the vehicle's scenarios: any excitation of thrust and planes, and the manoeuvres of the papers.
 
 
 @EXCITATIONS.register("manoeuvre")

@@ -14,11 +14,11 @@ from filters.filter import Filter
 from thruster_env.core.angles import difference, is_angle
 from tuning.problems.data import FIRST_SCORED_STEP, Data, estimates_in_parts, where_true
 
-# The log score of a filter: the log density of its belief at the true state, a proper score.
-
-
 LEAST = -1e6  # log score of a step whose covariance is singular or not finite
 FARTHEST = 1e100  # outputs are clipped to this, so that their squares are finite
+
+
+# The log score of a filter: the log density of its belief at the true state, a proper score.
 
 
 def log_scores_of(

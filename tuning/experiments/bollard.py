@@ -44,9 +44,6 @@ from thruster_env.thruster.analysis import steady_state
 from thruster_env.thruster.dynamics import thrust_and_torque
 from thruster_env.thruster.parameters import T200, ThrusterParameters, derive_constants
 
-# Reads a thruster's bollard table: thrust, speed and current for pulse widths and supply voltages.
-
-
 COLUMNS = ("pwm_us", "rpm", "current_A", "voltage_V", "force_kgf")
 CENTRE, SPAN = 1500.0, 400.0  # pulse width at rest, and from there to full throttle [us]
 SLOWEST = 0.25  # fraction of full speed; slower rows are not used
@@ -54,6 +51,9 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, N in a kgf
 FITTED = ("lift_coefficient", "drag_coefficient", "thrust_asymmetry", "motor_damping", "voltage_gain")
 SMALL_ERROR = 0.02  # relative; larger ones are the model's, and are weighted linearly, not by their square
 DEAD_BAND = 28.0  # half of the dead band [us]; 24 to 40 in the table of the T200
+
+
+# A thruster's bollard table: thrust, speed and current for pulse widths and supply voltages.
 
 
 class BollardTable(NamedTuple):

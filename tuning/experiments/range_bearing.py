@@ -32,9 +32,6 @@ from tuning.problems.problem import Parameter
 from tuning.search.plan import Plan
 from tuning.search.trials import best_trial
 
-# Stone Soup's Kalman filters for a target at nearly constant velocity, seen in range and bearing.
-
-
 START = datetime.datetime(2024, 1, 1)
 DT, STEPS = 1.0, 100  # [s]
 TRUE_SIGMA = 0.2  # [m/s^1.5]
@@ -45,6 +42,9 @@ POINTS = {"alpha": 0.5, "beta": 2.0, "kappa": -1.0}  # of the unscented filters
 TRIALS = 20
 SIGMA = Parameter("sigma_a", 0.01, 10.0, unit="m/s^1.5", default=2.0)  # the default is a guess, as users make one
 SCALE = (2.0, 0.5, 2.0, 0.5)  # what errors are measured in: about those of a good filter [m, m/s]
+
+
+# Stone Soup's Kalman filters for a target at nearly constant velocity, seen in range and bearing.
 
 
 def check_installed() -> None:

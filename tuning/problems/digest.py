@@ -23,9 +23,6 @@ from thruster_env.core.user_functions import OURS, Made, as_made
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.problem import Problem
 
-# Texts that identify code: of functions and classes, with what they refer to; see `digest`.
-
-
 Of = Callable[[Any], Iterator[str]]  # texts of a value
 EXPERIMENTS = "tuning.experiments."  # whose problems are as a user's
 INSTALLED = ("site-packages", "dist-packages")
@@ -63,6 +60,9 @@ DESCRIPTORS = (
 )
 LENGTH = 12  # of the hexadecimal digits of a SHA-256 that are kept
 PLAIN = bool | int | float | complex | str | bytes
+
+
+# Texts that identify code: of functions and classes, with what they refer to; see `digest`.
 
 
 def of_function(function: types.FunctionType, of: Of) -> Iterator[str]:

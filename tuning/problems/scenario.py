@@ -18,11 +18,11 @@ from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_s
 from tuning.problems.excitation import Excitation, Steps, excitation_of
 from tuning.problems.problem import Problem
 
-# Plain data: mappings and lists as immutable values, and as values for JSON.
-
-
 DEEPEST = 10  # levels of mappings and lists
 MOST_STEPS = 1_000_000
+
+
+# Plain data: mappings and lists as immutable values, and as values for JSON.
 
 
 def frozen(value, depth: int = 0):

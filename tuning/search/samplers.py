@@ -26,9 +26,6 @@ from tuning.search.plan import Plan
 from tuning.search.space import FILTER_TYPE
 from tuning.search.trials import best_trial
 
-# Samplers that draw Q and R within a box in their ranges, which grows as the best trial nears a side of it.
-
-
 MARGIN = 10.0  # factor by which the box reaches beyond the best trial
 SAMPLERS = {
     "tpe": "tree-structured Parzen estimator, all parameters together; good from some ten trials on",
@@ -48,6 +45,9 @@ LARGEST = 0.1  # step over the width of a linear range; over a decade of a logar
 DECADES = 1.5  # ... and the smallest step is so many powers of ten below
 MOVED = 0.5  # probability that a number is moved
 _OPTIMIZERS = ("CMA", "SepCMA", "CMAwM")
+
+
+# Samplers that draw Q and R within a box in their ranges, which grows as the best trial nears a side of it.
 
 
 def box(

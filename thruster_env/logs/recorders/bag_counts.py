@@ -1,4 +1,4 @@
-"""The files of a bag, and how many messages it says it has: what is damaged has others."""
+"""The files of a bag, and the number of messages that it states: a damaged bag has another."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ from urllib.parse import quote
 from thruster_env.logs.recorders import topics
 from thruster_env.logs.recorders.topics import Refused, check_bytes, package
 
-# How many messages a bag says it has, read apart from the messages: what is damaged has others.
-
 ROS1, MCAP, DB3 = b"#ROSBAG V2.0", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
 REPAIRS = {ROS1: "rosbag reindex", MCAP: "mcap recover", DB3: "ros2 bag reindex"}  # the formats' own programs
 SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX = 3, 4, 5, 6, 7  # records of an MCAP file
@@ -27,6 +25,14 @@ ROS1_HEADER, ROS1_INDEX, ROS1_CHUNK, ROS1_CHUNK_INFO, ROS1_CONNECTION = 3, 4, 5,
 PIECE = 2**20  # bytes
 
 Counts = Mapping[int, int]  # messages by connection
+
+# Of the metadata.
+METADATA = "metadata.yaml"
+NEWEST = 9  # version of the metadata
+PACKED = ("", "none", "file", "message")
+
+
+# The number of messages that a bag states, read apart from the messages.
 
 
 def is_ros1(path: Path) -> bool:
@@ -263,10 +269,6 @@ def _check_whole(path: Path) -> None:
 
 
 # The files of a bag: one, or those that the metadata.yaml of a folder names, unpacked where they are packed.
-
-METADATA = "metadata.yaml"
-NEWEST = 9  # version of the metadata
-PACKED = ("", "none", "file", "message")
 
 
 class Bag(NamedTuple):

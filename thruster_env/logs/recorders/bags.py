@@ -1,10 +1,8 @@
-"""Bags of ROS 1 and ROS 2, also as MCAP, by the package rosbags.
+"""Bags of ROS 1 and ROS 2, also as MCAP, by the package rosbags, with one clock for all topics of a log.
 
-One clock for all topics of a log from a bag: stamps of headers, or the times at which messages were received.
-
-Headers may have the time of a device or a simulation, and topics without stamps have none but that of reception:
-of two such topics nobody knows which samples belong together. Stamps of headers are exact where all topics have
-them; otherwise all topics have the times of reception.
+Stamps of headers are exact, but they may have the time of a device or a simulation, and topics without stamps have
+only times of reception: of two such topics nobody knows which samples belong together. So a log has the stamps of
+headers if all topics have them on one clock, and otherwise the times of reception.
 """
 
 from __future__ import annotations
@@ -50,6 +48,13 @@ HEADER, RECEIPT = "header", "receipt"
 STAMPS = (HEADER, RECEIPT)
 APART = 60.0  # [s] between the clocks of two headers: less may be the delay of a message
 FEWEST = 3  # messages of a topic whose clock is compared: one that is sent once may be old
+
+# Of messages.
+KIND = "bag"
+TICKS = 1e9  # a second
+NUMBER = re.compile(r"bool|byte|char|u?int\d+|float(32|64)")
+NAME = re.compile(r"[A-Za-z]\w*(/\w+)*", re.ASCII)  # of a type or a field
+DEEPEST = 8  # messages within messages
 
 
 class Clocked(NamedTuple):
@@ -114,13 +119,6 @@ def _of_another_clock(topics: Mapping[str, Clocked]) -> str:
             if np.median(abs(apart)) > APART:
                 return name
     return ""
-
-
-KIND = "bag"
-TICKS = 1e9  # a second
-NUMBER = re.compile(r"bool|byte|char|u?int\d+|float(32|64)")
-NAME = re.compile(r"[A-Za-z]\w*(/\w+)*", re.ASCII)  # of a type or a field
-DEEPEST = 8  # messages within messages
 
 
 class Leaf(NamedTuple):

@@ -24,10 +24,19 @@ from thruster_env.logs.recorders.topics import (
     reading,
 )
 
-# Arrays by name, as MATLAB and HDF5 keep them: which are channels, and which vector has their times.
-
 NUMERIC = "biuf"  # NumPy's kinds
 FEWEST = 2  # samples; what has fewer is a constant
+
+# Of files.
+KIND = "HDF5 file"
+MAGIC = b"\x89HDF\r\n\x1a\n"
+UNITS, SCALE, OFFSET = ("units", "unit"), "scale_factor", "add_offset"  # attributes
+MISSING = ("_fillvalue", "missing_value")
+LEAST, GREATEST, RANGE = "valid_min", "valid_max", "valid_range"
+UNSIGNED = "_unsigned"
+
+
+# Arrays by name, as MATLAB and HDF5 keep them: which are channels, and which vector has their times.
 
 
 def topics_of(
@@ -151,14 +160,6 @@ def _read(name: str, array: Any, path: Path) -> np.ndarray:
     """An array without its dimensions of length one."""
     check_bytes(math.prod(array.shape) * max(array.dtype.itemsize, 8), f"the array {name!r}", path)
     return np.squeeze(np.asarray(array[...]))
-
-
-KIND = "HDF5 file"
-MAGIC = b"\x89HDF\r\n\x1a\n"
-UNITS, SCALE, OFFSET = ("units", "unit"), "scale_factor", "add_offset"  # attributes
-MISSING = ("_fillvalue", "missing_value")
-LEAST, GREATEST, RANGE = "valid_min", "valid_max", "valid_range"
-UNSIGNED = "_unsigned"
 
 
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:

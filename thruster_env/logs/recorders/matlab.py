@@ -34,6 +34,9 @@ DEEPEST = 32
 TAG = 8  # bytes of type and size before an element
 PIECE = 2**20  # bytes
 WHOLE = "what a MATLAB file holds"
+KIND = "MATLAB file"
+MAGIC = b"MATLAB "
+HDF5 = b"MATLAB 7.3"
 
 
 def arrays_of(path: Path) -> dict[str, Any]:
@@ -199,10 +202,6 @@ def _text(data: bytes | bytearray, part: tuple[int, int, int]) -> str:
 
 
 # MATLAB's .mat files: version 5 to 7 by ourselves, version 7.3 by h5py.
-
-KIND = "MATLAB file"
-MAGIC = b"MATLAB "
-HDF5 = b"MATLAB 7.3"
 
 
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:

@@ -1,6 +1,6 @@
-"""Recorders' files by their ending and first bytes: their fields, and the samples of chosen fields.
+"""Recorders' files by their ending and first bytes: their fields, and the samples of chosen fields as a table.
 
-A recorder's file as a table: fields with their own times, in one row for each time.
+The table has one row for each time of any chosen field.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from thruster_env.logs.recorders.topics import Reader, Topic, Wanted, unreadable
 from thruster_env.logs.table import SUFFIXES, Table, read_table
 
 BINS = 8  # of the course of a field
+STAMP = "times"  # header of the rows' times
+MANY = 0.1  # of the samples of a channel outside the log: worth a word
 
 
 class Format(NamedTuple):
@@ -252,9 +254,6 @@ def _field(name: str, topic: str, samples: Samples) -> Field:
     )
 
 
-STAMP = "times"  # header of the rows' times
-
-
 class Recorded:
     """The fields of a recorder's file that may be columns of a log.
 
@@ -344,9 +343,6 @@ class Recorded:
         remarks = [*clock_remarks, *_of_choice(choice), *_not_used(columns, fields, clock, self.path)]
         table = Table(str(self.path), {STAMP: stamps, **cells}, rows, "row", is_clock, _damage(fields), remarks)
         return table, {**columns, TIME: Column(STAMP, SECOND)}
-
-
-MANY = 0.1  # of the samples of a channel outside the log: worth a word
 
 
 def _of_choice(choice: Choice) -> list[Remark]:

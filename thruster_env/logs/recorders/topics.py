@@ -19,6 +19,8 @@ MOST_COLUMNS = 64  # of a field that is an array: pictures and point clouds are 
 MOST_FIELDS = 20_000  # of a message
 
 Wanted = Collection[str] | None  # names of columns; None for all
+HEADER_TYPE = "std_msgs/msg/Header"
+STAMPED = "geometry_msgs/msg/TransformStamped"
 
 
 class Topic(NamedTuple):
@@ -164,9 +166,6 @@ def columns_of(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 # Transforms between frames: messages that hold arrays of them give one topic for each pair of frames.
-
-HEADER_TYPE = "std_msgs/msg/Header"
-STAMPED = "geometry_msgs/msg/TransformStamped"
 
 
 def array_of_transforms(defined: dict, kind: str) -> str:

@@ -31,9 +31,6 @@ from thruster_env.model.shape import Functions, Shape, constants_reader, number_
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.experiments.vehicle.papers import FUZZY_HIGH, FUZZY_LOW, papers_model
 
-# Position and yaw that follow from velocities over time, by the full transformation or by yaw alone.
-
-
 POSE_ANGLES = (False, False, False, True)  # of x, y, z and yaw
 KEPT = 5  # roll, pitch and the last p, q, r
 MEMBERS = (50, 100, 200, 300)
@@ -41,6 +38,9 @@ NARROW_LOW = (0.5, -0.1, -0.1, -0.1, -0.3, -0.3)  # [m/s], [rad/s]: approximate 
 NARROW_HIGH = (1.1, 0.1, 0.1, 0.1, 0.3, 0.3)
 MEASUREMENTS = "measurements, no filter"
 EULER = {"integration": "euler"}  # as in the papers; the truth and our other filters use Runge-Kutta
+
+
+# Position and yaw that follow from velocities over time, by the full transformation or by yaw alone.
 
 
 @inlined

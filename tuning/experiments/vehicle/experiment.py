@@ -45,9 +45,6 @@ from tuning.experiments.vehicle.papers import (
     papers_model,
 )
 
-# The vehicle's inputs over time on each of the papers' five paths.
-
-
 THRUST = 2.84531  # [N]; holds 1 m/s, the printed speed
 TORQUE_ARM = -0.006  # propeller's torque over its thrust [m]
 TORQUE = -0.017  # [N m]; that of the constant thrust
@@ -72,6 +69,9 @@ STYLES = {
 }
 LEAST_SPAN = 2.0  # of an axis [m]: millimetres of a straight path are no shape
 EVERY = 20  # steps between points of a line
+
+
+# The vehicle's inputs over time on each of the papers' five paths.
 
 
 class Manoeuvre(NamedTuple):

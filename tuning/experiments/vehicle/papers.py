@@ -10,9 +10,6 @@ from thruster_env.auv.parameters import SEGOROGENI
 from thruster_env.core.checks import one_of
 from thruster_env.model.state_space import StateSpaceModel
 
-# The runs of the papers on the vehicle: the form of a table, and the settings of both papers.
-
-
 DT = 0.001  # [s]
 NOISE = 1e-6  # Q = R = 1e-6 I, in the units of the velocities squared
 MEASURED = ("u", "v", "w", "r")  # H picks these
@@ -27,6 +24,9 @@ WORLDS = {"vehicle": SEGOROGENI, "no restoring moments": SEGOROGENI._replace(zG=
 Then nothing depends on roll and pitch, so that the papers' six velocities are a closed system.
 """
 COUNTS = {"velocities": 6, "motion": 8, "navigation": 12}
+
+
+# The runs of the papers on the vehicle: the form of a table, and the settings of both papers.
 
 
 class PrintedRow(NamedTuple):

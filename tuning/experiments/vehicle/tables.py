@@ -36,9 +36,6 @@ from tuning.experiments.vehicle.papers import (
     PrintedRow,
 )
 
-# Printed values beside ours, and why they differ.
-
-
 FACTOR = 3.0  # up to which two errors are of the same size: path and duration are not printed
 FIELDS = {
     "full": "similar to ours by the full transformation",
@@ -54,6 +51,9 @@ NO_POSTERIOR_BOUND = (
     "differences of Jacobians for information: a pitch to 3 mrad, where a consistent filter has 10."
 )
 RUNS_OF = {"ngatini2019": 50, "ngatini2017": 10}
+
+
+# Printed values beside ours, and why they differ.
 
 
 class Finding(NamedTuple):
