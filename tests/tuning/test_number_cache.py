@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from tuning.problems import check
-from tuning.problems.check import cached_numbers
+from tuning.problems import bound
+from tuning.problems.bound import cached_numbers
 
 
 class Code:
@@ -20,11 +20,11 @@ class Code:
 @pytest.fixture
 def ask(monkeypatch, tmp_path):
     """Ask for two numbers in a fresh process, so to speak; `ask.computed` counts."""
-    monkeypatch.setattr(check, "_known", {})
+    monkeypatch.setattr(bound, "_known", {})
 
     def ask(follows_from=b"it", value=(0.1, 1e-300), folder=tmp_path / "cache", fresh=True):
         if fresh:
-            check._known.clear()
+            bound._known.clear()
 
         def compute():
             ask.computed += 1
@@ -48,7 +48,7 @@ def test_another_process_finds_the_same_digits(ask, tmp_path):
 def test_what_they_follow_from_and_the_processor_tell_them_apart(ask, monkeypatch):
     ask(), ask(b"something else", (3.0, 4.0))
     assert ask().tolist() == [0.1, 1e-300] and ask(b"something else").tolist() == [3.0, 4.0] and ask.computed == 2
-    monkeypatch.setattr(check, "made_by", lambda: "another processor")
+    monkeypatch.setattr(bound, "made_by", lambda: "another processor")
     assert ask(value=(5.0, 6.0)).tolist() == [5.0, 6.0]
 
 

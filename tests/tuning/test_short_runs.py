@@ -8,7 +8,7 @@ from filters import affine_model, bounds, make_filter
 from filters.bounds import posterior_variances
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.evaluate import check_consistency
-from tuning.problems.check import average_bound
+from tuning.problems.bound import average_bound
 from tuning.problems.data import Data, mask_of
 
 

@@ -1,27 +1,19 @@
-"""Checks of a problem, whose model and data must agree in shapes, names and units, and its stored bound."""
+"""Checks of a problem: its model and its data must agree in shapes, names and units."""
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import json
 import warnings
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from weakref import WeakValueDictionary
 
 import numpy as np
 
-from filters.bounds import gathering_code, posterior_variances, sequences_taken
 from thruster_env.core.checks import short_repr
-from thruster_env.core.compiled import CompiledOrPython, made_by
-from thruster_env.core.files import write_whole
 from thruster_env.core.sources import as_value
 from thruster_env.model.quantities import Quantities, Quantity
 from thruster_env.model.simulate import seconds_as_python
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
-from tuning.problems.digest import digest_of
 from tuning.problems.problem import Problem
 
 SEEDS = (0, 1)  # with which a problem is checked
@@ -230,80 +222,3 @@ def _listed(quantities: tuple[Quantity, ...]) -> str:
 
 def _in_words(quantity: Quantity) -> str:
     return f"{quantity.symbol} [{quantity.unit}]" + (" (an angle)" if quantity.angle else "")
-
-
-# The posterior Cramér-Rao bound of a problem, which is computed once for all commands.
-
-
-def average_bound(model: StateSpaceModel, data: Data, truths: int = 100) -> np.ndarray:
-    """Root of the bound's variances (n,), averaged over the scored steps of all runs.
-
-    A minute's work for a model of many substeps, and the same for each command on a problem: it is kept beside
-    the machine code, by everything that it follows from.
-
-    Args:
-        model: the model that draws the truth; Q must be positive definite.
-        data: its inputs are those of the bound, a sequence a run.
-        truths: truths drawn for each sequence.
-    """
-    inputs = np.ascontiguousarray(data.seen.inputs, dtype=np.float64)
-    code, sources = gathering_code(model)
-    parts = sources, digest_of(model, *model.functions), data.first_scored, truths, inputs.shape
-    counted = b"" if data.counted is None else np.ascontiguousarray(data.counted).tobytes()
-    follows_from = repr(parts).encode() + model.numbers.tobytes() + inputs.tobytes() + counted
-
-    def compute() -> np.ndarray:
-        variances = posterior_variances(model, inputs, truths=truths)
-        if data.counted is None:
-            return np.sqrt(data.pooled(variances))
-        sequences = sequences_taken(inputs, truths, model)
-        if len(sequences) == 1:  # of all sequences, where they are the same
-            variances, sequences = np.repeat(variances, len(inputs), axis=0), np.arange(len(inputs))
-        return np.sqrt(data._replace(counted=data.counted[sequences]).pooled(variances))
-
-    return cached_numbers("bound", model.n, follows_from, code, compute)
-
-
-# Numbers that took long to compute, kept beside the machine code that computed them, for the next process.
-
-_known: dict[str, tuple[float, ...]] = {}  # of this process
-
-
-def cached_numbers(
-    name: str, count: int, follows_from: bytes, code: CompiledOrPython, compute: Callable
-) -> np.ndarray:
-    """Return the vector compute(), from the cache if it was computed from the same inputs before.
-
-    Numbers lie as JSON where the code is compiled to (`thruster_env.core.compiled`), for one kind of
-    processor, and go with it. A file that is damaged is as if it were not there, a folder that takes none is as it
-    is.
-
-    Args:
-        name: first part of the file's name.
-        count: n, how many numbers there are.
-        follows_from: everything that the numbers follow from, also the sources of what computes them.
-        code: what computes them, or most of them.
-        compute: a function that returns finite numbers (n,); others are not kept.
-    """
-    folder = code.folder
-    key = hashlib.sha256(follows_from + (made_by() if folder else "Python").encode()).hexdigest()
-    if key not in _known:
-        file = None if folder is None else Path(folder) / f"{name}-{key[:32]}.json"
-        numbers = None if file is None else _read(file, count)
-        if numbers is None:
-            numbers = tuple(np.asarray(compute(), dtype=np.float64).tolist())
-            if not np.isfinite(numbers).all():
-                return np.array(numbers)
-            if file is not None:
-                with contextlib.suppress(ValueError):  # nothing can be written there
-                    write_whole(file, json.dumps(numbers))
-        _known[key] = numbers
-    return np.array(_known[key])
-
-
-def _read(file: Path, count: int) -> tuple[float, ...] | None:
-    try:
-        numbers = tuple(map(float, json.loads(file.read_bytes())))
-    except (OSError, TypeError, ValueError):
-        return None
-    return numbers if len(numbers) == count and np.isfinite(numbers).all() else None

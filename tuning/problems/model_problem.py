@@ -22,7 +22,8 @@ from thruster_env.logs.log import Log
 from thruster_env.model.simulate import simulate
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
-from tuning.problems.check import average_bound, check_quantities
+from tuning.problems.bound import average_bound
+from tuning.problems.check import check_quantities
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step, estimates_in_parts
 from tuning.problems.digest import digest_of
 from tuning.problems.excitation import Excitation, excitation_of

@@ -1,8 +1,7 @@
-"""The comparison of the best trials with the baselines, and its result, in sentences.
+"""The result of a tuning in sentences: the choice and its reason, the gain over baselines, doubts about the model.
 
-NIS is the normalised innovation squared.
-
-Parameters of a filter in words, each with its unit.
+In order: the comparison of the best trials with the baselines; the gain of tuning; what residuals say of the
+model; and the parameters of a filter in words, each with its unit.
 """
 
 from __future__ import annotations
@@ -33,6 +32,22 @@ from tuning.search.space import Choice, everything_of, neutral, parameters, para
 from tuning.search.validation import choice_from
 
 FULL_NOISE = {FULL_Q: "--full-q", FULL_QR: "--full-q --full-r"}  # by the option that lets it compete with trials
+GIVEN_IS_ORACLE = (
+    "The given Q and R are the plant's own, as the oracle's are; no trial of a study starts from them."
+)
+
+# Of doubts about the model.
+SMALL = 0.1  # of a mean over its deviation, or of a correlation: what is below says little of a model
+STRONG = 0.5  # correlation of residuals with the next step, above which a headline says that the model is wrong
+LARGE_NIS = 3.0  # mean NIS of the given Q and R over its expected value, above which the model is in doubt
+MADE_UP = "made consistent by Q and R, not by the model"
+JOINTLY = "consistent jointly, but not in each state"
+
+# Of parameters in words.
+SMALL_SHARE, LARGE = 1e-3, 1e5  # what is smaller or larger is told in a unit with a power of ten
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+MOST_CORRELATIONS = 3  # of three states or channels: more are one row with the largest
+ALIKE = 4  # so many numbers of one kind and more, which are the same in every column, share a row
 
 
 def choice_sentences(validation: Mapping[str, Any] | None, plan: Any) -> list[str]:
@@ -271,11 +286,6 @@ def _range(ends: Sequence[int]) -> range:
 # The gain of tuning, in sentences.
 
 
-GIVEN_IS_ORACLE = (
-    "The given Q and R are the plant's own, as the oracle's are; no trial of a study starts from them."
-)
-
-
 def gains(comparison: Comparison, seed_word: str, name: str = TUNED) -> list[str]:
     """The gain of tuning over each baseline, the main one first, and a description of that one."""
     if not comparison.tuned.has_truth:
@@ -323,13 +333,6 @@ def _verdict(ratio: Interval, name: str, seed_word: str) -> str:
 
 
 # What residuals of the true states, or without these the innovations, say of a model.
-
-
-SMALL = 0.1  # of a mean over its deviation, or of a correlation: what is below says little of a model
-STRONG = 0.5  # correlation of residuals with the next step, above which a headline says that the model is wrong
-LARGE_NIS = 3.0  # mean NIS of the given Q and R over its expected value, above which the model is in doubt
-MADE_UP = "made consistent by Q and R, not by the model"
-JOINTLY = "consistent jointly, but not in each state"
 
 
 def residual_sentences(problem: Problem, seed: int = 0) -> list[str]:
@@ -468,12 +471,6 @@ def consistency_sentence(comparison: Comparison) -> str:
     if not comparison.tuned.has_truth or sentence.startswith("Consistent"):
         return sentence
     return f"{sentence} RMSE and NIS do not fully test the covariance."
-
-
-SMALL_SHARE, LARGE = 1e-3, 1e5  # what is smaller or larger is told in a unit with a power of ten
-RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-MOST_CORRELATIONS = 3  # of three states or channels: more are one row with the largest
-ALIKE = 4  # so many numbers of one kind and more, which are the same in every column, share a row
 
 
 def typeset(text: str) -> str:

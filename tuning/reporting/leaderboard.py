@@ -1,6 +1,6 @@
 """The output of `thruster compare` for one scenario: tables, a sentence on the winner, or plain data.
 
-Tables of metrics of filters: any number of states, derived outputs and channels, with or without truth.
+The tables of metrics hold any number of states, derived outputs and channels, with or without truth.
 """
 
 from __future__ import annotations

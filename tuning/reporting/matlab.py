@@ -22,8 +22,6 @@ from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.traced import traced_function
 from tuning.search.space import Choice
 
-# A function of a model as lines of MATLAB, from its graph.
-
 EXPRESSIONS = {
     **{name: f"{name}({{}})" for name in (*UNARY, "abs")},
     **{f"arc{name}": f"a{name}({{}})" for name in "tan tanh sinh cosh".split()},
@@ -48,6 +46,9 @@ function y = choose(condition, a, b)
 if condition, y = a; else, y = b; end
 end
 """
+
+
+# A function of a model as lines of MATLAB, from its graph.
 
 
 def lines_of(function: Callable, arguments: Sequence[Sequence[str]], constants: Any, count: int) -> list[str]:

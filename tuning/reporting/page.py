@@ -1,6 +1,7 @@
 """A self-contained page: tables and pictures in one HTML file that needs no network, and tables as Markdown.
 
-Text alternatives of pictures, for readers who cannot see them.
+In order: figures as SVG whose text, colours and values a browser can use; the parts of a page and the page; text
+alternatives of pictures, for readers who cannot see them.
 """
 
 from __future__ import annotations
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Figures as SVG within a page: text stays text, colours follow the page's, and a script can read values.
-
 
 PAPER = "#ffffff"
 DARK_PAPER = "#15191d"
@@ -47,6 +46,18 @@ NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 PLACES = re.compile(r'\b(d|x|y|x1|x2|y1|y2|points|transform)="([^"]*)"')
 FONTS = re.compile(r"'DejaVu Sans',[^;\"]*sans-serif")
 COLOUR = re.compile(r"#([0-9a-fA-F]{6})\b")
+
+# Of tables and pictures on a page.
+INTERVAL = re.compile(r"(\S+) (\[\S+, \S+\])")
+WIDE = 480.0  # [pt] pictures beyond this are scrolled on a phone
+MANY = 9  # columns of a table that is set small on paper
+FOLDED = 4  # columns from which a row is folded on a phone
+NARROW = 5  # columns of a table that fits beside another
+NO_TRIALS = "No trial was finished."
+TWO_SIDED = 1.96
+
+
+# Figures as SVG within a page: text stays text, colours follow the page's, and a script can read values.
 
 
 def figure_svg(figure: Figure, name: str) -> tuple[str, str]:
@@ -164,13 +175,6 @@ def _parts(colour: str) -> tuple[float, ...]:
 
 def _hex(parts: tuple[float, ...]) -> str:
     return "#" + "".join(f"{round(255 * part):02x}" for part in parts)
-
-
-INTERVAL = re.compile(r"(\S+) (\[\S+, \S+\])")
-WIDE = 480.0  # [pt] pictures beyond this are scrolled on a phone
-MANY = 9  # columns of a table that is set small on paper
-FOLDED = 4  # columns from which a row is folded on a phone
-NARROW = 5  # columns of a table that fits beside another
 
 
 class Table(NamedTuple):
@@ -353,10 +357,6 @@ def _plain(text: str) -> str:
     text = re.sub(r"([\\|*_`<$~])", r"\\\1", " ".join(text.split()))
     text = text.replace("](", "\\](").replace("![", "!\\[").replace("&", "&amp;")
     return f"\\{text}" if text[:1] in ("#", ">") else text
-
-
-NO_TRIALS = "No trial was finished."
-TWO_SIDED = 1.96
 
 
 def of_history(trials: Sequence[FrozenTrial], objective: str) -> str:

@@ -1,4 +1,4 @@
-"""The report of a tuning: one page with all results, and its tables as Markdown."""
+"""The report of a tuning: one page with all results, its tables as Markdown, and the report of two studies."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""Pictures of a study's search: importance, slices, Pareto front, ensemble sizes.
+"""Pictures of a study and its results: history, importance, slices, Pareto front, ensemble sizes, and consistency.
 
-One picture of a filter's consistency: a panel for each check of `filters.consistency`.
+`draw_...` returns a figure, `..._figure` saves it as a file. The picture of a filter's consistency has a panel for
+each check of `filters.consistency`.
 """
 
 from __future__ import annotations
@@ -47,11 +48,18 @@ from tuning.search.trials import best_trial, is_consistent
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Figures of studies and their results: `draw_...` returns a figure, `..._figure` saves it as a file.
-
-
 # Of baselines; the tuned filter has its own.
 COLOURS = {GIVEN: RUST, RULE: PALE, SCALED: GREY, NOISE: MUSTARD, ORACLE: GREEN}
+FEWEST_TRIALS = 10  # complete ones, for importances to mean anything
+CROSS = {"color": GREY, "markersize": 4, "markeredgewidth": 0.8}
+
+# Of the picture of consistency.
+STATE_COLOURS = (BLUE, RUST, "#5a8f3c", "#7a5195", "#9aa5ad", "#c9a227")  # of states
+CHANNEL_COLOURS = ("#44aa99", "#cc6677", "#999933", "#882255", "#ddaa33", "#332288")
+PANEL = (4.0, 3.0)  # [inch]
+MOST_HANDLES = 5  # of a legend side by side
+MOST_VALUES = 3  # in the title of a panel
+LOGARITHMIC_FROM = 20  # times the right value
 
 
 def history_figure(
@@ -151,10 +159,6 @@ def draw_comparison(comparison: Comparison, title: str, filter_name: str = "ekf"
     figure.legend(handles, labels, loc="outside lower center", frameon=False, title=left_out or None)
     figure.suptitle(verbatim(title, most=TITLE), fontsize=11)
     return figure
-
-
-FEWEST_TRIALS = 10  # complete ones, for importances to mean anything
-CROSS = {"color": GREY, "markersize": 4, "markeredgewidth": 0.8}
 
 
 def importances(study: optuna.Study) -> dict[str, float]:
@@ -333,14 +337,6 @@ class Sketchbook:
         """A figure as a part of a page."""
         svg, readings = figure_svg(figure, next(self._names))
         return Picture(svg, caption, alt, readings)
-
-
-STATE_COLOURS = (BLUE, RUST, "#5a8f3c", "#7a5195", "#9aa5ad", "#c9a227")  # of states
-CHANNEL_COLOURS = ("#44aa99", "#cc6677", "#999933", "#882255", "#ddaa33", "#332288")
-PANEL = (4.0, 3.0)  # [inch]
-MOST_HANDLES = 5  # of a legend side by side
-MOST_VALUES = 3  # in the title of a panel
-LOGARITHMIC_FROM = 20  # times the right value
 
 
 def consistency_figure(path: str | Path, report: ConsistencyReport, title: str, *arguments, **options) -> Path:

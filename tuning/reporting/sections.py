@@ -67,6 +67,36 @@ from tuning.search.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan, range_warning, 
 from tuning.search.space import AUTO, Choice
 
 MANY_TRIALS = 50
+MOST_ROWS = 40  # of a table of variances
+ON_ENV = """from filters import EstimateState
+{problem}
+env = EstimateState(problem.make_env(), tuned={file!r})  # observations are estimates
+tuned = env.filter  # with its model, Q and R
+"""
+ON_LOG = """import tuning
+
+found = tuning.estimate("run.csv", tuned={file!r})  # of a log; the same as `thruster estimate`
+tuned = found.filter  # with its model, Q and R
+"""
+BY_HAND = """
+belief = tuned.init()
+for measurement, command in zip(measurements, inputs):  # arrays of your own, a row per step
+    belief, innovation = tuned.update(belief, measurement)
+    print(belief.mean, belief.cov)
+    belief = tuned.predict(belief, command)
+"""
+UNSAVED = "TUNED.json"  # a name to be replaced
+AXES = (
+    "Limits are those of the scored steps, the same in a row unless its panels say otherwise; RMSE and RMS "
+    "are over these steps."
+)
+READ = "Point at a figure to read values; drag sideways to zoom in, double-click to zoom out."
+NEES_NIS = (
+    "NEES, the normalised estimation error squared, relates the error to the filter's covariance: if the "
+    "covariance is right, its mean is the number of states. NIS, the normalised innovation squared, does the "
+    "same with the innovation: its mean is the number of channels. CRPS, the continuous ranked probability "
+    "score, is the error of a whole distribution, in the unit of the state."
+)
 
 
 def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen: Mapping | None = None) -> str:
@@ -199,9 +229,6 @@ def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) 
 
 
 # Sections of a report on the setup: the score, the model, assumed Q and R, and the facts of the study.
-
-
-MOST_ROWS = 40  # of a table of variances
 
 
 def score_section(subject: Subject) -> Section:
@@ -363,26 +390,6 @@ def _nis_words(nis: Sequence[float], plan: Plan) -> str:
 # Lines of a report to copy: Python, JSON and MATLAB that use the tuned filter.
 
 
-ON_ENV = """from filters import EstimateState
-{problem}
-env = EstimateState(problem.make_env(), tuned={file!r})  # observations are estimates
-tuned = env.filter  # with its model, Q and R
-"""
-ON_LOG = """import tuning
-
-found = tuning.estimate("run.csv", tuned={file!r})  # of a log; the same as `thruster estimate`
-tuned = found.filter  # with its model, Q and R
-"""
-BY_HAND = """
-belief = tuned.init()
-for measurement, command in zip(measurements, inputs):  # arrays of your own, a row per step
-    belief, innovation = tuned.update(belief, measurement)
-    print(belief.mean, belief.cov)
-    belief = tuned.predict(belief, command)
-"""
-UNSAVED = "TUNED.json"  # a name to be replaced
-
-
 def lines_section(choice: Choice, problem: Problem, file: str | None) -> Section:
     """Lines that use the tuned filter.
 
@@ -424,13 +431,6 @@ def _found_by(problem: Problem) -> str:
 
 
 # Sections of a report on one run over time: estimates, measurements, innovations, gain, consistency.
-
-
-AXES = (
-    "Limits are those of the scored steps, the same in a row unless its panels say otherwise; RMSE and RMS "
-    "are over these steps."
-)
-READ = "Point at a figure to read values; drag sideways to zoom in, double-click to zoom out."
 
 
 def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> list[Section]:
@@ -476,14 +476,6 @@ def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> 
         book.picture(drawn, f"Checks of the tuned filter's covariance on {runs}.", " ".join(remarks)),
     ]
     return [*sections, Section("Is the covariance consistent?", parts)]
-
-
-NEES_NIS = (
-    "NEES, the normalised estimation error squared, relates the error to the filter's covariance: if the "
-    "covariance is right, its mean is the number of states. NIS, the normalised innovation squared, does the "
-    "same with the innovation: its mean is the number of channels. CRPS, the continuous ranked probability "
-    "score, is the error of a whole distribution, in the unit of the state."
-)
 
 
 def _gain_section(book: Sketchbook, pair, data, dt, scored, where: str) -> Section:

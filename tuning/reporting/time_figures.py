@@ -22,13 +22,23 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data
 
-# Axes of panels over time: limits from the scored steps, so that a start-up does not flatten the rest.
-
-
 FAR = 20.0  # where one panel of a row reaches so many times as far as another each has its own limits
 WIDEST = 4.0  # times the largest error: how much of a band is shown
 ROOM = 0.08  # of what is shown, above and below
 NOTE = {"xycoords": "axes fraction", "fontsize": 8, "zorder": 5}
+MOST_PANELS = 6  # of states in one figure
+COLUMNS = 3  # of panels side by side
+LABEL_WIDTH = 18  # characters of a line beside a panel
+TWO_SIDED = 1.96
+WIDTH = 5.4  # of a filter [inch]
+TALL, LOW = 2.0, 1.3  # relative heights of panels of values and of errors ...
+UNIT, UNIT_OF_MANY = 8.0 / 6.6, 0.9  # ... in so many inches, for up to two states and for more
+HEIGHT = 1.5  # of a panel [inch]
+DASHES = ("-", "--", ":", "-.")
+STEP = 1e-6  # of a central difference, in standard deviations
+
+
+# Axes of panels over time: limits from the scored steps, so that a start-up does not flatten the rest.
 
 
 def limit_errors(
@@ -98,11 +108,6 @@ def _reach(values: np.ndarray, band: np.ndarray, start: int) -> float:
 # Which states have a panel in a figure, and how axes name them.
 
 
-MOST_PANELS = 6  # of states in one figure
-COLUMNS = 3  # of panels side by side
-LABEL_WIDTH = 18  # characters of a line beside a panel
-
-
 def plotted_states(
     states: Sequence[Quantity] | Sequence[str], scored: Collection[int] | None = None
 ) -> tuple[list[int], str]:
@@ -129,11 +134,6 @@ def axis_label(quantity: Quantity) -> str:
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-TWO_SIDED = 1.96
-WIDTH = 5.4  # of a filter [inch]
-TALL, LOW = 2.0, 1.3  # relative heights of panels of values and of errors ...
-UNIT, UNIT_OF_MANY = 8.0 / 6.6, 0.9  # ... in so many inches, for up to two states and for more
 
 
 class Run(NamedTuple):
@@ -318,10 +318,6 @@ def draw_band(axis, time: np.ndarray, low: np.ndarray, high: np.ndarray, colour:
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-HEIGHT = 1.5  # of a panel [inch]
-DASHES = ("-", "--", ":", "-.")
-STEP = 1e-6  # of a central difference, in standard deviations
 
 
 def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Figure:

@@ -44,7 +44,7 @@ from thruster_env.thruster.plant import (
 )
 from thruster_env.thruster.simulation import NEXT_REFERENCE, READINGS, Copies, simulate
 from thruster_env.thruster.task import Task
-from tuning.problems.check import average_bound
+from tuning.problems.bound import average_bound
 from tuning.problems.data import Data
 from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, Excitation, MultiSine
 from tuning.problems.find import find_in
