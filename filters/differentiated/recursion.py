@@ -7,6 +7,7 @@ run, so the grouping of runs has no effect.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from math import prod
@@ -176,7 +177,7 @@ __all__ = ["LIKELIHOOD", "LOG_SCORE", "SQUARES", "Recursion", "Wanted", "recursi
 class Recursion(NamedTuple):
     """A compiled recursion; see `runs` for its arguments."""
 
-    run: CompiledOrPython
+    run: Callable
     at_once: int  # runs
     length: int  # of the memory `rows`
     depth: int  # of `change`
@@ -218,8 +219,21 @@ def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page
         works[:0] = nothing, nothing
     if page.represent is None:
         works[2:2] = nothing, nothing
-    run = CompiledOrPython(_accumulator(memory, works, wanted, page, at_once, fingerprint))
+    accumulate = _accumulator(memory, works, wanted, page, at_once, fingerprint)
+    code = None if interpreting or at_once == 1 else _machine_code(accumulate)
+    run = CompiledOrPython(accumulate) if code is None else code
     return Recursion(run, at_once, length, memory.depth)
+
+
+def _machine_code(accumulate: Callable) -> Callable | None:
+    from thruster_env.graphs.loops import machine_code_of
+    from thruster_env.graphs.machine_code import function_of
+
+    dimensions = dict.fromkeys(inspect.signature(accumulate).parameters, 1)
+    dimensions |= {"turns": 0, "first": 0, "last": 0, "begins": 2, "moves": 2, "changes": 2}
+    dimensions |= dict.fromkeys(("inputs", "measurements", "truth", "out", "information", "outputs"), 3)
+    code = machine_code_of(accumulate, [(None,) * count if count else None for count in dimensions.values()])
+    return None if code is None else function_of(code)
 
 
 @inlined

@@ -171,7 +171,7 @@ def derivatives(
         numbers,
         _moves(slopes, own_slopes, model),
         moves_prior,
-        begun.counted_from.astype(np.int64),
+        begun.counted_from.astype(np.float64),
         density.seen,
         turns,
         out,

@@ -9,7 +9,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from filters.engine.belief import Kernels, memory_places, vector_like
-from filters.engine.compile import PREDICT, START, UPDATE, batch, build_operation, new_memory, vectors
+from filters.engine.compile import (
+    PREDICT,
+    START,
+    UPDATE,
+    batch,
+    build_operation,
+    memory_side_by_side,
+    new_memory,
+    vectors,
+)
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from thruster_env.core.checks import as_floats, covariance, short_repr
@@ -105,10 +114,13 @@ def _run_one_by_one(filter_: Filter, data: tuple, noise: tuple, out: Estimates) 
 
 
 def _run_side_by_side(filter_: Filter, data: tuple, noise: tuple, out: Estimates) -> None:
-    count, numbers, run_part = len(out.means), filter_.numbers, vectors(filter_.kernels())
+    count, numbers, kernels, (_, inputs, measurements) = len(out.means), filter_.numbers, filter_.kernels(), data
+    run_part = vectors(kernels)
 
     def part(first: int, last: int) -> None:
-        run_part(*data, numbers, noise, tuple(out), first * LANES, min(last * LANES, count))
+        memory = memory_side_by_side(kernels, inputs.shape[2])
+        of_part = inputs, measurements, numbers.copy(), noise, tuple(out), memory
+        run_part(*of_part, first * LANES, min(last * LANES, count))
 
     spread(part, -(-count // LANES))
 

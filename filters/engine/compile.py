@@ -2,29 +2,36 @@
 
 The memory of eight beliefs is interleaved: number i of belief j is `rows[group, 8 i + j]`. Each stage of a step
 runs over four such groups, whose instructions the processor overlaps.
+
+Filters whose stages are programs need no numba: `graphs.loops` translates the loops around the programs, and LLVM
+compiles both together. Everything else, numba compiles.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import inf
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from filters.engine.belief import LARGEST, Kernels, memory_places, restart_if_lost
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, is_interpreting, narrow
+from thruster_env.core.compiled import CompiledOrPython, direct, function_fingerprint, is_interpreting
 from thruster_env.core.streams import GROUP
 from thruster_env.model.shape import LANES, number_places, padded
+
+if TYPE_CHECKING:
+    from thruster_env.graphs.machine_code import Code
 
 GROUPS = 4  # which each stage runs one after the other, so that their instructions overlap
 
 
 def build_side_by_side(kernels: Kernels) -> Callable:
-    """Return `run(keys, inputs, measurements, numbers, noise, out, first, last)`.
+    """Return `run(inputs, measurements, numbers, noise, out, memory, first, last)`.
 
-    It filters runs first ... last - 1 by `kernels.vectors`. Copies of the last run fill up a group. For the
-    arguments see `batch`.
+    It filters runs first ... last - 1 by `kernels.vectors`. Copies of the last run fill up a group. The memory is
+    that of `memory_side_by_side`; for the other arguments see `batch`.
     """
     n, m, start = kernels.n, kernels.m, kernels.start
     begin, advance, finish, update = kernels.vectors
@@ -32,23 +39,20 @@ def build_side_by_side(kernels: Kernels) -> Callable:
     mean, cov, innovation, s = layout.mean, layout.cov, layout.innovation, layout.innovation_cov
     divergences, log_likelihood, substeps = layout.divergences, layout.log_likelihood, source.substeps
     q_place, r_place, checked = source.q, source.r, layout.gain
-    length, restart = layout.extras + kernels.extras + kernels.scratch, restart_if_lost(kernels)
+    length, restart = row_length(kernels), restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, begin, advance, finish, update, within=__name__)
 
-    @narrow
-    def run(keys, inputs, measurements, given_numbers, noise, out, first, last):
+    def run(inputs, measurements, numbers, noise, out, memory, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
         qs, rs = noise
         means, covs, innovations, innovation_covs, log_likelihoods, counts = out
-        numbers = given_numbers.copy()  # because the noise of each step is written into it
-        belief, memory = np.zeros(length), (np.zeros((0, 0)), np.zeros(0))
-        rows, zs = np.zeros((groups, length * width)), np.zeros((groups, m * width))
-        us = np.zeros((groups, inputs.shape[2] * width))
+        belief, rows, us, zs = memory
         for b in range(first, last, groups * width):
             count = min(groups * width, last - b)
             used = (count + width - 1) // width
-            belief[:] = 0.0
-            start((belief, *memory), numbers, 0)
+            for i in range(length):
+                belief[i] = 0.0
+            start((belief, None, None), numbers, 0)
             for g in range(used):
                 for i in range(length):
                     for j in range(width):
@@ -90,7 +94,7 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                         for j in range(width):
                             for i in range(length):
                                 belief[i] = rows[g, i * width + j]
-                            restart((belief, *memory), numbers, 0)
+                            restart((belief, None, None), numbers, 0)
                             for i in range(length):
                                 rows[g, i * width + j] = belief[i]
                 for j in range(count):
@@ -108,6 +112,13 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                 counts[b + j] = rows[j // width, divergences * width + j % width]
 
     return run
+
+
+def memory_side_by_side(kernels: Kernels, inputs: int) -> tuple[np.ndarray, ...]:
+    """One belief, and the memory, inputs and measurements of all groups, zeros."""
+    length, width = row_length(kernels), LANES
+    groups = (np.zeros((GROUPS, size * width)) for size in (length, inputs, kernels.m))
+    return np.zeros(length), *groups
 
 
 START, PREDICT, UPDATE = 1, 2, 4  # tasks of an operation; a sum is several
@@ -209,6 +220,20 @@ def operation(kernels: Kernels) -> CompiledOrPython:
     return _runner(build_operation, kernels, is_interpreting())
 
 
+def operation_on(kernels: Kernels, given: tuple) -> Callable[[int], int]:
+    """`operate(task)` on a session's memory: given = (*memory, size, values, numbers), which stay where they are.
+
+    Call this again after the first call: then numba has compiled it, and calls skip numba's dispatch.
+    """
+    if kernels.vectors and not is_interpreting():
+        code = _operation_code(kernels)
+        if code is not None:
+            from thruster_env.graphs.machine_code import builtin_of
+
+            return builtin_of(code, *given)
+    return partial(direct(operation(kernels), *given, PREDICT + UPDATE), *given)
+
+
 def batch(kernels: Kernels) -> CompiledOrPython:
     """`batch(*memory, size, keys, inputs, measurements, numbers, noise, out, first, last)` on trajectories.
 
@@ -218,9 +243,14 @@ def batch(kernels: Kernels) -> CompiledOrPython:
     return _runner(_build_batch, kernels, is_interpreting())
 
 
-def vectors(kernels: Kernels) -> CompiledOrPython:
-    """`batch` for kernels that have vectors, of eight trajectories at a time."""
-    return _runner(build_side_by_side, kernels, is_interpreting())
+def vectors(kernels: Kernels) -> Callable:
+    """`run` of `build_side_by_side`, for kernels that have vectors."""
+    code = None if is_interpreting() else _code_side_by_side(kernels)
+    if code is None:
+        return _runner(build_side_by_side, kernels, is_interpreting())
+    from thruster_env.graphs.machine_code import function_of
+
+    return function_of(code)
 
 
 @lru_cache(maxsize=128)
@@ -228,9 +258,33 @@ def _runner(build: Callable, kernels: Kernels, interpreting: bool) -> CompiledOr
     return CompiledOrPython(build(kernels))
 
 
+@lru_cache(maxsize=64)
+def _operation_code(kernels: Kernels) -> Code | None:
+    memory = (row_length(kernels),), (0, 0), (0,)
+    from thruster_env.graphs.loops import machine_code_of
+
+    return machine_code_of(build_operation(kernels), (*memory, None, (None,), (None,), None), as_builtin=True)
+
+
+@lru_cache(maxsize=64)
+def _code_side_by_side(kernels: Kernels) -> Code | None:
+    from thruster_env.graphs.loops import machine_code_of
+
+    n, m, length = kernels.n, kernels.m, row_length(kernels)
+    noise = [(None, 2 * n * n), (None, 2 * m * m)]
+    out = [(None, None, *part) for part in ((n,), (n, n), (m,), (m, m), ())] + [(None,)]
+    memory = [(length,), (GROUPS, length * LANES), (GROUPS, None), (GROUPS, m * LANES)]
+    data = (None, None, None), (None, None, m), (None,)
+    return machine_code_of(build_side_by_side(kernels), (*data, noise, out, memory, None, None))
+
+
+def row_length(kernels: Kernels) -> int:
+    """Length of the row of a belief."""
+    return memory_places(kernels.n, kernels.m).extras + kernels.extras + kernels.scratch
+
+
 def new_memory(kernels: Kernels, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Row, table and draws for one belief with `size` members, zeros."""
     width = padded(size, LANES)
-    length = memory_places(kernels.n, kernels.m).extras + kernels.extras + kernels.scratch
     draws = padded(kernels.draws_per_member * width, GROUP)
-    return np.zeros(length), np.zeros((kernels.table_rows, width)), np.zeros(draws)
+    return np.zeros(row_length(kernels)), np.zeros((kernels.table_rows, width)), np.zeros(draws)

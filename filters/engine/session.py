@@ -20,9 +20,8 @@ from filters.engine.belief import (
     own_place,
     vector_like,
 )
-from filters.engine.compile import PREDICT, REFUSED, START, UPDATE, new_memory, operation
+from filters.engine.compile import PREDICT, REFUSED, START, UPDATE, new_memory, operation_on
 from thruster_env.core.checks import covariance, finite, positive
-from thruster_env.core.compiled import direct
 from thruster_env.logs.log import sample_time_place
 from thruster_env.model.continuous import same_dt
 from thruster_env.model.shape import number_places, with_root
@@ -70,7 +69,6 @@ class Session:
         n, m = kernels.n, kernels.m
         layout = memory_places(n, m)
         self._name, self._kernels = filter_.name, kernels
-        self._operate: Callable = operation(kernels)
         self._numbers, self._size, self._places = filter_.numbers, size, layout
         self._kept_rows, self._noise_places = kernels.kept_rows, number_places(n, m)
         self._memory = new_memory(kernels, size)
@@ -86,6 +84,7 @@ class Session:
         self.source: tuple = ()  # the origin of the numbers, for sessions that are kept
         self.divergences = 0
         self._given = (*self._memory, size, values, self._numbers)
+        self._operate: Callable[[int], int] = operation_on(kernels, self._given)
         self.mean = self._row[layout.mean : layout.mean + n]
         self.cov = self._row[layout.cov : layout.cov + n * n].reshape(n, n)
         self.innovation = self._row[layout.innovation : layout.innovation + m]
@@ -109,11 +108,12 @@ class Session:
         self._call_directly()
 
     def _call_directly(self) -> None:
-        self._operate = direct(operation(self._kernels), *self._given, STEP)  # `step` has to be quick
-        self._is_direct = True
+        if not self._is_direct:
+            self._operate = operation_on(self._kernels, self._given)  # `step` has to be quick
+            self._is_direct = True
 
     def _do(self, task: int) -> None:
-        self.divergences = self._operate(*self._given, task)
+        self.divergences = self._operate(task)
 
     @property
     def numbers(self) -> np.ndarray:
@@ -249,7 +249,7 @@ class Session:
                 self._u[:], self._z[:] = u, z
         except (TypeError, ValueError, LookupError):  # `_set` checks only if this fails: a step has to be quick
             self._set(u, z)
-        divergences = self._operate(*self._given, STEP)
+        divergences = self._operate(STEP)
         if divergences == REFUSED:
             self._set(u, z)  # raises ValueError with the reason
         self.divergences = divergences
@@ -266,8 +266,7 @@ class Session:
             self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
         for _ in range(count):
             self._do(TASKS[operation])
-            if not self._is_direct:
-                self._call_directly()
+            self._call_directly()
 
     def load(self, belief: Belief) -> None:
         """Put a belief into the memory; ValueError if it does not fit the filter or is no belief."""
@@ -336,17 +335,17 @@ class GatedSession(Session):
     def step(self, u, z) -> None:
         """Predict with input u (p,), then update with the channels of z (m,) that are within the gate."""
         self._set(u, z)
-        self.divergences = self._operate(*self._given, PREDICT)
+        self.divergences = self._operate(PREDICT)
         for saved, part in zip(self._kept, self._memory, strict=True):
             saved[...] = part
-        self.divergences = self._operate(*self._given, UPDATE)
+        self.divergences = self._operate(UPDATE)
         far = np.abs(self.innovation) > self.gate * np.sqrt(self.innovation_cov.diagonal())
         if far.any():
             for saved, part in zip(self._kept, self._memory, strict=True):
                 part[...] = saved
             self._z[far] = np.nan
             self.rejected += far
-            self.divergences = self._operate(*self._given, UPDATE)
+            self.divergences = self._operate(UPDATE)
 
     def __getstate__(self) -> tuple:
         """The state of a session, the gate, and the counts."""

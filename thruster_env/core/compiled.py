@@ -212,10 +212,9 @@ _waiting: list[Callable[[], Callable | None]] = []
 _marked: weakref.WeakSet[Callable] = weakref.WeakSet()
 _called: weakref.WeakSet[Callable] = weakref.WeakSet()  # of these, functions that are called and not inlined
 _apart: weakref.WeakSet[Callable] = weakref.WeakSet()  # of these, functions of which there is one copy
-_narrow: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions whose vectors are as wide as LLVM prefers
 _asked: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that `compiled` has been given
 _instead: weakref.WeakKeyDictionary[Callable, Callable[[], Instead]] = weakref.WeakKeyDictionary()
-_lessons: list[Callable[[], None]] = [lambda: optimise_once(Which(_asked, _marked, _called, _apart, _narrow))]
+_lessons: list[Callable[[], None]] = [lambda: optimise_once(Which(_asked, _marked, _called, _apart))]
 _untaught: weakref.WeakKeyDictionary[Callable, Callable[[Callable], None]] = weakref.WeakKeyDictionary()
 _taught: weakref.WeakSet[Callable] = weakref.WeakSet()  # those of `_instead` that numba knows
 _interpreting = os.environ.get("NUMBA_DISABLE_JIT", "").strip() not in ("", "0")
@@ -248,12 +247,6 @@ def not_inlined(function: Callable) -> Callable:
     """
     _apart.add(function)
     return inlined(function, into_callers=False)
-
-
-def narrow(function: Callable) -> Callable:
-    """Mark a function whose loops keep the vectors that LLVM prefers: wide ones were measured to take longer."""
-    _narrow.add(function)
-    return function
 
 
 def overloaded(function: Callable, teach: Callable[[Callable], None] | None = None) -> Callable:

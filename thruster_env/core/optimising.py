@@ -26,7 +26,6 @@ class Which(NamedTuple):
     marked: Container[Callable | None]  # those that become part of these
     called: Container[Callable | None]  # of those, the ones to leave as they are
     apart: Container[Callable | None]  # of these, the ones that never become part of a caller
-    narrow: Container[Callable | None]  # those whose vectors are as wide as LLVM prefers
 
 
 def optimise_once(which: Which) -> None:
@@ -99,7 +98,7 @@ def _widen_vectors(library: Any, compiling, which: Which) -> None:
     def add_widened(self, module):
         function = compiling.function_of(self)
         ours = function is compiling.outermost or function in which.marked
-        if function is not None and ours and function not in which.narrow:
+        if function is not None and ours:
             for part in module.functions:
                 if not part.is_declaration:
                     set.add(part.attributes, WIDE)  # its own `add` knows attributes without a value only

@@ -16,9 +16,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import cgutils, types, typing
-from numba.extending import lower_builtin, type_callable
-from numba.np.arrayobj import populate_array
 
 from thruster_env.core.compiled import FASTMATH
 from thruster_env.core.streams import ROUNDER, ROUNDER_BITS
@@ -48,6 +45,8 @@ DOUBLE, LONG = ir.DoubleType(), ir.IntType(64)
 
 def teach(work: Callable, program: Program, width: int, names: Sequence[str]) -> None:
     """Have numba put the instructions of a program in the place of a call of `work`."""
+    from numba.core import types
+    from numba.extending import lower_builtin, type_callable
 
     @type_callable(work)
     def of_arrays(context):
@@ -189,6 +188,11 @@ class Writer:
 
     def _worked_out_by(self, name: str, count: int, values: list[ir.Value]) -> list[ir.Value]:
         """The results of a function of two arrays, run after run."""
+        from numba.core import cgutils, types, typing
+        from numba.np.arrayobj import populate_array
+
+        if self._context is None:
+            raise TypeError(f"numba compiles {name}")
         builder, context, kind = self._builder, self._context, types.Array(types.float64, 1, "C")
         arrays = []
         for length in (len(values), count):
@@ -233,6 +237,8 @@ INT = ir.IntType(32)
 
 def teach_loops(work: Callable, program: Program, width: int, scratch: int) -> None:
     """Have numba put the instructions of a program with loops in the place of a call of `work`."""
+    from numba.core import types
+    from numba.extending import lower_builtin, type_callable
 
     @type_callable(work)
     def of_arrays(context):

@@ -163,7 +163,9 @@ def callable_of(program: Program, width: int, arrays: Sequence[str] = ARRAYS, sc
     # What the cache of machine code sees is the digest alone; the text lives as long as the function.
     names: dict = {"run": _run, "__name__": __name__, "text": _TEXTS.setdefault(digest, Text(lines))}
     exec(f"def work({arguments}):\n    run('{digest}', {width}, {arguments})\n", names)
-    return overloaded(names["work"], lambda work: _teach(work, program, width, arrays, scratch))
+    work = names["work"]
+    work.program = program, width, arrays, scratch  # of which `loops` makes instructions
+    return overloaded(work, lambda work: _teach(work, program, width, arrays, scratch))
 
 
 class Text:

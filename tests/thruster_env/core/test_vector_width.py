@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import pytest
 
-from thruster_env.core.compiled import compiled, inlined, narrow
+from thruster_env.core.compiled import compiled, inlined
 
 ROOT = Path(__file__).parents[3]
 WIDE = '"prefer-vector-width"="512"'
@@ -22,15 +22,11 @@ def add_squares(out, values):
 ON_INTEL = """\
 import sys
 sys.path.insert(0, sys.argv[1])
-from thruster_env.core.compiled import compiled, narrow
+import numba
+from thruster_env.core.compiled import compiled
 from loop import add_squares
 
-def narrow_squares(out, values):
-    for i in range(values.shape[0]):
-        out[i] += values[i] * values[i]
-
-for function in (add_squares, narrow(narrow_squares)):
-    code = compiled(function)
+for code in (compiled(add_squares), numba.njit(add_squares)):
     code.compile("void(f8[::1], f8[::1])")
     print("%zmm" in code.inspect_asm(code.signatures[0]))
 """
@@ -42,12 +38,8 @@ def add_squares(out, values):
         out[i] += values[i] * values[i]
 
 
-def narrowed(function):
-    return compiled(narrow(function))
-
-
-@pytest.mark.parametrize(("wrap", "wide"), [(compiled, True), (narrowed, False), (numba.njit, False)])
-def test_functions_of_ours_are_wide_unless_marked(tmp_path, wrap, wide):
+@pytest.mark.parametrize(("wrap", "wide"), [(compiled, True), (numba.njit, False)])
+def test_functions_of_ours_are_wide(tmp_path, wrap, wide):
     path = tmp_path / "outermost.py"  # no cache has seen it
     path.write_text("def outermost(out, values):\n    add_squares(out, values)\n    return out.sum()\n")
     names = {"__name__": __name__, "add_squares": add_squares}

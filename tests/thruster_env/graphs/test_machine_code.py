@@ -1,0 +1,188 @@
+"""Loops around programs as machine code: the same numbers as Python, without numba."""
+
+import gc
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from llvmlite import ir
+
+from thruster_env.core.sources import vector_reader, vector_writer
+from thruster_env.graphs import machine_code
+from thruster_env.graphs.graphs import Graph
+from thruster_env.graphs.loops import Untranslated, add_function
+from thruster_env.graphs.machine_code import add_builtin, builtin_of, code_of, function_of
+from thruster_env.graphs.programs import OF_STEPS, Place, callable_of, program_of
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """A folder of machine code for each test."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    return tmp_path / machine_code.FOLDER
+
+
+def machine(function, *shapes):
+    module = ir.Module()
+    add_function(module, "run", function, shapes)
+    return function_of(code_of(module, "run"))
+
+
+def squares_program(width=1):
+    """rows[0] = rows[0]^2 - given[0] numbers[1]."""
+    graph = Graph(100)
+    x, u, c = (graph.given(Place(array, at)) for array, at in (("rows", 0), ("given", 0), ("numbers", 1)))
+    return callable_of(program_of([(Place("rows", 0), x * x - u * c)], {}), width, OF_STEPS)
+
+
+def weighted(x, y, count):
+    total, least, double = 0.0, 0.0, 2 * count
+    for i in range(x.shape[0]):
+        for j in range(0, x.shape[1], 2):
+            value = x[i, j]
+            total += abs(value) * y[j] if value < 0.0 else value
+            least = value if value < least else least
+        x[i, 1] -= float_of(i // 2 % 3)
+    for k in range(count - 1, 0, -1):
+        y[k] = -y[k - 1]
+    y[0] = total / double
+    y[1] = least
+    if not total < 3.0 or count == 2 and least != 0.0:
+        y[2] = 7.0
+    else:
+        y[2] = int(total)
+    return min(count, 4)
+
+
+def float_of(whole):
+    return 0.5 * whole
+
+
+def test_loops_are_those_of_python():
+    rng = np.random.default_rng(0)
+    for count in (2, 3, 5):
+        x, y = rng.normal(size=(4, 5)), rng.normal(size=5)
+        expected = x.copy(), y.copy()
+        result = weighted(*expected, count)
+        assert machine(weighted, (None, 5), (None,), None)(x, y, count) == result
+        np.testing.assert_allclose(x, expected[0], rtol=1e-15)
+        np.testing.assert_allclose(y, expected[1], rtol=1e-14)
+
+
+def test_tuples_parts_of_arrays_and_early_returns():
+    read, store = vector_reader(2, 1), vector_writer(2)
+
+    def first_negative(pair, values):
+        row, _ = pair
+        store(row[0], read(values[1:]))
+        for i in range(values.shape[0]):
+            if values[i] < 0.0:
+                return i
+        return -1
+
+    run, row, values = machine(first_negative, [(1, 2), (None,)], (None,)), np.zeros((1, 2)), np.arange(4.0)
+    assert run((row, row[0]), values) == -1 and row.tolist() == [[2.0, 3.0]]
+    values[2] = -5.0
+    assert run((row, row[0]), values) == 2 and row.tolist() == [[-5.0, 3.0]]
+
+
+@pytest.mark.parametrize("width", [1, 8])
+def test_programs_are_called_side_by_side(width):
+    program = squares_program(width)
+
+    def twice(rows, given, numbers):
+        for g in range(rows.shape[0]):
+            program(rows[g], given[g], numbers)
+
+    rng = np.random.default_rng(1)
+    rows, given, numbers = rng.normal(size=(3, width)), rng.normal(size=(3, width)), rng.normal(size=2)
+    expected = rows**2 - given * numbers[1]
+    machine(twice, (None, width), (None, width), (None,))(rows, given, numbers)
+    np.testing.assert_allclose(rows, expected, rtol=1e-14)
+
+
+def looked_up(x):
+    while x[0] < 1.0:
+        x[0] += 1.0
+
+
+def printed(x):
+    print(x)
+
+
+def named(x):
+    return float_of(whole=x.shape[0])
+
+
+@pytest.mark.parametrize("function", [looked_up, printed, named])
+def test_what_cannot_be_translated_is_refused(function):
+    with pytest.raises(Untranslated):
+        add_function(ir.Module(), "run", function, [(None,)])
+
+
+def count_up(x, by):
+    x[0] += by
+    return x.shape[0] + by
+
+
+def builtin(x):
+    module = ir.Module()
+    function, count = add_function(module, "run", count_up, [(None,), None])
+    add_builtin(module, "call", function, count - 1)
+    return builtin_of(code_of(module, "call"), x)
+
+
+def test_a_builtin_works_on_its_arrays_and_keeps_its_code():
+    x = np.zeros(3)
+    call = builtin(x)
+    gc.collect()
+    assert call(2) == 5 and call(-1) == 2 and x[0] == 1.0
+
+
+@pytest.mark.parametrize("x", [np.zeros(3, dtype=int), np.zeros((3, 2))[:, 0], np.zeros(3, dtype=np.float32)])
+def test_other_arrays_are_refused(x):
+    with pytest.raises(TypeError, match="arrays must be of float64 in C order, but got"):
+        builtin(x)
+
+
+def test_code_is_freed_with_its_last_user():
+    machine_code._loaded.clear()
+    call = builtin(np.zeros(3))
+    assert len(machine_code._loaded) == 1
+    del call
+    gc.collect()
+    assert not machine_code._loaded
+
+
+def test_object_code_is_kept_and_damage_is_noticed(folder, monkeypatch):
+    machine_code._loaded.clear()
+    assert builtin(np.zeros(2))(1) == 3
+    (file,) = folder.iterdir()
+    content = file.read_bytes()
+    for damaged in (content[:-1], b"", content[:40] + b"x" + content[41:]):
+        gc.collect()
+        machine_code._loaded.clear()
+        file.write_bytes(damaged)
+        assert builtin(np.zeros(2))(1) == 3 and file.read_bytes() == content
+    machine_code._loaded.clear()
+    monkeypatch.setattr(machine_code, "_compiled", None)
+    assert builtin(np.zeros(2))(1) == 3
+
+
+FIRST_USE = """
+import sys
+import numpy as np
+from filters import affine_model, make_filter, run
+model = affine_model(a=0.9 * np.eye(2), b=np.ones((2, 1)), c=np.eye(1, 2), process_noise_cov=[0.1, 0.1],
+                     measurement_noise_cov=[0.5], prior_mean=[0.0, 0.0], prior_cov=[1.0, 1.0])
+filter_ = make_filter("ekf", model)
+run(filter_, inputs=np.zeros((9, 3, 1)), measurements=np.ones((9, 4, 1)))
+filter_.update(filter_.predict(filter_.init(), [0.0]), [1.0])
+print([name for name in ("numba", "scipy", "gymnasium") if name in sys.modules])
+"""
+
+
+def test_a_filter_of_a_page_needs_no_numba():
+    result = subprocess.run([sys.executable, "-c", FIRST_USE], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

@@ -1,0 +1,227 @@
+"""Modules of LLVM as machine code in memory, without numba.
+
+A module is compiled for this processor once. Its object code is kept in a folder of the user's under a digest of
+its text, of LLVM's version and of the processor, so if a source changes, only programs that changed with it are
+compiled. The code is freed with the last object that holds its `Code`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import itertools
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+from weakref import WeakValueDictionary
+
+import llvmlite  # type: ignore[import-untyped]
+import numpy as np
+from llvmlite import binding as llvm
+from llvmlite import ir
+
+from thruster_env.core.compiled import private_folder
+
+FOLDER = "thruster-env-code"  # within the folder of numba's cache or of the user's
+PASSES, SELECTION = 1, 2  # levels of LLVM's optimisation: of the module, and of its translation
+DIGEST = hashlib.sha256().digest_size
+LONG, POINTER = ir.IntType(64), ir.IntType(8).as_pointer()
+METH_O = 0x0008  # of Python's C interface: a function of one argument
+OF_PYTHON = {  # functions of Python's C interface that code calls: the result and the arguments
+    "PyLong_AsVoidPtr": (POINTER, POINTER),
+    "PyLong_AsLongLong": (LONG, POINTER),
+    "PyLong_FromLongLong": (POINTER, LONG),
+    "PyEval_SaveThread": (POINTER,),
+    "PyEval_RestoreThread": (ir.VoidType(), POINTER),
+}
+
+_compiling = threading.RLock()
+_number = itertools.count()
+_loaded: WeakValueDictionary[str, Code] = WeakValueDictionary()
+
+
+class Code:
+    """Machine code in memory, for as long as this object lives.
+
+    Attributes:
+        kilobytes: size of the object code.
+    """
+
+    def __init__(self, object_code: bytes, name: str):
+        builder = llvm.JITLibraryBuilder().add_object_img(object_code).add_current_process().export_symbol(name)
+        for symbol in OF_PYTHON:
+            builder.import_symbol(symbol, ctypes.cast(getattr(ctypes.pythonapi, symbol), ctypes.c_void_p).value)
+        self._library = builder.link(_linker(), f"code {next(_number)}")
+        self.address, self.kilobytes = self._library[name], len(object_code) / 1024
+
+
+def code_of(module: ir.Module, name: str) -> Code:
+    """Compile a module, or load its object code, unless it is in memory; `name` is the function to be called."""
+    text = str(module)
+    digest = hashlib.sha256(f"{_host()}\n{name}\n{text}".encode()).hexdigest()
+    with _compiling:
+        code = _loaded.get(digest)
+        if code is None:
+            code = _loaded[digest] = Code(_kept(digest) or _keep(digest, _compiled(text)), name)
+    return code
+
+
+@cache
+def _machine() -> Any:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    features = llvm.get_host_cpu_features().flatten()
+    target = llvm.Target.from_default_triple()
+    return target.create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=features, opt=SELECTION, reloc="pic", codemodel="small", jit=True
+    )
+
+
+@cache
+def _linker() -> Any:
+    return llvm.create_lljit_compiler(_machine(), use_jit_link=sys.platform == "darwin")
+
+
+@cache
+def _host() -> str:
+    """What object code depends on beside the text."""
+    version = ".".join(map(str, llvm.llvm_version_info))
+    processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    return f"{llvmlite.__version__} {version} {llvm.get_process_triple()} {processor} {PASSES} {SELECTION}"
+
+
+def _compiled(text: str) -> bytes:
+    context = llvm.create_context()  # of its own, so that all of it can be freed
+    module = llvm.parse_assembly(text, context)
+    try:
+        machine = _machine()
+        module.data_layout, module.triple = str(machine.target_data), machine.triple
+        passes = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(PASSES))
+        passes.getModulePassManager().run(module, passes)
+        return machine.emit_object(module)
+    finally:
+        module.close()
+        context.close()
+
+
+@cache
+def _folder(told: str) -> Path | None:
+    """Where object code is kept: in numba's folder if one is set, else in the user's cache; None if nowhere."""
+    home = {"win32": "~/AppData/Local", "darwin": "~/Library/Caches"}.get(sys.platform, "~/.cache")
+    cached = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME") or home
+    for root in (told or cached, private_folder()):
+        if root is not None:
+            folder = Path(root).expanduser() / FOLDER
+            try:
+                folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            except OSError:
+                continue
+            if os.access(folder, os.W_OK):
+                return folder
+    return None
+
+
+def _file(digest: str) -> Path | None:
+    folder = _folder(os.environ.get("NUMBA_CACHE_DIR", ""))
+    return None if folder is None else folder / f"{digest}.o"
+
+
+def _kept(digest: str) -> bytes | None:
+    """Object code from an earlier process; None if there is none, or it is damaged."""
+    file = _file(digest)
+    try:
+        content = b"" if file is None else file.read_bytes()
+    except OSError:
+        return None
+    known, object_code = content[:DIGEST], content[DIGEST:]
+    return object_code if known == hashlib.sha256(object_code).digest() and object_code else None
+
+
+def _keep(digest: str, object_code: bytes) -> bytes:
+    """Keep object code for later processes, if the disk takes it; return it."""
+    file = _file(digest)
+    if file is not None:
+        aside = file.with_suffix(f".{os.getpid()}")
+        try:
+            aside.write_bytes(hashlib.sha256(object_code).digest() + object_code)
+            os.replace(aside, file)
+        except OSError:
+            aside.unlink(missing_ok=True)
+    return object_code
+
+
+# Calls from Python. What a function works on are whole numbers and addresses, in an array of words.
+
+
+class _MethodDefinition(ctypes.Structure):
+    _fields_ = [
+        ("name", ctypes.c_char_p),
+        ("function", ctypes.c_void_p),
+        ("flags", ctypes.c_int),
+        ("doc", ctypes.c_char_p),
+    ]
+
+
+def function_of(code: Code) -> Callable[..., int]:
+    """Return `call(*arguments)` of a function i64 (words), which releases the interpreter lock.
+
+    Its arguments are arrays of float64 in C order, and whole numbers.
+    """
+    run = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(code.address)
+
+    def call(*arguments) -> int:
+        words = np.array(words_of(arguments), dtype=np.int64)
+        result = run(words.ctypes.data)
+        return result if code else 0  # so that the code lives as long as the function
+
+    return call
+
+
+def builtin_of(code: Code, *arguments) -> Callable[[int], int]:
+    """Return `call(last)` of a function ptr (words, last), as `add_builtin` writes it; a call costs some 70 ns.
+
+    The arrays stay where they are, and live as long as `call`.
+    """
+    words = np.array([*words_of(arguments), 0], dtype=np.int64)
+    definition = _MethodDefinition(b"call", code.address, METH_O, None)
+    new = ctypes.pythonapi.PyCFunction_NewEx
+    new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.py_object, ctypes.py_object]
+    return new(ctypes.addressof(definition), words.ctypes.data, (code, words, arguments, definition))
+
+
+def words_of(arguments: Iterable) -> list[int]:
+    """Whole numbers, and of each array its address and its lengths; tuples have those of their parts.
+
+    Raises TypeError for an array that is not of float64 in C order.
+    """
+    words: list[int] = []
+    for argument in arguments:
+        if isinstance(argument, np.ndarray):
+            if argument.dtype != np.float64 or not argument.flags.c_contiguous:
+                raise TypeError(f"arrays must be of float64 in C order, but got {argument.dtype}")
+            words += argument.ctypes.data, *argument.shape
+        else:
+            words += words_of(argument) if isinstance(argument, tuple) else [argument]
+    return words
+
+
+def add_builtin(module: ir.Module, name: str, function: ir.Function, last: int) -> None:
+    """Add a builtin function of Python: i64 function(words) with its argument as word number `last`."""
+    declared = {
+        symbol: ir.Function(module, ir.FunctionType(kinds[0], kinds[1:]), symbol)
+        for symbol, kinds in OF_PYTHON.items()
+    }
+    builtin = ir.Function(module, ir.FunctionType(POINTER, [POINTER, POINTER]), name)
+    builder = ir.IRBuilder(builtin.append_basic_block())
+    words, argument = builtin.args
+    words = builder.bitcast(builder.call(declared["PyLong_AsVoidPtr"], [words]), LONG.as_pointer())
+    value = builder.call(declared["PyLong_AsLongLong"], [argument])
+    builder.store(value, builder.gep(words, [ir.Constant(LONG, last)], source_etype=LONG))
+    thread = builder.call(declared["PyEval_SaveThread"], [])
+    result = builder.call(function, [words])
+    builder.call(declared["PyEval_RestoreThread"], [thread])
+    builder.ret(builder.call(declared["PyLong_FromLongLong"], [result]))
