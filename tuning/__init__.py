@@ -6,6 +6,7 @@
     estimate    a filter or a smoother over a recorded log
     identify    a model's parameters from recorded runs, and which of them the runs determine
     explore     a page on which one tunes by hand, and sees at once what comes of it
+    find_problem   a problem by name, of another thruster, or with constants to estimate
     read_logs   recorded runs, with all that one has to know to read them
     report      a page on a tuned filter that any browser shows
 
@@ -27,18 +28,22 @@ if TYPE_CHECKING:
     from tuning.api.evaluate import evaluate
     from tuning.api.explore import explore
     from tuning.api.identify import identify
+    from tuning.api.problems import find_problem
     from tuning.api.read_logs import read_logs
     from tuning.api.report import report
-    from tuning.api.study import tune
+    from tuning.api.study import SearchSpace, tune
     from tuning.api.train_estimator import train_estimator
 
 warnings.filterwarnings("ignore", message="IProgress not found")  # tqdm's in notebooks: Optuna imports it, unused
 
+HOMES = {"tune": "study", "SearchSpace": "study", "find_problem": "problems"}  # files of those with another name
 __all__ = [
+    "SearchSpace",
     "compare",
     "estimate",
     "evaluate",
     "explore",
+    "find_problem",
     "identify",
     "read_logs",
     "report",
@@ -50,7 +55,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """A function, whose module is imported when it is asked for: `import tuning` alone is light."""
     if name in __all__:
-        return getattr(import_module(f"tuning.api.{'study' if name == 'tune' else name}"), name)
+        return getattr(import_module(f"tuning.api.{HOMES.get(name, name)}"), name)
     raise AttributeError(f"module 'tuning' has no attribute {name!r}")
 
 

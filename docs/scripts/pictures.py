@@ -19,8 +19,7 @@ from filters import EstimateState
 from filters.engine.batch import run
 from thruster_env.core.files import BLUE, DARK, RUST, save_figure, write_whole
 from tuning.api.run import Tuning
-from tuning.cli.demo import FILTER, SCENARIO, before_and_after
-from tuning.cli.tune import tune
+from tuning.cli.demo import FILTER, SCENARIO, before_and_after, tune
 from tuning.exploring.bench import Bench
 from tuning.exploring.page.session import Server, page_of
 from tuning.problems.find import find_problem
@@ -38,7 +37,7 @@ def demo() -> Tuning:
     """The study of `make demo`."""
     folder = Path(tempfile.mkdtemp())
     plan = Plan(FILTER, (find_problem(SCENARIO),), seed=0)
-    return tune(plan, 50, f"{folder}/studies.journal", out=folder / "tuned.json")
+    return tune(plan, 50, f"{folder}/studies.journal", folder / "tuned.json")
 
 
 def tuned(path: Path) -> Path:

@@ -69,7 +69,7 @@ def test_recorded_runs_are_the_same_in_any_form(logs, tmp_path):
         write_log(path, log)
     wanted = problem_of((cart(), logs)).data(range(4))
     for data in (columns, frames, indexed, dated, paths, list(map(str, paths))):
-        found = problem_of((cart, data), lead=20)
+        found = problem_of(tuning.read_logs(data, model=cart, lead=20))
         assert isinstance(found, LogProblem) and len(found.logs) == 2
         got = problem_of((cart(), data)).data(range(4))
         np.testing.assert_allclose(got.measurements, wanted.measurements, rtol=1e-12)
@@ -77,13 +77,14 @@ def test_recorded_runs_are_the_same_in_any_form(logs, tmp_path):
     assert [log.name for log in problem_of((cart(), columns)).logs] == ["run1", "run2"]
     assert [log.name for log in problem_of((cart(), logs)).logs] == ["log 0", "log 1"]
     assert (
-        problem_of((cart(), frames), held_out="run2").parts.held_out != problem_of((cart(), frames)).parts.held_out
+        problem_of(tuning.read_logs(frames, model=cart(), held_out="run2")).parts.held_out
+        != problem_of((cart(), frames)).parts.held_out
     )
 
 
 def test_tuning_on_a_model_and_frames_finds_a_filter(logs):
     frames = [pandas.DataFrame(table_of(log)) for log in logs]
-    study = tuning.tune((cart(), frames), "kf", trials=3, lead=20, progress=False)
+    study = tuning.tune(tuning.read_logs(frames, model=cart(), lead=20), "kf", trials=3, progress=False)
     assert study.tuning.plan.objectives == ("likelihood",) and "log-likelihood" in repr(study)
     assert study.problem.name == "run1 and 1 more" and study.filter.name == "kf"
     estimates = tuning.estimate((cart(), frames[0]), study)
@@ -120,8 +121,7 @@ def test_problems_by_name_and_themselves():
 WRONG = [
     (lambda: problem_of(3), "a problem must be a name, .* of a model and recorded runs, but got 3"),
     (lambda: problems_of([]), "or a list of them, but got an empty list"),
-    (lambda: problem_of("nominal", dt=0.1), r"dt must come with a pair \(model, data\), but got 'nominal'"),
-    (lambda: problem_of(("tunnel", "x.csv"), preset="t200"), "must come without another, but got 't200'"),
+    (lambda: problem_of(("tunnel", "x.csv"), preset="t200"), "preset must be given to read_logs, but got 't200'"),
     (lambda: problem_of((cart(), 5)), "a log must be the path of a file, a pandas.DataFrame, .* but got 5"),
     (lambda: problem_of((cart(), [])), "a problem of logs must have at least one"),
     (lambda: problem_of((cart(), {"a": np.zeros(3)})), "a log must have a column for the input"),
@@ -129,7 +129,7 @@ WRONG = [
     (lambda: problem_of((5, {"F": np.zeros(3)})), "the model of a log must be a StateSpaceModel, .* but got 5"),
     (lambda: problem_of((cart(), "none.csv")), "none.csv is not"),
     (
-        lambda: problem_of((cart(), {"z": np.zeros(9)}), columns=5),
+        lambda: problem_of(tuning.read_logs({"z": np.zeros(9)}, model=cart(), columns=5)),
         r"columns \(--column\) must be a mapping by name, .* but got 5",
     ),
 ]
@@ -145,7 +145,7 @@ def test_two_logs_of_one_name_are_told_apart(logs):
     with pytest.raises(ValueError, match="logs must have different names, but got two called log 0"):
         problem_of((cart(), [logs[0], logs[1].named("log 0")]))
     with pytest.raises(ValueError, match="dt must come with a file or a table, but log 0 is a Log already"):
-        problem_of((cart(), logs), dt=0.2)
+        problem_of(tuning.read_logs(logs, model=cart(), dt=0.2))
 
 
 def test_a_table_is_read_as_a_file_is(logs, tmp_path):

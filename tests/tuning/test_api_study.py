@@ -18,10 +18,10 @@ from filters import EstimateState
 from filters.c.project import c_filter
 from filters.monitoring import Monitor
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from tuning.cli.tuning_report import as_json as tuning_as_json
-from tuning.cli.tuning_report import report
 from tuning.problems.find import find_problem
 from tuning.reporting.sections import lines_section
+from tuning.reporting.tuning_report import as_json as tuning_as_json
+from tuning.reporting.tuning_report import report
 
 TRIALS = 5
 SHORT = find_problem("nominal").replace(steps=70, name="short")  # quick to tune on
@@ -239,11 +239,11 @@ def test_progress_is_silent_where_nobody_looks(capsys):
 
 
 def test_importing_tuning_is_light_and_says_what_there_is():
-    code = (
-        "import sys, tuning; print([n for n in ('numpy', 'optuna', 'rich') if n in sys.modules], dir(tuning)[-8:])"
-    )
+    heavy = "[n for n in ('numpy', 'optuna', 'rich') if n in sys.modules]"
+    code = f"import sys, tuning; print({heavy}, dir(tuning)[-10:])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    names = ["compare", "estimate", "evaluate", "explore", "identify", "report", "train_estimator", "tune"]
+    names = ["compare", "estimate", "evaluate", "explore", "find_problem", "identify"]
+    names += ["read_logs", "report", "train_estimator", "tune"]
     assert done.stdout.strip() == f"[] {names}"
     with pytest.raises(AttributeError, match="module 'tuning' has no attribute 'tunes'"):
         tuning.tunes  # noqa: B018

@@ -24,7 +24,9 @@ quiet = {"progress": False}
 
 @pytest.fixture(scope="module")
 def study():
-    return tuning.tune("ambient", trials=4, augment={"ambient_velocity": (0.4, 0.01)}, **quiet)
+    return tuning.tune(
+        tuning.find_problem("ambient", augment={"ambient_velocity": (0.4, 0.01)}), trials=4, **quiet
+    )
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ from filters import make_filter
 from filters.consistency.nees import blow_up_sentence, root_mean_square
 from filters.consistency.report import sentences
 from thruster_env.model.affine import affine_model
-from tuning.cli.tuning_report import as_json, report
 from tuning.evaluation.evaluate import check_consistency
 from tuning.problems.model_problem import RunsProblem
+from tuning.reporting.tuning_report import as_json, report
 
 
 def model(factor, r=1e9):

@@ -125,7 +125,9 @@ def test_the_command_follows_a_method(as_json, thruster):  # noqa: F811
 
 @pytest.mark.slow
 def test_gradients_of_full_matrices_begin_at_noise_estimation():
-    study = tuning.tune("deadband", "ekf", method="log-score", full_q=True, trials=6, progress=False)
+    study = tuning.tune(
+        "deadband", "ekf", method="log-score", space=tuning.SearchSpace(full_q=True), trials=6, progress=False
+    )
     ratios = study.held_out.ratios
     assert ratios["noise estimation"].high < 0.85 and ratios["scaled default"].high < 0.5
     assert study.held_out.evaluation.nees.value == pytest.approx(2.0, rel=0.1)

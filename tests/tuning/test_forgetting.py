@@ -13,7 +13,6 @@ from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.text_tables import plain_text
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.cli.tuning_report import as_json, report, way_out
 from tuning.evaluation.baselines import baselines, rule_of_thumb, same_filter
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.tuned import read_tuned
@@ -24,6 +23,7 @@ from tuning.problems.model_problem import ModelProblem, log_of
 from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.leaderboard import report as leaderboard_report
 from tuning.reporting.subject import _plan
+from tuning.reporting.tuning_report import as_json, report, way_out
 from tuning.search.forgetting import forgetting, time_constants_on, with_oracle_and_advice
 from tuning.search.measures import measured, over
 from tuning.search.plan import Plan
@@ -65,7 +65,10 @@ def problem():
 @pytest.fixture(scope="module")
 def studies(problem):
     """A study as it was asked for, and one that must forget."""
-    return [tuning.tune(problem, "kf", trials=8, forget=one, progress=False) for one in (None, FORGET)]
+    return [
+        tuning.tune(problem, "kf", trials=8, space=tuning.SearchSpace(forget=one), progress=False)
+        for one in (None, FORGET)
+    ]
 
 
 def after_a_push(filter_, steps=60):
@@ -232,7 +235,9 @@ def test_the_numbers_on_validation_seeds_are_those_of_the_filter_that_is_handed_
 
 @pytest.mark.parametrize("options", [{"method": name} for name in ("likelihood", "gradient", "noise-estimation")])
 def test_it_holds_on_other_methods_of_tuning(options, problem):
-    found = tuning.tune(problem, "kf", trials=2, forget=FORGET, progress=False, **options)
+    found = tuning.tune(
+        problem, "kf", trials=2, space=tuning.SearchSpace(forget=FORGET), progress=False, **options
+    )
     assert DT * found.held_out.evaluation.time_constants.steps[0] <= FORGET
 
 

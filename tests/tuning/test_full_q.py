@@ -10,7 +10,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
 from filters.tuned_file import read_tuned_file, sealed
-from tuning.cli.tune import tune
+from tuning.cli.demo import tune
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, verify, write_tuned
 from tuning.reporting.terminal import choice_table

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters import StateSpaceModel, run
-from tuning.cli.tune import tune
+from tuning.cli.demo import tune
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import goal_of, tune_by_gradient

@@ -6,8 +6,7 @@ import pytest
 from filters import KalmanFilter, affine_model, run
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
-from tuning.cli.tune import tune
-from tuning.cli.tuning_report import as_json, report
+from tuning.cli.demo import tune
 from tuning.likelihood import family, identifiability
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import (
@@ -21,6 +20,7 @@ from tuning.likelihood.identifiability import (
     sentences,
     too_many,
 )
+from tuning.reporting.tuning_report import as_json, report
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
 from tuning.thruster.scenario import find_scenario

@@ -235,7 +235,7 @@ def test_a_tuned_file_from_own_stamps_is_for_the_model_of_a_step(tmp_path):
     study.save(tmp_path / "tuned.json")
     content = json.loads((tmp_path / "tuned.json").read_text())
     assert [one[1] for one in content["model"]["inputs"]] == ["u_1"] and content["model"]["digest"] == model.digest
-    again = tuning.estimate(logs[2], tuned=tmp_path / "tuned.json", model=model)
+    again = tuning.estimate((model, logs[2]), tmp_path / "tuned.json")
     q = np.diag(content["filter"]["model"]["process_noise_cov"])
     assert np.allclose(again.filter.model.process_noise_cov, q) and np.isfinite(again.log_likelihood)
     assert study.held_out.evaluations["tuned"].log_likelihood > 0.0

@@ -8,11 +8,11 @@ from scipy.stats import chi2, multivariate_normal
 from docs.scripts.tuning_choice import by_objective
 from filters import run
 from tests.linear_problem import LinearProblem
-from tuning.cli.tuning_report import _band_sentence
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.runs import RunMetrics, variance_ratios
 from tuning.reporting.page import of_front, of_history
 from tuning.reporting.search_figures import draw_history
+from tuning.reporting.tuning_report import _band_sentence
 from tuning.search.among_types import TypeResult
 from tuning.search.measures import measured
 from tuning.search.objectives import find_objective, nees_ratio, reported, reported_about, reported_name

@@ -56,7 +56,7 @@ def test_labels_of_figures_show_a_name_as_it_is(name):
 def test_a_log_of_odd_names_is_drawn(name):
     rng = np.random.default_rng(0)
     table = {"t": 0.1 * np.arange(200), "u": rng.normal(size=200), "z": rng.normal(size=200), "x": np.zeros(200)}
-    found = tuning.estimate(table, model=model(name, unit=r"$\frac"))
+    found = tuning.estimate((model(name, unit=r"$\frac"), table))
     for figure in (found.plot_states(), found.plot_innovations()):
         figure.savefig(io.BytesIO(), format="png")
 

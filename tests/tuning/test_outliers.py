@@ -83,7 +83,7 @@ def test_a_mean_nis_that_a_burst_carries_is_said_with_log_times_and_channel(logs
 
 
 def test_outliers_of_logs_are_left_out_by_an_option_and_r_is_that_of_the_sensor(dirty):
-    study = tuning.tune((GUESS, dirty), "kf", trials=4, outliers="missing", progress=False)
+    study = tuning.tune(tuning.read_logs(dirty, model=GUESS, outliers="missing"), "kf", trials=4, progress=False)
     assert study.choice.model["measurement_noise_cov"] == pytest.approx(R, rel=0.3)
     assert study.held_out.evaluation.uneven is None and study.held_out.evaluation.nis.covers(1.0)
     remarks = study.problem.remarks

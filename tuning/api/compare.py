@@ -1,4 +1,4 @@
-"""`tuning.compare`: filters side by side on problems, on seeds that no study saw."""
+"""`tuning.compare` and `thruster compare`: filters side by side on problems, on seeds that no study saw."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from dataclasses import dataclass, field
 from functools import partial
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from rich.console import RenderableType
 
 from filters.consistency.intervals import Interval, slightly
 from filters.estimators.find import label_of
 from filters.filter import Filter
 from filters.logs.findings import colour_of
-from filters.registry import filter_type
+from filters.registry import FILTERS, filter_type
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.files import panels
@@ -23,6 +24,18 @@ from thruster_env.core.text_tables import TITLE, plain_text, verbatim
 from tuning.api.display import about, drawn, frame, html, number
 from tuning.api.evaluate import NOMINAL
 from tuning.api.held_out import cells_of
+from tuning.api.markers import (
+    FILTER,
+    INPUT,
+    READ,
+    Argument,
+    Augment,
+    Option,
+    PresetOption,
+    ProblemOption,
+    Progress,
+    Seed,
+)
 from tuning.api.problems import given_for, is_filter, problems_of
 from tuning.api.progress import console_for, row_bar
 from tuning.api.run import MOST_TRIALS
@@ -48,8 +61,9 @@ from tuning.evaluation.compare import compare as compare_all
 from tuning.evaluation.evaluate import restart_sentences
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.assumed import Unknowns, constants_in, suited, unknowns_of
+from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Problem
-from tuning.reporting.leaderboard import report
+from tuning.reporting.leaderboard import as_json, report
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
@@ -60,6 +74,7 @@ if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
 
+SIZE = "ensemble_size (--ensemble-size)"
 INTERRUPTED = "Interrupted: these are the rows that were done."
 
 
@@ -72,12 +87,14 @@ class FilterComparison:
         seed: of the study to which the held-out seeds belong.
         interrupted: whether Ctrl-C ended it; the rows are the finished ones.
         left_out: by label, why a filter could not run.
+        knows: the Q and R of named filters that were asked for.
     """
 
     boards: tuple[Leaderboard, ...]
     seed: int = 0
     interrupted: bool = False
     left_out: Mapping[str, str] = field(default_factory=dict)
+    knows: str | None = None
 
     @property
     def problems(self) -> tuple[Problem, ...]:
@@ -142,10 +159,24 @@ class FilterComparison:
         ended = ", interrupted" if self.interrupted else ""
         return f"FilterComparison({'; '.join(parts)}{ended})"
 
+    def tables(self) -> list[RenderableType]:
+        """The tables of each problem and a sentence on the winner, for a terminal."""
+        ended = [INTERRUPTED] if self.interrupted else []
+        return [*(part for board in self.boards for part in report(board)), *left_out_lines(self.left_out), *ended]
+
+    def as_dict(self) -> dict[str, Any]:
+        """All results as plain data, as in `thruster compare --json`."""
+        data = {"seed": self.seed, "knows": self.knows, "interrupted": self.interrupted, "left_out": self.left_out}
+        return {**data, **as_json(list(self.boards))}
+
+    @property
+    def exit_code(self) -> int:
+        """Of the command: 130 if it was interrupted."""
+        return 130 if self.interrupted else 0
+
     def __str__(self) -> str:
-        """The tables that `thruster compare` prints."""
-        ended = [*left_out_lines(self.left_out), *([INTERRUPTED] if self.interrupted else [])]
-        return plain_text([*(part for board in self.boards for part in report(board)), *ended])
+        """What `thruster compare` prints."""
+        return plain_text(self.tables())
 
     def _repr_html_(self) -> str:
         parts = []
@@ -212,50 +243,62 @@ def _draw(axis: Any, board: Leaderboard) -> None:
 
 
 def compare(
-    filters: Any = DEFAULT_FILTERS,
-    problem: Any = None,
+    filters: Annotated[
+        Any, Argument(FILTER, ("--filter",), "FILE", list[str], choices=FILTERS, file=READ)
+    ] = DEFAULT_FILTERS,
+    problem: Annotated[
+        Any, ProblemOption(INPUT, ("--problem", "--scenario"), type=list[str], choices="problems", file=READ)
+    ] = None,
     *,
     seeds: int = HELD_OUT_SEEDS,
-    seed: int = 0,
-    trials: int | None = None,
-    knows: str | None = None,
-    augment: Sequence[str] | Mapping[str, Any] | None = None,
-    ensemble_size: int | Mapping[str, int] | None = None,
-    preset: str | Path | None = None,
-    progress: bool | None = None,
+    knows: Annotated[str | None, Option(FILTER)] = None,
+    trials: Annotated[int | None, Option(FILTER)] = None,
+    augment: Augment = (),
+    ensemble_size: Annotated[
+        int | Mapping[str, int] | Sequence[str] | None, Option(FILTER, metavar="[FILTER=]N", type=list[str])
+    ] = None,
+    preset: Annotated[str | Path | None, PresetOption] = None,
+    seed: Seed = 0,
+    progress: Progress = None,
 ) -> FilterComparison:
-    """Rank filters on problems: errors, consistency, cost, and which beat the first one on the same seeds.
+    """Rank filters on problems by errors, consistency and cost, paired with the first one on the same seeds.
 
     All filters see the same truth, inputs and measurements. A filter is better or worse than the first one if the
-    paired 95 % interval of the ratio of their scores excludes 1; without truth, if that of the
-    difference of their log-likelihoods excludes 0. Named filters that do not accept a problem's model are
-    left out, and `left_out` says why. Ctrl-C keeps finished rows.
+    paired 95 % interval of the ratio of their scores excludes 1; without truth, if that of the difference of their
+    log-likelihoods excludes 0. Named filters that do not accept a problem's model are left out, with the reason.
+    Ctrl-C keeps finished rows.
 
         comparison = tuning.compare(["kf", "ekf", "enkf"], "mismatch", seeds=50)
         comparison.to_frame()
         comparison.plot_scores()
 
+    Example: thruster compare --filter ekf --filter ekf-robust --filter pf --scenario outliers --scenario ambient
+
+    Example: thruster compare --filter ekf --augment ambient_velocity --scenario ambient
+
     Args:
-        filters: names of filters, tuned files, `Study`s, other packages' estimators, or your own: a filter such as
-            `make_filter("ekf", model)` or a model with its Q and R, in a list, or in a mapping from the labels of
-            their rows; the others are compared with the first. The default's particle filter is left out for
-            models of more than 6 states.
-        problem: a problem as for `tuning.tune`, or a list of several; by default that of the first tuned file or
-            study, or "nominal".
+        filters: files of `thruster tune` and `thruster train-estimator`, names of filters, or module:object for an
+            estimator of another package; the others are compared with the first. By default ekf, enkf and, for up
+            to 6 states, pf. In Python also `Study`s, other packages' estimators, or your own: a filter such
+            as `make_filter("ekf", model)` or a model with its Q and R, in a list, or in a mapping from the labels
+            of their rows.
+        problem: name of a problem; may be repeated; by default that of the first tuned file, or nominal. In Python
+            as for `tuning.tune`.
         seeds: number of held-out seeds.
-        seed: of the study to which they belong.
-        trials: number of trials of the study if knows is "study"; if given, it is.
-        knows: the Q and R of named filters: "true" (the plant's own, the oracle), "scaled" (the scaled default),
-            "untuned" (the rule of thumb), "given" (the model's own), "noise" (noise estimation) or "study" (the
-            best on the training seeds of a study of 20 trials and all of these but the oracle; ensemble sizes are
-            not tuned). Default: "true"; "study" where the model is wrong (its residuals on true states are not
-            white with the plant's Q and R), except for rows that estimate further constants; "scaled" where the
-            plant's Q and R are unknown, or, without a scaled default, the first available of "given", "noise" and
-            "untuned".
-        augment: constants of the model, such as "ambient_velocity", that each filter also estimates in a further
-            row; by name with an `Unknown`, or (std, walk).
-        ensemble_size: of all filters, or by name.
-        preset: the problems of another thruster, by name or file.
+        knows: the Q and R of named filters: true (the plant's own, the oracle), scaled (the scaled default),
+            untuned (the rule of thumb), given (the model's own), noise (noise estimation) or study (the best on
+            the training seeds of a study of 20 trials and all of these but the oracle; ensemble sizes are not
+            tuned). Default: true; study where the model is wrong (its residuals on true states are not white with
+            the plant's Q and R), except for rows that estimate further constants; scaled where the plant's Q and R
+            are unknown, or, without a scaled default, the first available of given, noise and untuned.
+        trials: number of trials of the study if `knows` is study, which it implies.
+        augment: give each named filter a second row that also estimates this constant of its model, such as
+            ambient_velocity, with prior deviation STD and a random walk of WALK per step; may be repeated. In
+            Python also by name an `Unknown` or (std, walk).
+        ensemble_size: of all filters or of one; 30 by default, 1000 for particles; may be repeated. In Python a
+            number, or numbers by name.
+        preset: the problems of another thruster.
+        seed: seed of all randomness; the same seed gives the same results.
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
@@ -265,82 +308,57 @@ def compare(
         ValueError: states the rule and the value.
         KeyboardInterrupt: after Ctrl-C before any row is done.
     """
-    labels = list(filters) if isinstance(filters, Mapping) else []
-    requested = (
-        list(filters.values()) if labels else list(filters) if isinstance(filters, list | tuple) else [filters]
-    )
-    problems = problems_of(_default(requested) if problem is None else problem, preset)
-    each = ensemble_size if isinstance(ensemble_size, Mapping) else {None: ensemble_size}
-    sizes = {name: size for name, size in each.items() if size is not None}
-    named = None if filters is DEFAULT_FILTERS else requested
-    options: dict[str, Any] = {"knows": knows, "trials": trials, "unknown": unknowns_of(augment or {})}
-    return run_comparison(
-        named, problems, seed, seeds, console_for(progress), sizes=sizes, labels=labels, **options
-    )
-
-
-def run_comparison(
-    filters: Sequence[Any] | None,
-    problems: Sequence[Problem],
-    seed: int,
-    seeds: int,
-    console: Any,
-    *,
-    knows: str | None,
-    trials: int | None,
-    unknown: Unknowns,
-    sizes: Mapping[Any, int],
-    labels: Sequence[Any] = (),
-) -> FilterComparison:
-    """Compare filters on problems with a progress bar, for `tuning.compare` and `thruster compare`.
-
-    Args:
-        filters: as for `contenders_of`; None for the default ones.
-        problems: the problems.
-        seed: of the study to which the held-out seeds belong.
-        seeds: number of held-out seeds.
-        console: where progress is shown.
-        knows: the Q and R of named filters, as `tuning.evaluation.compare.KNOWS` explains; None for the default.
-        trials: of the study if filters know that; if given, they do.
-        unknown: constants that filters also estimate in a second row.
-        sizes: ensemble size by name; under None that of all others.
-        labels: of the filters' rows, by the user; if empty, those of `contenders_of`.
-    """
     if trials is not None:
         trials = at_least("trials", trials, 1, MOST_TRIALS)
         if knows not in (None, STUDY):
             raise ValueError(f"knows must be left out, or {STUDY!r}, with trials, but got {short_repr(knows)}")
-        knows = STUDY
+    labels = list(filters) if isinstance(filters, Mapping) else []
+    asked = list(filters.values()) if labels else list(filters) if isinstance(filters, list | tuple) else [filters]
+    for name in asked:
+        if isinstance(name, str) and name in built_in():
+            raise ValueError(
+                f"a filter must be a name or a file, but got the problem {name}: use problem (--problem)"
+            )
+    problems = problems_of(_default(asked) if problem is None else problem, preset)
+    for file in asked:
+        if isinstance(file, str | Path) and not is_filter(file):
+            for each in problems:
+                read_choice(Path(file), suited_to(Path(file), each))  # a clear error for another plant's file
     left_out: dict[str, str] = {}
-    if filters is None:
-        filters, left_out = default_filters(problems)
-    asked = filters
-    filters, unfit = without_unfit(asked, problems)
-    labels = [
-        label
-        for label, filter_ in zip(labels, asked, strict=False)
-        if not _is_named(filter_) or filter_ in filters
-    ]
-    arguments = knows, unknown, sizes, seed, trials or STUDY_TRIALS
-    contenders = contenders_of(filters, *arguments)
+    if filters is DEFAULT_FILTERS:
+        asked, left_out = default_filters(problems)
+    accepted, unfit = without_unfit(asked, problems)
+    pairs = zip(labels, asked, strict=False)
+    labels = [label for label, filter_ in pairs if not _is_named(filter_) or filter_ in accepted]
+    sizes, chosen = _sizes(ensemble_size), knows if trials is None else STUDY
+    arguments = chosen, unknowns_of(augment or {}), sizes, seed, trials or STUDY_TRIALS
+    contenders = contenders_of(accepted, *arguments)
     if labels:
-        of_each = [
-            (label, contenders_of([filter_], *arguments)) for label, filter_ in zip(labels, filters, strict=True)
-        ]
+        groups = [contenders_of([filter_], *arguments) for filter_ in accepted]
         contenders = [
             contender._replace(label=contender.label.replace(group[0].label, str(label), 1))
-            for label, group in of_each
+            for label, group in zip(labels, groups, strict=True)
             for contender in group
         ]
 
     def held_out(problem: Problem) -> range:
         return problem.held_out_seeds(seed, seeds)
 
-    for problem in problems:
-        held_out(problem)  # a clear error before any filter runs
-    with row_bar(len(contenders) * len(problems), console) as on_row:
+    for each in problems:
+        held_out(each)  # a clear error before any filter runs
+    with row_bar(len(contenders) * len(problems), console_for(progress)) as on_row:
         boards, interrupted = compare_all(contenders, problems, held_out, on_row)
-    return FilterComparison(tuple(boards), seed, interrupted, left_out | unfit)
+    return FilterComparison(tuple(boards), seed, interrupted, left_out | unfit, knows)
+
+
+def _sizes(argument: int | Mapping[str, int] | Sequence[str] | None) -> dict[str | None, int]:
+    """Ensemble sizes by name, under None that of all other filters, also from texts [FILTER=]N."""
+    if isinstance(argument, Mapping):
+        return {name: size for name, size in argument.items() if size is not None}
+    if isinstance(argument, list | tuple):
+        parts = [text.rpartition("=") for text in argument]
+        return {name if equals else None: at_least(SIZE, number, 2) for name, equals, number in parts}
+    return {None: argument} if isinstance(argument, int) else {}
 
 
 def without_unfit(filters: Sequence[Any], problems: Sequence[Problem]) -> tuple[list[Any], dict[str, str]]:
@@ -372,8 +390,8 @@ def contenders_of(
     """
     for name, members in sizes.items():
         if name is not None and not filter_type(name).has_ensemble:
-            raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {members}")
-        at_least("ensemble_size", members, 2)
+            raise ValueError(f"{SIZE} must be for a filter with an ensemble, but got {name}: {members}")
+        at_least(SIZE, members, 2)
 
     def size_of(name: Any) -> int | None:
         return sizes[name] if name in sizes else sizes.get(None)

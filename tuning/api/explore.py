@@ -27,7 +27,6 @@ def explore(
     seeds: int = 8,
     seed: int = 0,
     preset: str | Path | None = None,
-    **of_logs: Any,
 ) -> Explorer:
     """Set a filter's Q, R and other numbers by hand, and see at once what becomes of its estimates.
 
@@ -38,19 +37,19 @@ def explore(
 
     Args:
         problem: a name, such as "mismatch" or "auv:motion", a file that ends in .toml, "module:object", a
-            `Problem`, or a pair (model, data) of a model, or a thruster's preset, and recorded runs.
+            `Problem`, `tuning.read_logs(...)`, or a pair (model, data) of a model, or a thruster's preset, and
+            recorded runs.
         filter: name of a filter; or own numbers where one starts, as `make_filter("ekf", model)`.
         tuned: a tuned file or a `Study` where one starts, in place of a filter; by default the rule of thumb.
         seeds: number of runs at once; logs are shown whole.
         seed: of the study whose training seeds these are.
         preset: the problem of another thruster, by name or file.
-        **of_logs: options of recorded runs, as `tuning.tune` has them: `sensors`, `columns`, `dt`, ...
 
     Raises:
         ValueError: states the rule and the value.
         ModuleNotFoundError: without the extra `explore`.
     """
-    chosen = problem_of(problem, preset, **of_logs)
+    chosen = problem_of(problem, preset)
     if tuned is None and not is_own(filter):
         return Explorer(Bench(chosen, filter, seed=seed), seeds)
     choice, chosen, _ = subject_of(filter if tuned is None else tuned, chosen)

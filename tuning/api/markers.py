@@ -6,7 +6,7 @@ the signature, help from the docstring, and the rest from these markers in `Anno
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -29,10 +29,11 @@ class Option:
         metavar: word for its value.
         type: of its value, if the annotation allows more than a command line can express.
         default: if it differs from the function's.
-        choices: names that are accepted in any case, or which list: "presets", "problems", "sensors".
+        choices: names that are accepted in any case, or which list of `tuning.cli.verbs.names_in`.
         least: of a number.
         most: of a number.
         file: READ or WRITTEN: whether a file can be written is checked before anything runs.
+        unset: the argument for a command in which it is not given, if it is not the function's default.
     """
 
     panel: str = RUNS
@@ -44,6 +45,7 @@ class Option:
     least: float | None = None
     most: float | None = None
     file: str | None = None
+    unset: Any = UNSET
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,16 @@ class LogsArgument(Argument):
 
 @dataclass(frozen=True)
 class ProblemOption(Option):
-    """A problem, or several: its name, or recorded runs (--log) with the options of `tuning.read_logs`."""
+    """A problem, or several: its name, or recorded runs (--log) with options of `read_logs` up to `last`."""
+
+    last: str = "start"
+
+
+@dataclass(frozen=True)
+class Group:
+    """A dataclass whose fields are options."""
+
+    of: Any
 
 
 @dataclass(frozen=True)
@@ -72,6 +83,7 @@ class PythonOnly:
 
 Progress = Annotated[bool | None, PythonOnly(True)]
 Seed = Annotated[int, Option(RUNS, least=0)]
+Augment = Annotated[Sequence[str] | Mapping[str, Any], Option(FILTER, metavar="NAME[:STD[:WALK]]", type=list[str])]
 FilterOption = Option(FILTER, ("--filter",), type=str, choices=(*FILTERS, "auto"))
 TunedArgument = Argument(FILTER, ("--tuned",), "FILE", str, file=READ)
 PresetOption = Option(INPUT, type=str, choices="presets", file=READ)

@@ -12,11 +12,11 @@ from thruster_env.core.checks import one_of, short_repr
 from thruster_env.logs.findings import OUTLIERS
 from thruster_env.logs.log import Log
 from thruster_env.logs.recorders.bags import STAMPS
-from tuning.api.markers import LOGS, READ, ModelOption, Option, PresetOption
+from tuning.api.markers import LOGS, READ, Augment, ModelOption, Option, PresetOption
 from tuning.logs.read import model_of_logs, name_of, read_named
 
 if TYPE_CHECKING:
-    from tuning.problems.log_problem import LogProblem
+    from tuning.problems.problem import Problem
 
 CUTS = ("blocks", "lead", "start")  # which only a problem of logs has
 SPLITS = ("held_out", "hold_gaps", "outliers")
@@ -31,18 +31,22 @@ class RecordedRuns:
         reading: options of `tuning.logs.read.read_named`, those that are set.
         splits: held-out runs, whether gaps are held, and whether outliers are left out, if set.
         cuts: how a problem cuts them into blocks, if set.
+        augment: constants that the filter also estimates.
     """
 
     files: Any
     reading: Mapping[str, Any] = field(default_factory=dict)
     splits: Mapping[str, Any] = field(default_factory=dict)
     cuts: Mapping[str, Any] = field(default_factory=dict)
+    augment: Any = ()
 
-    def problem(self) -> LogProblem:
+    def problem(self) -> Problem:
         """The problem of tuning a filter on them."""
         from tuning.logs.problem import log_problem
+        from tuning.problems.assumed import augmented, unknowns_of
 
-        return log_problem(self.files, **self.reading, **self.splits, **self.cuts)
+        problem = log_problem(self.files, **self.reading, **self.splits, **self.cuts)
+        return augmented(problem, unknowns_of(self.augment))
 
     def read(self, tuned: Mapping[str, Any] | None = None) -> tuple[Log, Any]:
         """The only run, and the source of its model at its sample time.
@@ -95,6 +99,7 @@ def read_logs(
     blocks: Annotated[int | None, Option(LOGS)] = None,
     lead: Annotated[int | None, Option(LOGS)] = None,
     start: Annotated[str | None, Option(LOGS, choices=STARTS)] = None,
+    augment: Augment = (),
 ) -> RecordedRuns:
     """Recorded runs, with all that one has to know to read them: for `tune`, `identify`, `estimate`, ...
 
@@ -104,7 +109,7 @@ def read_logs(
     Args:
         files: a .csv, .parquet or .npz file with a header, or a recorder's: .ulg, .bin, .bag, .db3, .mcap, .mat,
             .h5. In Python also a pandas.DataFrame, a mapping from headers to arrays, a `Log`, or a list.
-        preset: the thruster of the runs.
+        preset: the thruster of the problem or of the runs.
         model: instead of a thruster, a StateSpaceModel, or a function that returns one (called with dt if it has
             that argument). In Python also an object that offers one, or a thruster's preset.
         sensors: a thruster's sensor that the filter sees, thrust by default.
@@ -123,6 +128,9 @@ def read_logs(
         lead: number of rows at the beginning of a block that are not scored; 50 by default.
         start: initial state of blocks: prior, or measurement, from their first measurement, the default of
             ekf-robust.
+        augment: let the filter also estimate this constant of its model, such as voltage_gain, with prior
+            deviation STD; its random walk, at first WALK per step, is tuned with Q; may be repeated. In Python an
+            `Unknown` or (std, walk) by name.
 
     Returns:
         `RecordedRuns`, which are read when they are used.
@@ -138,9 +146,8 @@ def read_logs(
     reading |= {"clock_offset": clock_offset, "dt": dt, "grid": None if grid else False, "stamps": stamps}
     splits = {"held_out": held_out, "hold_gaps": hold_gaps or None, "outliers": outliers}
     cuts = {"blocks": blocks, "lead": lead, "start": start}
-    return RecordedRuns(
-        files, *({key: v for key, v in part.items() if v is not None} for part in (reading, splits, cuts))
-    )
+    reading, splits, cuts = ({k: part[k] for k in part if part[k] is not None} for part in (reading, splits, cuts))
+    return RecordedRuns(files, reading, splits, cuts, augment)
 
 
 def recorded_runs(logs: Any) -> RecordedRuns:

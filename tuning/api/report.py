@@ -14,15 +14,13 @@ from thruster_env.core.checks import short_repr
 from thruster_env.core.files import check_target, write_whole
 from tuning.api.problems import given_for, problems_of
 from tuning.api.progress import console_for, working
-from tuning.api.study import Study
+from tuning.api.study import STUDIES, Study
 from tuning.evaluation.held_out import sizes_as_data
 from tuning.problems.problem import Problem
 from tuning.reporting.report import Source, write_report, write_two_studies
 from tuning.reporting.subject import is_file
 from tuning.search.among_types import SIZES
 from tuning.search.storage import open_storage, quiet_optuna, storage_text
-
-STUDIES = "out/studies.journal"  # where studies are unless it is told
 
 
 def report(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from optuna.trial import FrozenTrial, TrialState
+from rich.console import RenderableType
 
 from filters.estimators.find import label_of
 from filters.filter import Filter
@@ -19,13 +20,29 @@ from thruster_env.core.text_tables import plain_text
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.display import about, drawn, frame, html, number
 from tuning.api.held_out import HeldOut
+from tuning.api.markers import (
+    FILTER,
+    INPUT,
+    OUTPUT,
+    READ,
+    SEARCH,
+    WRITTEN,
+    FilterOption,
+    Group,
+    Option,
+    ProblemOption,
+    Progress,
+    Seed,
+)
 from tuning.api.problems import problems_of
 from tuning.api.progress import console_for
-from tuning.api.run import Tuning, aim_of, run_tuning, sampler_of, with_budget
+from tuning.api.run import Tuning, aim_of, name_of, run_tuning, sampler_of, with_budget
 from tuning.evaluation.tuned import check_keepable
 from tuning.evaluation.worth import tuning_effect
-from tuning.problems.assumed import as_argument, augmented, rows_argument, unknowns_of
+from tuning.methods.registry import DEFAULT, METHODS
+from tuning.problems.assumed import as_argument, rows_argument
 from tuning.problems.problem import Problem, score_label
+from tuning.reporting.tuning_report import as_json, report
 from tuning.search.objectives import reported, reported_name
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, untuned_choice
@@ -35,6 +52,9 @@ from tuning.search.trials import is_consistent
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
+
+STUDIES = "out/studies.journal"  # of commands
+INTERRUPTED, NONE_CONSISTENT = 130, 3  # exit codes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -207,11 +227,22 @@ class Study:
             return f"{summary}{ended}: tuning {effect})"
         return f"{summary}{ended}: score {about(self.held_out.score)}; tuning {effect})"
 
+    def tables(self) -> list[RenderableType]:
+        """The gain of the tuning, then tables and sentences, for a terminal."""
+        return report(self.tuning)
+
+    def as_dict(self) -> dict[str, Any]:
+        """All results as plain data, as in `thruster tune --json`."""
+        return as_json(self.tuning)
+
+    @property
+    def exit_code(self) -> int:
+        """Of the command: 130 if it was interrupted, 3 if no trial is consistent."""
+        return INTERRUPTED if self.interrupted else NONE_CONSISTENT if self.consistent is False else 0
+
     def __str__(self) -> str:
-        """The choice and its reason, a summary line, and the tables of its held-out evaluations."""
-        first = plain_text(self.tuning.chosen)
-        tables = [plain_text(evaluation.tables()) for evaluation in self.evaluations]
-        return "\n\n".join([*([first] if first else []), repr(self), *tables])
+        """What `thruster tune` prints."""
+        return plain_text(self.tables())
 
     def _repr_html_(self) -> str:
         from tuning.reporting.choice_words import number_rows
@@ -242,48 +273,62 @@ def _seconds(trial: FrozenTrial) -> float | None:
 # `tuning.tune`: find a filter's Q, R and other parameters, and evaluate them on held-out seeds.
 
 
+@dataclass(frozen=True)
+class SearchSpace:
+    """Which parameters a study searches, and what they must obey.
+
+    Attributes:
+        hold_r: keep R from the sensor's data sheet, tune only Q.
+        full_q: tune the correlations of Q, too.
+        full_r: tune the correlations of R, too.
+        where: a relation that parameters must obey: 'Q22 = 4 Q11', 'Q33 = Q11', 'R = 0.01' (not tuned),
+            'Q11 = 1e-6..1e-2' (its range); may be repeated.
+        forget: longest time constant of the filter's gain that is allowed; a smaller Q is raised to it.
+    """
+
+    hold_r: Annotated[bool, Option(SEARCH)] = False
+    full_q: Annotated[bool, Option(SEARCH)] = False
+    full_r: Annotated[bool, Option(SEARCH)] = False
+    where: Annotated[Sequence[str], Option(SEARCH, metavar="RELATION")] = ()
+    forget: Annotated[float | None, Option(SEARCH, metavar="SECONDS")] = None
+
+
 def tune(
-    problem: Any,
-    filter: str = "ekf",
+    problem: Annotated[
+        Any,
+        ProblemOption(
+            INPUT,
+            ("--problem", "--scenario"),
+            type=list[str],
+            default=["mismatch"],
+            choices="problems",
+            file=READ,
+            last="augment",
+        ),
+    ],
+    filter: Annotated[str, replace(FilterOption, default="enkf")] = "ekf",
     *,
-    trials: int = 50,
-    seed: int = 0,
-    objective: str | Sequence[str] | None = None,
-    consistent: bool = True,
-    worst: bool = False,
-    hold_r: bool = False,
-    full_q: bool = False,
-    full_r: bool = False,
-    where: Sequence[str] = (),
-    forget: float | None = None,
-    augment: Sequence[str] | Mapping[str, Any] = (),
-    budget: float | None = None,
-    prune: bool = True,
-    method: str = "tpe",
+    space: Annotated[SearchSpace, Group(SearchSpace)] = SearchSpace(),  # noqa: B008 - it is frozen
+    budget: Annotated[float | None, Option(FILTER, metavar="MICROSECONDS")] = None,
+    trials: Annotated[int, Option(SEARCH)] = 50,
+    objective: Annotated[str | Sequence[str] | None, Option(SEARCH, type=list[str], choices="objectives")] = None,
+    worst: Annotated[bool, Option(SEARCH)] = False,
+    consistent: Annotated[bool, Option(SEARCH, ("--consistency/--no-consistency",))] = True,
+    prune: Annotated[bool, Option(SEARCH, ("--pruning/--no-pruning",))] = True,
+    method: Annotated[str, Option(SEARCH, choices=METHODS)] = DEFAULT,
     workers: int = 1,
-    storage: str | Path | None = None,
-    name: str | None = None,
-    progress: bool | None = None,
-    preset: str | Path | None = None,
-    sensors: Sequence[str] | None = None,
-    columns: Any = None,
-    clock_offset: Any = None,
-    dt: float | None = None,
-    grid: bool = True,
-    stamps: str | None = None,
-    held_out: Any = None,
-    blocks: int | None = None,
-    lead: int | None = None,
-    hold_gaps: bool | None = None,
-    start: str | None = None,
-    outliers: str | None = None,
+    storage: Annotated[str | Path | None, Option(OUTPUT, default=STUDIES)] = None,
+    name: Annotated[str | None, Option(OUTPUT, ("--study",))] = None,
+    out: Annotated[str | Path | bool | None, Option(OUTPUT, type=Path, file=WRITTEN, unset=True)] = None,
+    seed: Seed = 0,
+    progress: Progress = None,
 ) -> Study:
     """Find the Q, R and ensemble size that give a filter's best estimate, and evaluate it on held-out seeds.
 
-    The score is the mean over states of RMSE over its bound, on 32 training seeds that every trial shares; for
-    recorded runs without true states it is the negative log-likelihood of the innovations. The first trial is the
-    rule of thumb. The mean NIS is kept in a band, because RMSE barely determines Q and R: only their ratio affects
-    the estimate. Ctrl-C keeps all finished trials: the study then consists of these and is marked `interrupted`.
+    The score is the mean over states of RMSE over its scale, on 32 training seeds that every trial shares. The
+    first trial is the rule of thumb: R from the sensor's data sheet, Q from 1 % of each state's range. Ctrl-C
+    keeps all finished trials, and the same command continues the study. The report compares the filter with its
+    baselines, first with your model's own Q and R, on 200 seeds that no trial saw.
 
         study = tuning.tune("mismatch", filter="enkf", trials=50)
         study.save("tuned.json")
@@ -291,53 +336,61 @@ def tune(
 
         study = tuning.tune((model, ["run1.csv", "run2.csv"]), trials=100)
 
+    Q's variances and R are searched from 1e-10 to 1e4 times the rule of thumb, on logarithmic scales, beginning
+    from 1e-5 to 1e2 (R: 1e-2 to 1e3) and ten times beyond the best trial; given values lie inside, and the report
+    flags a parameter at an end of its range. Besides sampled trials the study tries the baselines (given, rule of
+    thumb, scaled default, noise estimation) and the maximum-likelihood values. At the end the best trials are
+    compared with the baselines on 100 validation seeds. If none is significantly better, the best baseline is
+    chosen, and the report names the runs in which what was given fails.
+
+    RMSE alone barely determines Q and R: only their ratio affects the estimate. The study therefore keeps the mean
+    NIS in a band, unless that is switched off, as long as it costs at most 5 % of the score. With true states
+    it chooses the trial with the best log score among those within 5 % of the least error. If no trial is in the
+    band, the report and the file say so, and the command's exit code is 3.
+
+    --method also selects another sampler, gradients, or a published method, which runs alone: samplers end after
+    --trials trials, the others by their own criterion. With a right model and true states use noise-estimation.
+    With true states use log-score if the covariance matters, mse if only the estimate does. Without true states
+    use likelihood, or als for a linear model on long runs, which accepts --full-q and --full-r. For an ensemble
+    use the default, or desroziers without true states. With true states and a wrong model, or a dead band, add
+    --full-q (and --full-r) to mse or log-score. `thruster methods` lists all methods.
+
+    With --log the study uses recorded runs, cut into blocks of which every third is held out. It minimises the
+    negative log-likelihood of the innovations, unless the logs contain the true states.
+
+    Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100
+
+    Example: thruster tune --filter ekf --log run1.csv --log run2.csv --trials 100
+
+    Example: thruster tune --filter ekf --method log-score --scenario mismatch
+
+    Example: thruster tune --filter auto --budget 2 --scenario published_noise --trials 100
+
+    Example: thruster tune --filter ekf --augment voltage_gain --scenario mismatch
+
     Args:
-        problem: a name, such as "mismatch" or "auv:motion", a .toml file, or "module:object"; a
-            `Problem`; a pair (model, data) of a model, or a thruster's preset, and recorded runs; or a list of
-            problems, for the mean of their objectives or the `worst`. Recorded runs are paths,
-            pandas tables, mappings from headers to arrays, or `Log`s.
-        filter: name of a filter; "auto" for the best of all within the budget; or "module:object" for an estimator
-            of your own, which can be used and evaluated, but not saved.
+        problem: name of a problem; several for their mean, or the worst with `worst`; mismatch by default. In
+            Python also a `Problem`, `tuning.find_problem(...)`, `tuning.read_logs(...)`, a pair (model, data) of a
+            model, or a thruster's preset, and recorded runs, or a list.
+        filter: name of a filter, as `thruster filters` lists them, or auto: the best of all within `budget`. In
+            Python also "module:object" for an estimator of your own, which can be used, but not saved.
+        space: what is searched.
+        budget: time limit of a step of the filter on one core; of auto by default 2.5 n^2 for n states.
         trials: total number of finished trials of the study.
-        seed: of all randomness; the same seed gives the same results.
-        objective: the quantity to minimise, or two for a Pareto front, as `thruster tune --objective` lists them;
-            by default the score, or without truth the negative log-likelihood.
-        consistent: whether the mean NIS is kept between 0.8 and 1.25 times its expected value; the objective
-            "log-score" needs no such band.
-        worst: of several problems, minimise the objective of the worst one.
-        hold_r: keep R at the data sheet's value, tune only Q.
-        full_q: tune the correlations of Q, too.
-        full_r: tune the correlations of R, too.
-        where: relations that parameters must obey, such as "Q22 = 4 Q11", "Q33 = Q11", "R = 0.01"
-            (not tuned), "Q11 = 1e-6..1e-2" (its range).
-        forget: the longest time constant of the filter's gain that is allowed [s]; a smaller Q is raised to it.
-        augment: constants of the model, such as "voltage_gain", that the filter also estimates, as further states
-            whose random walks are tuned with Q; by name with an `Unknown`, or (std, walk).
-        budget: time limit of a step of the filter [microseconds of one core]; for "auto" by default 2.5 times the
-            square of the number of states.
-        prune: end a trial that is significantly worse than the best on the same seeds.
-        method: one of `thruster methods`: a study by a sampler of Optuna, by default "tpe"; "gradient", a study
-            and the optimum that gradients lead to, with standard errors; or a method that runs alone, such as
-            "noise-estimation" or "em", to its own end or, if it samples, for `trials` trials.
+        objective: what to minimise, two for a Pareto front; by default the score, or without true states the
+            negative log-likelihood.
+        worst: minimise the worst of several problems instead of their mean.
+        consistent: whether to keep the mean NIS between 0.8 and 1.25 of its expected value.
+        prune: whether to end trials that are significantly worse than the best on the same seeds.
+        method: a study by a sampler (tpe, gp, cma-es, nsga-ii, random, grid), gradient for Kalman filters, or a
+            published method; `thruster methods` lists them and when to use which.
         workers: processes on this host that share the study; several need a storage.
-        storage: journal file or URL of a database that saves the study, so that the same call continues it; by
-            default it ends with the process.
-        name: of the study; by default from the arguments above.
+        storage: journal file for one host; for several, a database (docs/workers.md). In Python by default none:
+            the study ends with the process.
+        name: name of the study; by default from the options above.
+        out: tuned file; out/STUDY.json by default. In Python none by default, and True for that one.
+        seed: seed of all randomness; the same seed gives the same results.
         progress: whether to show progress; by default only in terminals and notebooks.
-        preset: the problem of another thruster, by name or file.
-        sensors: for recorded runs of a thruster, the channels that the filter sees.
-        columns: for recorded runs, headers by quantity.
-        clock_offset: for recorded runs, seconds by quantity that a channel's clock is ahead.
-        dt: for recorded runs, the sample time [s].
-        grid: for recorded runs, whether they are put on a grid; else on their own stamps, as in `estimate`.
-        stamps: for bags, "header" or "receipt", as in `estimate`.
-        held_out: recorded runs used only for the held-out evaluation; by default every third.
-        blocks: number of blocks per recorded run.
-        lead: rows at the beginning of a block that are not scored.
-        hold_gaps: hold the last input over gaps of a log; by default runs are split there.
-        start: initial state of blocks of logs: "prior", or "measurement", from their first measurement, as
-            ekf-robust does by default.
-        outliers: samples that the findings in logs call outliers: "kept", or "missing", which leaves them out.
 
     Returns:
         `Study`: `filter`, `choice`, `held_out`, `save(path)`, `to_frame()`, `plot_history()`, `plot_errors()`.
@@ -346,40 +399,35 @@ def tune(
         ValueError: states the rule and the value.
         KeyboardInterrupt: after Ctrl-C before any trial is complete, or during the held-out evaluation.
     """
-    asked = [objective] if isinstance(objective, str) else objective
-    sampler, aim = sampler_of(method), aim_of(None if asked is None else list(asked))
     if not isinstance(filter, str):
         raise ValueError(
             f"filter must be a name or 'module:object', by which trials keep it, but got {short_repr(filter)}"
         )
-    of_logs: dict[str, Any] = {"sensors": sensors, "columns": columns, "clock_offset": clock_offset, "dt": dt}
-    of_logs |= {"grid": None if grid else False, "stamps": stamps}
-    of_logs |= {"held_out": held_out, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps, "start": start}
-    of_logs |= {"outliers": outliers}
-    unknown = unknowns_of(augment)
-    problems = tuple(augmented(base, unknown) for base in problems_of(problem, preset, **of_logs))
-    if objective is None:
-        objective = "score" if problems[0].scale is not None else "likelihood"
+    if out is not None:
+        check_keepable(filter)
+    sampler, problems = sampler_of(method), problems_of(problem)
+    asked = [objective] if isinstance(objective, str) else None if objective is None else list(objective)
     plan = Plan(
         filter,
         problems,
         seed,
-        (objective,) if isinstance(objective, str) else tuple(objective),
+        tuple(asked or ["score" if problems[0].scale is not None else "likelihood"]),
         consistent=consistent,
         sampler=sampler,
-        hold_r=hold_r,
+        hold_r=space.hold_r,
         prune=prune,
         budget=budget,
-        full_q=full_q,
-        full_r=full_r,
-        where=(where,) if isinstance(where, str) else tuple(where),
+        full_q=space.full_q,
+        full_r=space.full_r,
+        where=(space.where,) if isinstance(space.where, str) else tuple(space.where),
         worst=worst,
-        forget=forget,
+        forget=space.forget,
     )
-    plan = with_budget(plan)
-    journal = None if storage is None else storage_text(storage)
-    console = console_for(progress)
-    return Study(run_tuning(plan, trials, console, journal, name, method=method, aim=aim, workers=workers))
+    plan, aim = with_budget(plan), aim_of(asked)
+    study = name or name_of(plan, method, aim)
+    file = None if out in (None, False) else Path("out") / f"{study}.json" if out is True else Path(str(out))
+    journal, console = None if storage is None else storage_text(storage), console_for(progress)
+    return Study(run_tuning(plan, trials, console, journal, study, file, method=method, aim=aim, workers=workers))
 
 
 # A user's own parameters as a choice: those of a filter, or of a model with its own Q and R.

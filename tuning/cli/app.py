@@ -33,9 +33,9 @@ PANELS = {
     "Published results and long studies": ("reproduce", "study"),
 }
 VERBS = {
-    "evaluate": "evaluate",
-    "estimate": "estimate",
-}  # commands that functions make, and their files in tuning.api
+    "tune": "study",
+    **{name: name for name in ("compare", "evaluate", "estimate")},
+}  # functions, and their files in tuning.api
 COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
 MARKUP: Final = "markdown"
 LOADING = "loading ..."

@@ -15,11 +15,9 @@ from rich.table import Table
 
 from filters.filter import Filter
 from thruster_env.core.text_tables import table
-from tuning.api.run import Tuning
+from tuning.api.run import Tuning, run_tuning
 from tuning.cli.options import JsonOption, SeedOption
-from tuning.cli.output import emit, working
-from tuning.cli.tune import tune
-from tuning.cli.tuning_report import as_json
+from tuning.cli.output import announce_compilation, emit, progress_console, working
 from tuning.evaluation.baselines import NOISE, ORACLE, TUNED, baselines, same_filter
 from tuning.evaluation.evaluate import score_ratio
 from tuning.problems.problem import score_label
@@ -27,6 +25,7 @@ from tuning.reporting.leaderboard import above_bound, consistency_cells
 from tuning.reporting.report import Report, write_report
 from tuning.reporting.search_figures import comparison_figure, history_figure
 from tuning.reporting.time_figures import estimates_figure
+from tuning.reporting.tuning_report import as_json
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import AUTO
 from tuning.thruster.scenario import find_scenario
@@ -75,6 +74,12 @@ def command(
     emit(output, data, json)
     if best is None or best.result.interrupted:
         sys.exit(130)
+
+
+def tune(plan: Plan, trials: int, storage: str, out: Path) -> Tuning:
+    """Run or resume a study with a progress bar."""
+    announce_compilation()
+    return run_tuning(plan, trials, progress_console, storage, out=out)
 
 
 def best_type(plan: Plan, trials: int, storage: str, out: Path) -> Tuning:

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
+from tuning.api.study import STUDIES
 from tuning.cli.options import INPUT, OUTPUT, CodeOption, JsonOption, LogModelOption, TunedPresetOption
 from tuning.cli.output import announce_compilation, emit, working
-from tuning.cli.tune import DEFAULT_STORAGE
 from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
 from tuning.reporting.report import Source, write_report, write_two_studies
@@ -29,7 +29,7 @@ def command(
         typer.Option(
             help="Storage of the study: a journal file, or an Optuna storage URL.", rich_help_panel=INPUT
         ),
-    ] = DEFAULT_STORAGE,
+    ] = STUDIES,
     out: Annotated[
         Path | None,
         typer.Option(

@@ -28,6 +28,7 @@ from tuning.api.markers import (
     UNSET,
     WRITTEN,
     Argument,
+    Group,
     LogsArgument,
     Option,
     ProblemOption,
@@ -39,6 +40,8 @@ from tuning.cli.output import announce_compilation, check_targets, emit
 from tuning.problems.plant_packages import built_in
 
 SHARED = {"preset", "model"}  # of recorded runs, and of tuned files
+CHANGES = {"preset", "augment"}  # of a problem that is named
+READING = "reading"
 SAME, AGAIN = "The same as the argument.", "_again"
 SIMPLE = (bool, int, float, str, Path)
 
@@ -49,6 +52,10 @@ def names_in(choices: str) -> tuple[Sequence[str], str]:
         return [*PRESETS], f"{', '.join(PRESETS)}, or a FILE.toml of `thruster new preset` or `thruster identify`."
     if choices == "sensors":
         return [*CHANNELS], f"{', '.join(CHANNELS)}."
+    if choices == "objectives":
+        from tuning.search.objectives import OBJECTIVES  # which imports optuna
+
+        return [*OBJECTIVES], f"{', '.join(OBJECTIVES)}, output:SYMBOL."
     from tuning.cli.problems import PROBLEMS  # which imports all plants
 
     return [*built_in()], PROBLEMS
@@ -61,7 +68,7 @@ class Part(NamedTuple):
     marker: Option
     default: Any  # of the function
     option: str  # how one sets it: --filter, or the word of an argument
-    of_logs: bool = False  # whether it is one of `read_logs` alone
+    group: str = ""  # READING if it is one of `read_logs`, or the parameter whose value is made of several options
 
     def is_set(self, value: Any) -> bool:
         """Whether a value differs from the default."""
@@ -102,17 +109,20 @@ def parts_of(verb: Callable, last: str = "") -> tuple[list[Part], dict[str, Any]
         if isinstance(marker, PythonOnly) or parameter.kind is Parameter.VAR_KEYWORD:
             fixed |= {} if getattr(marker, "value", UNSET) is UNSET else {name: marker.value}
             continue
+        if isinstance(marker, Group):
+            parts += [part._replace(group=name) for part in parts_of(marker.of)[0]]
+            continue
         text = texts.get(name, "")
         if isinstance(marker, LogsArgument):
             text = f"{text} {described(read_logs)[1]['files']}"
         parts += parts_of_parameter(parameter, kind, marker, text)
         if isinstance(marker, LogsArgument | ProblemOption):
-            files, *of_logs = parts_of(read_logs, getattr(marker, "last", ""))[0]
+            files, *of_logs = parts_of(read_logs, marker.last)[0]
             if isinstance(marker, ProblemOption):
                 kind, info = get_args(files.parameter.annotation)
                 info.help = f"Instead of a problem: {info.help[:1].lower()}{info.help[1:]}"
                 of_logs.insert(0, files._replace(parameter=parameter_of("log", kind | None, info, None)))
-            parts += [part._replace(of_logs=True) for part in of_logs if part.parameter.name not in parameters]
+            parts += [part._replace(group=READING) for part in of_logs if part.parameter.name not in parameters]
         if name == last:
             break
     for part in parts:
@@ -125,6 +135,7 @@ def parts_of_parameter(parameter: Parameter, kind: Any, marker: Option, text: st
     """A parameter as Typer declares it: an option or an argument, or an argument that an option may name."""
     kind = simplified(kind) if marker.type is None else marker.type
     default = parameter.default if marker.default is UNSET else marker.default
+    default = None if isinstance(marker, ProblemOption) else default
     if get_origin(kind) is list:
         default = default or None
     kind = kind | None if default is None else kind
@@ -143,7 +154,8 @@ def parts_of_parameter(parameter: Parameter, kind: Any, marker: Option, text: st
         option, info = marker.metavar or parameter.name.upper(), typer.Argument(**options)
     parts = [Part(parameter_of(parameter.name, kind, info, default), marker, parameter.default, option)]
     if isinstance(marker, Argument) and marker.names:
-        again = typer.Option(*names, metavar=marker.metavar, help=SAME, rich_help_panel=marker.panel)
+        options |= {"help": SAME, "rich_help_panel": marker.panel}
+        again = typer.Option(*names, **options)
         parts.append(parts[0]._replace(parameter=parameter_of(parameter.name + AGAIN, kind, again, None)))
     return parts
 
@@ -156,32 +168,54 @@ def parameter_of(name: str, kind: Any, info: Any, default: Any) -> Parameter:
 def arguments_of(verb: Callable, parts: Sequence[Part], values: Mapping[str, Any]) -> dict[str, Any]:
     """The function's arguments: those that are set, and recorded runs in place of the options on them."""
     chosen = {part.parameter.name: part for part in parts if part.is_set(values[part.parameter.name])}
-    arguments = {name: values[name] for name, part in chosen.items() if not part.of_logs}
-    of_logs = {name: values[name] for name, part in chosen.items() if part.of_logs}
+    arguments = {name: values[name] for name, part in chosen.items() if not part.group}
+    reading = {name: values[name] for name, part in chosen.items() if part.group == READING}
     for name in [name for name in arguments if name.endswith(AGAIN)]:
         first, again = arguments.get(name.removesuffix(AGAIN)), arguments.pop(name)
-        if first is not None:
-            raise ValueError(
-                f"a tuned file must be one, but got {first} and {chosen[name].marker.names[0]} {again}"
-            )
+        if isinstance(again, list):
+            again = [*(first or []), *again]
+        elif first is not None:
+            option = chosen[name].marker.names[0]
+            raise ValueError(f"a tuned file must be one, but got {first} and {option} {again}")
         arguments[name.removesuffix(AGAIN)] = again
-    for part in parts:
-        name, marker = part.parameter.name, part.marker
+    for name, parameter in inspect.signature(verb).parameters.items():
+        marker = hints_of(verb)[name][1]
         if isinstance(marker, LogsArgument) and name in arguments:
-            arguments[name] = read_logs(arguments[name], **of_logs)
+            arguments[name] = read_logs(arguments[name], **reading)
         elif isinstance(marker, ProblemOption):
-            files, shared = of_logs.pop("log", None), SHARED & arguments.keys()
-            if files:
-                if name in arguments:
-                    got = f"both, {files[0]} and {arguments[name]}"
-                    raise ValueError(f"a problem must be of --log or of --problem, but got {got}")
-                arguments[name] = read_logs(files, **of_logs, **{key: arguments.pop(key) for key in shared})
-            elif of_logs:
-                first = chosen[next(iter(of_logs))].option
-                raise ValueError(
-                    f"{first} must come with --log, but got {short_repr(next(iter(of_logs.values())))}"
-                )
+            problem_in(arguments, name, marker, reading, chosen)
+        elif isinstance(marker, Group):
+            fields = {key: values[key] for key, part in chosen.items() if part.group == name}
+            arguments |= {name: marker.of(**fields)} if fields else {}
+        elif getattr(marker, "unset", UNSET) is not UNSET and parameter.name not in arguments:
+            arguments[name] = marker.unset
     return arguments
+
+
+def problem_in(
+    arguments: dict[str, Any], name: str, marker: Option, reading: dict[str, Any], chosen: Mapping[str, Part]
+) -> None:
+    """Put the problem that is named, or that of recorded runs, in its place among the arguments."""
+    if files := reading.pop("log", None):
+        if name in arguments:
+            got = f"both, {files[0]} and {arguments[name]}"
+            raise ValueError(f"a problem must be of --log or of --problem, but got {got}")
+        shared = {key: arguments.pop(key) for key in SHARED & arguments.keys()}
+        arguments[name] = read_logs(files, **reading, **shared)
+        return
+    changes = {key: reading.pop(key) for key in CHANGES & reading.keys()}
+    if reading:
+        first, value = next(iter(reading.items()))
+        option = chosen[first].option
+        got = option if isinstance(value, bool) else f"{option} {short_repr(value)}"
+        raise ValueError(f"{option} must come with --log, but got {got} without one")
+    if name not in arguments and marker.default is not UNSET:
+        arguments[name] = marker.default
+    if changes:
+        from tuning.api.problems import find_problem  # which imports optuna
+
+        names = arguments[name] if isinstance(arguments[name], list) else [arguments[name]]
+        arguments[name] = [find_problem(each, **changes) for each in names]
 
 
 def files_of(parts: Sequence[Part], values: Mapping[str, Any], role: str) -> list:
@@ -195,7 +229,7 @@ def files_of(parts: Sequence[Part], values: Mapping[str, Any], role: str) -> lis
 
 def described(function: Callable) -> tuple[str, dict[str, str]]:
     """The text of a Google docstring without programs, and the descriptions of the arguments by name."""
-    text, _, rest = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
+    text, rest, *_ = [*re.split(r"\n\n(?:Args|Attributes):\n", inspect.getdoc(function) or ""), ""]
     body = [part for part in text.split("\n\n") if not part.startswith("    ")]
     descriptions: dict[str, str] = {}
     for line in rest.partition("\n\n")[0].splitlines():
@@ -216,7 +250,7 @@ def shell_text(text: str, parts: Sequence[Part] = ()) -> str:
 
 def hints_of(function: Callable) -> dict[str, tuple[Any, Any]]:
     """The type of each parameter and its marker; names that only a type checker imports count as any type."""
-    hints = get_type_hints(function, {}, Names(function.__globals__), include_extras=True)
+    hints = get_type_hints(function, {}, Names(vars(sys.modules[function.__module__])), include_extras=True)
     pairs = {
         name: (get_args(hint) if get_origin(hint) is Annotated else (hint, Option()))
         for name, hint in hints.items()

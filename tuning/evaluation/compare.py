@@ -59,15 +59,6 @@ from tuning.search.trials import best_trial
 OF_FILE, OF_FILTER, STUDY = "tuned", "own", "study"
 STUDY_TRIALS = 20  # of a comparison's study, if no number is given
 TUNING = "tuning"  # how the progress of such a study begins
-# The one explanation of `knows`: that of the command's help, of the docstring of `tuning.compare` and of the docs.
-KNOWS = (
-    "the Q and R of named filters: true (the plant's own, the oracle), scaled (the scaled default), untuned (the "
-    "rule of thumb), given (the model's own), noise (noise estimation) or study (the best on the training seeds "
-    f"of a study of {STUDY_TRIALS} trials and all of these but the oracle; ensemble sizes are not tuned). "
-    "Default: true; study where the model is wrong (its residuals on true states are not white with the plant's Q "
-    "and R), except for rows that estimate further constants; scaled where the plant's Q and R are unknown, or, "
-    "without a scaled default, the first available of given, noise and untuned."
-)
 SAID = {
     "true": "the plant's own (oracle; {option} true)",
     "scaled": "the scaled default ({option} scaled)",
@@ -78,7 +69,7 @@ SAID = {
     OF_FILE: "the tuned ones",
     OF_FILTER: "those of the filter itself",
 }
-KNOWLEDGE = ("true", "scaled", "untuned", "given", "noise", STUDY)  # of Q and R; see `KNOWS`
+KNOWLEDGE = ("true", "scaled", "untuned", "given", "noise", STUDY)  # of Q and R; `tuning.compare` explains it
 OF_BASELINE = {SCALED: "scaled", RULE: "untuned", GIVEN: "given", NOISE: "noise"}
 VERDICTS = {  # in sentences
     "better": "better than",
@@ -111,7 +102,7 @@ def known(
     trials: int = STUDY_TRIALS,
     ensemble_size: int | None = None,
 ) -> Known:
-    """The choice of a filter with some knowledge, by default as `KNOWS` has it.
+    """The choice of a filter with some knowledge, by default as `tuning.compare` explains it.
 
     Args:
         knows: one of `KNOWLEDGE`, or None.
@@ -336,7 +327,7 @@ def contender(
 
     Args:
         name: name of a filter; or an estimator, a function that makes one from a model, or "module:object".
-        knows: one of `KNOWLEDGE`, as `tuning.evaluation.compare.KNOWS` explains; None for what is best known on
+        knows: one of `KNOWLEDGE`, as `tuning.compare` explains; None for what is best known on
             each problem.
         unknown: constants of the model to estimate with the states; a belief of None means `default_belief`.
         seed: seed of the study whose training runs scale the scaled default.

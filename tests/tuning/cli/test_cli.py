@@ -215,7 +215,7 @@ BAD = [
         ("report", "missing"),
         "a report must be of a tuned file or of a study in out/studies.journal, but got 'missing'",
     ),
-    (("evaluate",), "give either a tuned file or --filter NAME"),
+    (("evaluate",), "give either a tuned file or a filter (--filter NAME)"),
     (("evaluate", "a.json", "--tuned", "b.json"), "a tuned file must be one, but got a.json and --tuned b.json"),
     (("evaluate", "--filter", "ekf", "--seeds", "1"), "held-out seeds must be a whole number of at least 2"),
     (
@@ -223,7 +223,7 @@ BAD = [
         "--consistency must end in .png, .svg or .pdf, but",
     ),
     (("evaluate", "--filter", "ekf", "--consistency", "text.txt/x.png"), "must be where it can be written"),
-    (("evaluate", "--filter", "open-loop", "--consistency", "x.png"), "must be for a filter with a covariance"),
+    (("evaluate", "--filter", "open-loop", "--consistency", "x.png"), "must be of a filter with a covariance"),
     (("inspect", "--preset", "none"), "preset must be one of"),
     (("inspect", "--dt", "-1"), "dt must be positive, but got -1.0"),
     (("inspect", "--voltage", "30"), "voltage must be within plus and minus 24, but got 30.0"),

@@ -45,7 +45,7 @@ STEPS = {  # in this order, in one folder: what a command writes, the next ones 
         "identify run1.csv run2.csv run3.csv --free motor_damping --hold-noise --starts 1 --out mine.toml",
         "identify",
     ],
-    "compare": ["compare tuned.json --filter ekf --filter kf --problem nominal --seeds 6", "compare ekf"],
+    "compare": ["compare tuned.json --filter ekf --filter kf --problem nominal --seeds 6", "compare nominal"],
     "report": ["report tuned.json --storage out/studies.journal --out page"],
     "verify": ["verify logs.json"],
     "export": ["export tuned.json --out exported --single"],

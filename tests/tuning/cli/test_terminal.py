@@ -24,10 +24,10 @@ from tuning.api.run import file_name
 from tuning.cli import output
 from tuning.cli.app import COMMANDS, PANELS, listed
 from tuning.cli.reproduce import fitted
-from tuning.cli.tuning_report import way_out
 from tuning.evaluation.baselines import ORACLE, RULE, rule_of_thumb
 from tuning.problems.find import find_problem
 from tuning.reporting.search_figures import draw_history
+from tuning.reporting.tuning_report import way_out
 from tuning.search.plan import Plan
 from tuning.search.study import STOPPING, stop_on_interrupt
 

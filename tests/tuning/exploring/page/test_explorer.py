@@ -47,7 +47,6 @@ def test_own_numbers_are_where_one_starts(as_python):
     [
         (dict(problem="outliers", filter="open-loop"), "filter must be one that has a number to change"),
         (dict(problem="outliers", seeds=0), "seeds must be"),
-        (dict(problem="outliers", dt=0.1), "dt must come with a pair"),
     ],
     ids=str,
 )
