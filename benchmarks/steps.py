@@ -18,15 +18,14 @@ from benchmarks.rates import arithmetic_limit, operations_of, step_of_env, step_
 from benchmarks.timing import Measure, Row, alone, seconds_a_call, side_by_side
 from filters.wrappers.envs import EstimateState
 from thruster_env.core.compiled import compiled, function_fingerprint
-from thruster_env.core.memory import set_row
+from thruster_env.core.memory import WIDTH
+from thruster_env.core.sources import written_out
 from thruster_env.core.streams import ACTION_SPACE, derived_seed
 from thruster_env.core.threads import cores, spread
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.thruster.dynamics import substep
+from thruster_env.thruster.dynamics import Constants, substep
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.plant import Plant, make_plant
-from thruster_env.thruster.simulation import COMMAND, SUBSTEPS, VOLTAGE, Copies, move_thruster
-from thruster_env.thruster.task import Task
 
 ENSEMBLE_SIZE = 50
 HORIZON, HORIZON_GOAL = 10, 1 / 10
@@ -203,31 +202,36 @@ def vector_steps(name: str, seed: int, copies: int = COPIES, steps: int = STEPS,
 
 def propagation() -> Measure:
     """A measure of one Runge-Kutta step of one copy without noise, many copies on all cores."""
-    plant = make_plant()
-    copies = Copies(plant, Task(), PROPAGATED)
-    memory, numbers = copies.memory, copies.numbers
-    for row in (COMMAND, VOLTAGE):
-        set_row(memory, row, np.full(PROPAGATED, 12.0))
-    move, calls = _propagate(), 10
+    constants, states = np.array(make_plant().constants), np.zeros((PROPAGATED // WIDTH, 2, WIDTH))
+    move, calls = _propagate(), 20
 
     def measure() -> float:
         begin = perf_counter()
-        spread(lambda first, last: move(memory, numbers, calls, first, last), len(memory))
-        return (perf_counter() - begin) / (calls * plant.substeps * PROPAGATED)
+        spread(lambda first, last: move(states, constants, calls, first, last), len(states))
+        return (perf_counter() - begin) / (calls * PROPAGATED)
 
-    assert numbers[SUBSTEPS] == plant.substeps
     return measure
+
+
+_constants = written_out(
+    "constants",
+    "numbers",
+    f"Constants({', '.join(f'numbers[{i}]' for i in range(len(Constants._fields)))})",
+    Constants=Constants,
+)
 
 
 @cache
 def _propagate() -> Callable:
     fingerprint = function_fingerprint(within=__name__)
 
-    def propagate(memory, numbers, calls, first, last):
+    def propagate(states, numbers, calls, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
+        c = _constants(numbers)
         for b in range(first, last):
             for _ in range(calls):
-                move_thruster(memory, b, numbers)
+                for j in range(states.shape[2]):
+                    states[b, 0, j], states[b, 1, j] = substep((states[b, 0, j], states[b, 1, j]), (12.0, 0.0), c)
 
     return compiled(propagate)
 

@@ -17,8 +17,8 @@ from benchmarks.timing import Measure, Row, alone, side_by_side
 from filters import make_filter, run
 from filters.filter import Filter
 from thruster_env.auv.dynamics import motion_substep
+from thruster_env.auv.forces import Constants
 from thruster_env.auv.plant import make_plant
-from thruster_env.auv.simulation import read_constants
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.core.threads import cores
@@ -33,6 +33,12 @@ CRUISE = (2.845, -0.01707, 0.0, 0.0)  # propeller's force [N] and torque [N m], 
 N = 8  # states of the model "motion"
 PAIRS = 8  # of a sine and a cosine in a Runge-Kutta step: four rates of roll and pitch
 
+_constants = written_out(
+    "constants",
+    "numbers",
+    f"Constants({', '.join(f'numbers[{i}]' for i in range(len(Constants._fields)))})",
+    Constants=Constants,
+)
 _column = written_out("column", "table, j", tuple_of(f"table[{i}, j]" for i in range(N)))
 _store = written_out("store", "table, j, x", *(f"table[{i}, j] = x[{i}]" for i in range(N)), "None")
 
@@ -104,7 +110,7 @@ def _propagate() -> Callable:
 
     def propagate(table, steps, numbers):
         fingerprint  # noqa: B018 - part of the cache's key
-        c = read_constants(numbers)
+        c = _constants(numbers)
         for _ in range(steps):
             for j in range(table.shape[1]):
                 _store(table, j, motion_substep(_column(table, j), CRUISE, c))

@@ -1,26 +1,26 @@
 """A second plant, as small as one can be: a cart with a motor, three states, two inputs, two channels.
 
-It is what the rooms below a plant are tested with, and shows what a plant has to bring: an equation, where its
-rows lie, a step, and an env that names its arguments.
+It is what the rooms below a plant are tested with, and shows what a plant has to bring: an equation, a page, and
+an env that names its arguments.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.core.checks import arguments_of, covariance_root, positive, takes_arguments_of, vector
-from thruster_env.core.checks import options as checked_options
-from thruster_env.core.compiled import inlined
-from thruster_env.core.memory import FIRST_REPORTED, FRONT, REWARD, STEP, TERMINATED, TIME
+from thruster_env.core.checks import arguments_of, positive, takes_arguments_of
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS
-from thruster_env.effects.effects import Context, chain_of, dropping_channels, encoded
-from thruster_env.effects.sensors import SENSOR_EFFECTS
-from thruster_env.env.copies import BLOCK, Channel, PlantCopies, add_noise, machine_code_of, reader_of
-from thruster_env.env.env import PlantEnv, PlantVectorEnv, ReportRows
+from thruster_env.effects.effects import Context, chain_of, dropping_channels, run_chain
+from thruster_env.effects.sensors import SENSOR_EFFECTS, Reading
+from thruster_env.env.copies import Channel, correlated, root_of
+from thruster_env.env.env import PlantEnv, PlantVectorEnv
 from thruster_env.env.model_env import ModelledEnv
+from thruster_env.env.page import Page
+from thruster_env.graphs.graphs import where
 from thruster_env.model.affine import affine_model
 from thruster_env.model.quantities import Quantity
 
@@ -28,16 +28,10 @@ STATES = (Quantity("position", "p", "m"), Quantity("speed", "v", "m/s"), Quantit
 INPUTS = (Quantity("command", "u", "V"), Quantity("slope", "s", "m/s^2"))
 POSITION, SPEED, FORCE = STATES
 CHANNELS = {
-    "speed": Channel(SPEED, 0.04, 5, lambda x, y, u, c: x[1], lambda x, dy, c: (0, 1, 0)),
-    "position": Channel(POSITION, 0.01, 2, lambda x, y, u, c: x[0], lambda x, dy, c: (1, 0, 0)),
+    "speed": Channel(SPEED, 0.04, lambda x, y, u, c: x[1], lambda x, dy, c: (0, 1, 0)),
+    "position": Channel(POSITION, 0.01, lambda x, y, u, c: x[0], lambda x, dy, c: (1, 0, 0)),
 }
-KINDS = tuple(SENSOR_EFFECTS.effects.values())
 Q, P_0 = np.diag([1e-6, 1e-4, 4e-4]), np.diag([0.1, 0.01, 0.01])
-
-X = len(FRONT)  # three states, then readings, whether they are valid, and what is not reported
-READINGS, VALID, REPORTED, COMMAND, SCRATCH = X + 3, X + 5, X + 7, X + 7, X + 9
-ROWS = SCRATCH + BLOCK
-A, B, MEAN, P_ROOT, Q_ROOT, R_ROOT, CODES, DT, COUNT, EFFECTS = np.cumsum([0, 9, 6, 3, 9, 9, 4, 2, 1, 1]).tolist()
 
 
 class Cart(NamedTuple):
@@ -85,79 +79,53 @@ def cart_model(cart: Cart, process_noise_cov=None):
     )
 
 
-def of_copy(read):
-    return inlined(
-        lambda memory, b, j: read((memory[b, X, j], memory[b, X + 1, j], memory[b, X + 2, j]), (), (), ())
-    )
+class Parameters(NamedTuple):
+    dt: float
+    a: Any
+    b: Any
+    prior_mean: Any
+    prior_root: Any
+    q_root: Any
+    r_root: Any
+    effects: Any
 
 
-read = reader_of(tuple(CHANNELS.values()), of_copy, "memory, b, j")
-sense = chain_of(KINDS, COUNT)
+@lru_cache
+def cart_page(kinds, channels) -> Page:
+    def observed(p, x, memories, t):
+        noise, readings, after = correlated(p.r_root, t.draws.normals(MEASUREMENT)), [], []
+        for i, name in enumerate(channels):
+            reading = Reading(CHANNELS[name].read(x, (), (), ()) + noise[i], 1.0)
+            reading, memory = run_chain(kinds[i], p.effects[i], reading, memories and memories[i], t)
+            readings, after = [*readings, reading], [*after, memory]
+        report = {
+            "state": x,
+            "measurement": tuple(r.z for r in readings),
+            "valid": tuple(r.valid for r in readings),
+        }
+        report |= {"force": x[2], "time": t.step * p.dt, "terminated": where(abs(x[0]) > 0.8, 1.0, 0.0)}
+        return (x, tuple(after)), report
+
+    def begin(p, t):
+        noise = correlated(p.prior_root, t.draws.normals(INITIAL))
+        return observed(p, tuple(m + w for m, w in zip(p.prior_mean, noise, strict=True)), None, t)
+
+    def step(p, memory, action, t):
+        x, memories = memory
+        rows = zip(p.a, p.b, correlated(p.q_root, t.draws.normals(PROCESS)), strict=True)
+        x = tuple(sum(k * v for k, v in zip((*a, *b), (*x, *action), strict=True)) + w for a, b, w in rows)
+        memory, report = observed(p, x, memories, t)
+        return memory, {"reward": -(x[0] * x[0])} | report
+
+    return Page(begin, step, len(INPUTS))
 
 
-@inlined
-def move(memory, b, numbers, begin):
-    for j in range(memory.shape[2]):
-        memory[b, STEP, j] = 0.0 if begin else memory[b, STEP, j] + 1.0
-        x, y, z = memory[b, X, j], memory[b, X + 1, j], memory[b, X + 2, j]
-        for i in range(3):
-            state = numbers[A + 3 * i] * x + numbers[A + 3 * i + 1] * y + numbers[A + 3 * i + 2] * z
-            drive = numbers[B + 2 * i] * memory[b, COMMAND, j] + numbers[B + 2 * i + 1] * memory[b, COMMAND + 1, j]
-            memory[b, X + i, j] = numbers[MEAN + i] if begin else state + drive
-
-
-def step(first, last, memory, numbers, out, begin):
-    for b in range(first, last):
-        move(memory, b, numbers, begin)
-        if begin:
-            add_noise(memory, b, numbers, 3, X, P_ROOT, INITIAL, SCRATCH)
-        else:
-            add_noise(memory, b, numbers, 3, X, Q_ROOT, PROCESS, SCRATCH)
-        for j in range(memory.shape[2]):
-            for i in range(2):
-                memory[b, READINGS + i, j] = read(numbers[CODES + i], memory, b, j)
-                memory[b, VALID + i, j] = 1.0
-            memory[b, REWARD, j] = 0.0 if begin else -memory[b, X, j] * memory[b, X, j]
-            memory[b, TERMINATED, j] = 1.0 if abs(memory[b, X, j]) > 0.8 else 0.0
-            memory[b, TIME, j] = memory[b, STEP, j] * numbers[DT]
-        add_noise(memory, b, numbers, 2, READINGS, R_ROOT, MEASUREMENT, SCRATCH)
-        sense(memory, b, numbers, EFFECTS, begin)
-        for i in range(FIRST_REPORTED, REPORTED):
-            for j in range(memory.shape[2]):
-                out[i, b, j] = memory[b, i, j]
-
-
-class Carts(PlantCopies):
-    commands, reported = (COMMAND, COMMAND + 1), REPORTED
-
-    def encode(self, cart: Cart):
-        self.context, program, rows = Context(cart.dt, VALID - READINGS), [], 0
-        for i, effects in enumerate(cart.sensors.values()):
-            code, taken = encoded(effects, KINDS, READINGS + i, ROWS + rows, 64 * i, self.context)
-            program, rows = program + code, rows + taken
-        roots = [covariance_root(cov).ravel() for cov in (P_0, Q, cart.r)]
-        codes = [CHANNELS[name].code for name in cart.sensors]
-        length = sum(map(len, cart.sensors.values()))
-        fixed = [
-            *(matrix.ravel() for matrix in cart.matrices),
-            np.zeros(3),
-            *roots,
-            codes,
-            [cart.dt, length],
-            program,
-        ]
-        return np.concatenate(fixed).astype(np.float64), ROWS + rows
-
-    def machine_code(self):
-        return machine_code_of(step)
-
-    def numbers_from(self, options):
-        given = checked_options(options).get("state")
-        if given is None:
-            return None
-        numbers = self.numbers.copy()
-        numbers[MEAN : MEAN + 3], numbers[P_ROOT : P_ROOT + 9] = vector("the state of options", given, 3), 0.0
-        return numbers
+def page_of(cart: Cart, task: None):
+    chains = [chain_of(effects, Context(cart.dt), 64 * i) for i, effects in enumerate(cart.sensors.values())]
+    a, b = (tuple(map(tuple, matrix.tolist())) for matrix in cart.matrices)
+    roots = [root_of(cov) for cov in (P_0, Q, cart.r)]
+    p = Parameters(cart.dt, a, b, (0.0,) * 3, *roots, tuple(parameters for _, parameters in chains))
+    return cart_page(tuple(kinds for kinds, _ in chains), tuple(cart.sensors)), p
 
 
 class ModelledCart(ModelledEnv):
@@ -171,18 +139,14 @@ class CartEnv(ModelledCart, PlantEnv):
     """Keep a cart near its origin. The list of arguments is that of `make_cart`."""
 
     inputs = INPUTS
+    page_of = staticmethod(page_of)
 
     @takes_arguments_of(make_cart)
     def __init__(self, *, render_mode=None, **arguments):
         self.plant = make_cart(**arguments_of(make_cart, arguments))
-        readings, valid = slice(READINGS, READINGS + 2), slice(VALID, VALID + 2)
-        dropping = dropping_channels(self.plant.sensors)
-        info = {"state": slice(X, X + 3), "measurement": readings, "time": TIME}
         space = gym.spaces.Box(np.float32([-5.0, -1.0]), np.float32([5.0, 1.0]))
-        self._set_up(space, ReportRows(readings, valid, dropping, (X + 2,), info), render_mode)
-
-    def copies_of(self, count):
-        return Carts(self.plant, None, count)
+        info, dropping = ("state", "measurement", "time"), dropping_channels(self.plant.sensors)
+        self._set_up(space, info, ("force",), dropping, render_mode)
 
 
 class CartVectorEnv(ModelledCart, PlantVectorEnv):

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from thruster_env.thruster.parameters import PRESETS, ThrusterParameters
 
 may_be_inlined("thruster_env.core")
+may_be_inlined("thruster_env.graphs", "thruster_env.core")
 may_be_inlined("thruster_env.model", "thruster_env.core")
-may_be_inlined("thruster_env.effects", "thruster_env.core")
+may_be_inlined("thruster_env.effects", "thruster_env.graphs")
 may_be_inlined("thruster_env.env", "thruster_env.model", "thruster_env.effects")
 may_be_inlined("thruster_env.thruster", "thruster_env.env")
 may_be_inlined("thruster_env.auv", "thruster_env.env")

@@ -18,6 +18,7 @@ from thruster_env.thruster.analysis import jacobians, required_substeps, run_sub
 from thruster_env.thruster.controllers import LQRController, PIController
 from thruster_env.thruster.dynamics import rates
 from thruster_env.thruster.effects import AMPLIFIER_EFFECTS, FLOW_SIGNALS, REFERENCE_SIGNALS
+from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, derive_constants
 from thruster_env.thruster.plant import (
     DEFAULT_DT,
@@ -25,17 +26,6 @@ from thruster_env.thruster.plant import (
     DEFAULT_MEASUREMENT_NOISE,
     Plant,
     make_plant,
-)
-from thruster_env.thruster.simulation import (
-    AMBIENT,
-    FIXED_ROWS,
-    READINGS,
-    REFERENCE,
-    THRUST,
-    VALID,
-    VOLTAGE,
-    Copies,
-    simulate,
 )
 from thruster_env.thruster.task import Task
 
@@ -291,11 +281,12 @@ def sensor_effects(path: Path) -> Path:
     figure, axes = subplots((9.6, 4.6), 2, 4, sharex=True, sharey=True)
     for axis, (title, effects) in zip(axes.flat, examples.items(), strict=True):
         record = run(make_plant(sensors={"thrust": effects}, initial_state={"voltage": 12.0}), voltages)
-        valid, time = record[:, VALID] > 0, 0.01 * np.arange(len(record))
-        axis.plot(time, record[:, THRUST], color=DARK, linewidth=1.2, label="thrust")
-        axis.plot(time[valid], record[valid, READINGS], ".", color=BLUE, markersize=3.5, label="measurement")
+        valid, readings = record["valid"][:, 0] > 0, record["measurement"][:, 0]
+        time = 0.01 * np.arange(len(valid))
+        axis.plot(time, record["thrust"], color=DARK, linewidth=1.2, label="thrust")
+        axis.plot(time[valid], readings[valid], ".", color=BLUE, markersize=3.5, label="measurement")
         missing = ~valid
-        axis.plot(time[missing], record[missing, READINGS], "x", color=RUST, markersize=3.5, label="missing")
+        axis.plot(time[missing], readings[missing], "x", color=RUST, markersize=3.5, label="missing")
         axis.set_title(title, fontsize=9)
     label_grid(axes, "time [s]", "thrust [N]")
     legend_below(figure, axes[0, 0])
@@ -312,7 +303,7 @@ def flow_signals(path: Path) -> Path:
     }
     plain = make_plant(process_noise_cov=[0.0, 0.0], initial_state={"voltage": 12.0})
     plants = {title: plain._replace(flow=FLOW_SIGNALS.make(signal)) for title, signal in examples.items()}
-    return _signals(path, plants, plain, np.full(500, 12.0), (AMBIENT, "flow $U_0$ [m/s]"))
+    return _signals(path, plants, plain, np.full(500, 12.0), ("ambient_velocity", "flow $U_0$ [m/s]"))
 
 
 def amplifier_effects(path: Path) -> Path:
@@ -328,7 +319,7 @@ def amplifier_effects(path: Path) -> Path:
     plain = make_plant("t200", max_voltage=FULL_VOLTAGE["t200"], **QUIET)
     make = AMPLIFIER_EFFECTS.make
     plants = {title: plain._replace(amplifier=make(effect)) for title, effect in examples.items()}
-    return _signals(path, plants, plain, voltages, (VOLTAGE, "voltage [V]"))
+    return _signals(path, plants, plain, voltages, ("voltage", "voltage [V]"))
 
 
 def references(path: Path) -> Path:
@@ -347,7 +338,7 @@ def references(path: Path) -> Path:
     figure, axes = subplots((9.6, 4.4), 2, 4, sharex=True, sharey=True)
     for axis, (title, signals) in zip(axes.flat, examples.items(), strict=True):
         record = run(plant, np.zeros(500), Task(REFERENCE_SIGNALS.make(signals)), seed=6)
-        axis.step(0.01 * np.arange(501), record[:, REFERENCE], where="post", color=BLUE, linewidth=1.4)
+        axis.step(0.01 * np.arange(501), record["reference"], where="post", color=BLUE, linewidth=1.4)
         axis.set_title(title, fontsize=9)
     axes[0, 0].set_ylim(0, 50)
     label_grid(axes, "time [s]", "reference thrust [N]")
@@ -370,28 +361,25 @@ def frame(path: Path) -> Path:
     return path
 
 
-def run(plant: Plant, voltages: np.ndarray, task: Task | None = None, seed: int = SEED) -> np.ndarray:
-    """Record (K + 1, rows) of one copy under voltages (K,); `engine.memory` names the rows."""
-    copies = Copies(plant, task or Task(), 1)
-    copies.begin(episode_keys([seed]))
-    record = [copies.memory[0, :FIXED_ROWS, 0].copy()]
-    for voltage in voltages:
-        copies.step(np.array([voltage]))
-        record.append(copies.memory[0, :FIXED_ROWS, 0].copy())
-    return np.array(record)
+def run(plant: Plant, voltages: np.ndarray, task: Task | None = None, seed: int = SEED) -> dict[str, np.ndarray]:
+    """The report of one copy under voltages (K,) by name, (K + 1,) or (K + 1, entries)."""
+    copies = copies_of(plant, task or Task(), 1)
+    reports = [copies.begin(episode_keys([seed]))[:, 0]]
+    reports += [copies.step(np.array([voltage]))[:, 0] for voltage in voltages]
+    return {name: np.array(reports)[:, rows] for name, rows in copies.report_rows.items()}
 
 
-def _signals(path: Path, plants: dict[str, Plant], plain: Plant, voltages, first_row: tuple[int, str]) -> Path:
+def _signals(path: Path, plants: dict[str, Plant], plain: Plant, voltages, first_row: tuple[str, str]) -> Path:
     """One column a plant: the row `first_row` above, the thrust below, each beside that of the plain plant."""
     figure, axes = subplots((9.6, 4.6), 2, 4, sharex=True, sharey="row")
     row, label = first_row
     time = 0.01 * np.arange(1, len(voltages) + 1)
-    undisturbed = run(plain, voltages)[1:]
+    undisturbed = run(plain, voltages)
     for column, (title, plant) in zip(axes.T, plants.items(), strict=True):
-        record = run(plant, voltages)[1:]
-        for axis, values in zip(column, (row, THRUST), strict=True):
-            axis.plot(time, record[:, values], color=BLUE, linewidth=1.4, label="with the effect")
-            axis.plot(time, undisturbed[:, values], color=DARK, linewidth=1.0, linestyle="--", label="without")
+        record = run(plant, voltages)
+        for axis, values in zip(column, (row, "thrust"), strict=True):
+            axis.plot(time, record[values][1:], color=BLUE, linewidth=1.4, label="with the effect")
+            axis.plot(time, undisturbed[values][1:], color=DARK, linewidth=1.0, linestyle="--", label="without")
         column[0].set_title(title, fontsize=9)
         column[1].set_xlabel("time [s]")
     axes[0, 0].set_ylabel(label)

@@ -11,8 +11,8 @@ from tests.oracles import each_close, equal
 from tests.slow import SLOW
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys, filter_keys
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.simulation import simulate
 
 
 def stepped(filter_, key, inputs, measurements):

@@ -20,12 +20,12 @@ ROOMS = {  # of thruster_env, and the rooms that each knows
     "core": set(),
     "graphs": {"core"},
     "model": {"core", "graphs"},
-    "effects": {"core"},
+    "effects": {"core", "graphs"},
     "render": {"core"},
     "logs": {"core", "model"},
-    "env": {"core", "model", "effects", "render", "logs"},
-    "thruster": {"core", "model", "effects", "render", "logs", "env"},
-    "auv": {"core", "model", "effects", "render", "logs", "env"},
+    "env": {"core", "graphs", "model", "effects", "render", "logs"},
+    "thruster": {"core", "graphs", "model", "effects", "render", "logs", "env"},
+    "auv": {"core", "graphs", "model", "effects", "render", "logs", "env"},
 }
 PLANTS = {"thruster", "auv"}
 KNOW_PLANTS = ("tuning/thruster/", "tuning/auv/", "tuning/policies/", "tuning/experiments/", "tuning/cli/")

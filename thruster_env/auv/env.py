@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.auv import simulation as at
+from thruster_env.auv.equations import PHI, PSI, THETA, U, X, Y, Z, page_of
 from thruster_env.auv.paths import make_depth_task, make_task
 from thruster_env.auv.plant import Plant, make_plant
 from thruster_env.auv.rendering import Moment, Renderer
-from thruster_env.auv.simulation import Copies
 from thruster_env.core.checks import arguments_of, takes_arguments_of
 from thruster_env.core.memory import TIME
-from thruster_env.env.env import PlantEnv, PlantVectorEnv, ReportRows
+from thruster_env.env.env import PlantEnv, PlantVectorEnv
 from thruster_env.env.model_env import ModelledEnv, Split, split
 from thruster_env.render.renderer import MODES
 
@@ -123,7 +122,7 @@ class SegorogeniAUVEnv(ModelledVehicle, PlantEnv):
     lags, `current` (3,) to the north, to the east and down [m/s], `path_errors` (2,) to starboard of the path and
     below it [m], `path_piece`, the number of the straight piece of the path that the vehicle has got to,
     `reckoned` (4,) north, east, down [m] and yaw [rad] by the vehicle's own reckoning (see
-    `thruster_env.auv.simulation`), `time` [s]; where a channel may be missing also `measurement_valid` (m,).
+    `thruster_env.auv.equations`), `time` [s]; where a channel may be missing also `measurement_valid` (m,).
 
     ## Episode
     Starts about a cruise at 1 m/s, N(mean, diag) with 0.05 m/s in u, 0.02 m/s and rad/s in the other velocities,
@@ -139,6 +138,7 @@ class SegorogeniAUVEnv(ModelledVehicle, PlantEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 20}
+    page_of = staticmethod(page_of)
     observes_errors = False
 
     @takes_arguments_of(make_plant, make_task, leaving_out=["substeps"])
@@ -152,25 +152,9 @@ class SegorogeniAUVEnv(ModelledVehicle, PlantEnv):
         if start is None or set(start) == {"speed"}:  # the others say how deep it begins
             plant = at_depth(plant, arguments["depth"])
         self.plant, self.task, self.inputs = plant, task, plant.inputs
-        m = len(plant.channels)
-        measurement = slice(at.READINGS, at.READINGS + m)
-        info: dict[str, int | slice] = {
-            "state": slice(at.STATE, at.STATE + at.N),
-            "measurement": measurement,
-            "inputs": slice(at.INPUTS, at.INPUTS + 4),
-            "current": slice(at.CURRENT, at.CURRENT + 3),
-            "path_errors": slice(at.TRUE_ERRORS, at.TRUE_ERRORS + 2),
-            "path_piece": at.PIECE,
-            "reckoned": slice(at.RECKONED, at.RECKONED + 4),
-            "time": TIME,
-        }
-        appended = (at.PATH_DEPTH, *range(at.ERRORS, at.ERRORS + 5)) if self.observes_errors else ()
-        rows = ReportRows(measurement, slice(at.VALID, at.VALID + m), plant.dropping_channels, appended, info)
-        self._set_up(action_space(plant), rows, *rendering)
-
-    def copies_of(self, count: int) -> Copies:
-        """Return `count` vehicles with the env's task."""
-        return Copies(self.plant, self.task, count)
+        info = "state", "measurement", "inputs", "current", "path_errors", "path_piece", "reckoned", "time"
+        appended = ("path_depth", "errors") if self.observes_errors else ()
+        self._set_up(action_space(plant), info, appended, plant.dropping_channels, *rendering)
 
     def make_renderer(self) -> Renderer:
         """The renderer of the vehicle and its path."""
@@ -187,27 +171,25 @@ class SegorogeniAUVEnv(ModelledVehicle, PlantEnv):
 
     def moment_of(self, report: list[float]) -> Moment:
         """The renderer's input from a report: truth, measurements, the path abreast and the actuators."""
-        channels, state = self.plant.channels, report[at.STATE : at.STATE + at.N]
-
-        def measured(symbol: str) -> float | None:
-            return report[at.READINGS + channels.index(symbol)] if symbol in channels else None
-
+        values = self._by_name(report)
+        state, inputs = values["state"], values["inputs"]
+        measured = dict(zip(self.plant.channels, values["measurement"], strict=True))
         return Moment(
             time=report[TIME],
-            x=state[at.X],
-            y=state[at.Y],
-            depth=state[at.Z],
-            phi=state[at.PHI],
-            theta=state[at.THETA],
-            psi=state[at.PSI],
-            u=state[at.U],
-            measured_depth=measured("z"),
-            measured_u=measured("u"),
-            reference_depth=state[at.Z] - report[at.TRUE_ERRORS + 1],
+            x=state[X],
+            y=state[Y],
+            depth=state[Z],
+            phi=state[PHI],
+            theta=state[THETA],
+            psi=state[PSI],
+            u=state[U],
+            measured_depth=measured.get("z"),
+            measured_u=measured.get("u"),
+            reference_depth=state[Z] - values["path_errors"][1],
             reference_u=self.task.speed,
-            thrust=report[at.INPUTS],
-            stern=report[at.INPUTS + 2],
-            rudder=report[at.INPUTS + 3],
+            thrust=inputs[0],
+            stern=inputs[2],
+            rudder=inputs[3],
         )
 
 
@@ -220,7 +202,7 @@ def action_space(plant: Plant) -> gym.spaces.Box:
 def at_depth(plant: Plant, depth: float) -> Plant:
     """The plant whose initial state has its mean at a depth [m]."""
     mean = plant.initial_mean.copy()
-    mean[at.Z] = depth
+    mean[Z] = depth
     return plant._replace(initial_mean=mean)
 
 

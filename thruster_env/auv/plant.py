@@ -25,9 +25,8 @@ from thruster_env.auv.dynamics import required_substeps
 from thruster_env.auv.forces import Constants
 from thruster_env.auv.parameters import PRESETS, VehicleParameters, derive_constants, preset_parameters
 from thruster_env.core.checks import at_least, between, finite, one_of, positive, short_repr, within
-from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import tuple_of, written_out
-from thruster_env.effects.effects import Context, Effect, Registry, dropping_channels
+from thruster_env.effects.effects import Effect, Registry, dropping_channels
 from thruster_env.effects.sensors import SENSOR_EFFECTS, SampleEvery, hold_missing
 from thruster_env.effects.signals import ConstantSignal, GaussMarkov, Gusts, RecordedSignal, Sinusoid
 from thruster_env.env.copies import Channel
@@ -94,16 +93,6 @@ def _signals(direction: str, signals_or_speed) -> tuple[Effect, ...]:
     return tuple(signal for signal in signals if signal != ConstantSignal(0.0))
 
 
-# The context of effects on a vehicle.
-
-
-@dataclass(frozen=True)
-class VehicleContext(Context):
-    """The data with which an effect on a vehicle computes its parameters."""
-
-    depth_row: int  # of the memory: the true depth [m]
-
-
 # What spoils a vehicle's measurements: the effects that every plant has, and being below the surface.
 
 
@@ -117,20 +106,12 @@ class NearSurface(Effect):
 
     depth: float = 1.0
     checks = {"depth": finite}
-    row_count = 1  # the last measurement that was not missing
     loses = True
 
-    def parameters(self, context: VehicleContext) -> list[float]:
-        """The depth [m], where validity stands, the row of the true depth."""
-        return [self.depth, context.valid_offset, context.depth_row]
-
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, reading, last, t):
         """Lose a measurement at depths beyond a limit."""
-        limit, valid, depth = numbers[at], target + int(numbers[at + 1]), int(numbers[at + 2])
-        for j in range(memory.shape[2]):
-            hold_missing(memory, b, j, target, rows, valid, not memory[b, depth, j] < limit, begin)
+        return hold_missing(reading, t.state[-1] < e.depth, last)
 
 
 # Names, symbols and units of the vehicle's states and inputs.
@@ -227,7 +208,7 @@ SUITES: dict[str, tuple[str, ...]] = {
 """Suites of instruments by name: "default" for navigation, "motion" for what eight states predict, ..."""
 
 
-def _of_state(symbol: str, code: int, name: str | None = None) -> Channel:
+def _of_state(symbol: str, name: str | None = None) -> Channel:
     """The channel that measures one state, or a second channel of it with another name."""
     i = SYMBOLS.index(symbol)
     _, _, unit, angle = STATES[i]
@@ -236,7 +217,6 @@ def _of_state(symbol: str, code: int, name: str | None = None) -> Channel:
     return Channel(
         Quantity(f"measured {STATES[i].name}" + (" (satellites)" if name != symbol else ""), name, unit, angle),
         deviation**2,
-        code,
         written_out("read", "x, y, u, c", f"x[{i}]"),
         written_out("slopes", "x, dy, c", unit_row(i, len(STATES))),
     )
@@ -248,9 +228,9 @@ def unit_row(index: int, count: int) -> str:
 
 
 CHANNELS: dict[str, Channel] = {
-    **{symbol: _of_state(symbol, code) for code, symbol in enumerate(SYMBOLS)},
-    "x_gps": _of_state("x", 12, "x_gps"),
-    "y_gps": _of_state("y", 13, "y_gps"),
+    **{symbol: _of_state(symbol) for symbol in SYMBOLS},
+    "x_gps": _of_state("x", "x_gps"),
+    "y_gps": _of_state("y", "y_gps"),
 }
 """Channels by name, of a plant of twelve states."""
 

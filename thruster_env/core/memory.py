@@ -1,9 +1,8 @@
 """The memory of many copies of a plant: one float64 array (blocks, rows, width), block by block.
 
-The rows of a block fit the fastest cache, and every loop over copies is vectorised. A single env is one block of
-width one. The first rows of every plant hold what random draws depend on and what a step reports; the plant's own
-rows follow. Each measured channel has a row, and another one, `Context.valid_offset` rows further on (the same
-distance for all channels of a plant), that says whether the measurement is valid.
+The rows of a block fit the fastest cache. A single env is one block of width one; blocks of more copies are whole
+groups of copies that are advanced side by side. The first rows of every plant hold what random draws depend on and
+what a step reports; the plant's own rows follow.
 """
 
 from __future__ import annotations
@@ -15,15 +14,13 @@ FIRST_REPORTED = REWARD
 WIDTH = 128  # copies in a block: 23 rows of them are 23 KiB
 
 
-def new_memory(copies: int, rows: int, width: int | None = None) -> np.ndarray:
-    """Memory (blocks, rows, width) of zeros for a number of copies; the last block may have some to spare."""
-    width = min(copies, WIDTH) if width is None else width
+def new_memory(copies: int, rows: int, lanes: int) -> np.ndarray:
+    """Memory (blocks, rows, width) of zeros for a number of copies; the last block may have some to spare.
+
+    The width is a multiple of `lanes`.
+    """
+    width = min(-(-copies // lanes) * lanes, WIDTH)
     return np.zeros((-(-copies // width), rows, width))
-
-
-def row(memory: np.ndarray, index: int, copies: int) -> np.ndarray:
-    """A copy of one row for all copies, (copies,)."""
-    return memory[:, index].reshape(-1)[:copies]
 
 
 def set_row(memory: np.ndarray, index: int, values: np.ndarray) -> None:
@@ -35,9 +32,9 @@ def set_row(memory: np.ndarray, index: int, values: np.ndarray) -> None:
         memory[full, index, : len(values) - full * width] = values[full * width :]
 
 
-def gathered(memory: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Memory of some copies, given by their numbers (count,), in separate blocks."""
-    part = np.zeros((-(-len(which) // min(len(which), WIDTH)), memory.shape[1], min(len(which), WIDTH)))
+def gathered(memory: np.ndarray, which: np.ndarray, lanes: int) -> np.ndarray:
+    """Memory of some copies, given by their numbers (count,), in separate blocks of a multiple of `lanes`."""
+    part = new_memory(len(which), memory.shape[1], lanes)
     block, column = np.divmod(which, memory.shape[2])
     own_block, own_column = np.divmod(np.arange(len(which)), part.shape[2])
     part[own_block, :, own_column] = memory[block, :, column]

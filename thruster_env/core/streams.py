@@ -228,7 +228,7 @@ AT_ONCE = 512  # blocks that Python draws in one pass
 _MULTIPLIER_0, _MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 _WEYL_0, _WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 _LOW, _SHIFT, _NONE = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(0)
-_SQRT_HALF_BITS = int(np.float64(np.sqrt(0.5)).view(np.int64))
+SQRT_HALF_BITS = int(np.float64(np.sqrt(0.5)).view(np.int64))
 _LN_2, _TWO_TO_MINUS_32 = float(np.log(2.0)), 2.0**-32
 
 
@@ -280,14 +280,8 @@ def uniform_block(block, step, stream, key_0, key_1):
 
 
 @inlined
-def logarithm(x):
-    """Natural logarithm of a positive, normal float64 to 1e-15, without a branch or a library call.
-
-    x = 2^e m with m in [sqrt(1/2), sqrt(2)); log m = 2 artanh((m - 1)/(m + 1)) by its series.
-    """
-    bits = np.float64(x).view(np.int64)
-    exponent = (bits - _SQRT_HALF_BITS) >> 52
-    m = np.int64(bits - (exponent << 52)).view(np.float64)
+def logarithm_of_parts(exponent, m):
+    """The logarithm of 2^exponent m, m in [sqrt(1/2), sqrt(2)): log m = 2 artanh((m - 1)/(m + 1)), a series."""
     s = (m - 1.0) / (m + 1.0)
     t = s * s
     series = 1.0 / 21.0
@@ -301,18 +295,38 @@ def logarithm(x):
     series = series * t + 1.0 / 5.0
     series = series * t + 1.0 / 3.0
     series = series * t + 1.0
-    return np.float64(exponent) * _LN_2 + 2.0 * s * series
+    return exponent * _LN_2 + 2.0 * s * series
+
+
+@inlined
+def exponent_and_mantissa(x):
+    """The exponent e and the mantissa m of x = 2^e m, m in [sqrt(1/2), sqrt(2)), of positive, normal float64."""
+    bits = np.float64(x).view(np.int64)
+    exponent = (bits - SQRT_HALF_BITS) >> 52
+    return np.float64(exponent), np.int64(bits - (exponent << 52)).view(np.float64)
+
+
+@inlined
+def logarithm(x):
+    """Natural logarithm of a positive, normal float64 to 1e-15, without a branch or a library call."""
+    exponent, m = exponent_and_mantissa(x)
+    return logarithm_of_parts(exponent, m)
+
+
+@inlined
+def polar(log_0, u_1, log_2, u_3):
+    """Four standard normals of uniform numbers, of which two are given by their logarithms (Box, Muller)."""
+    radius_0, radius_1 = (-2.0 * log_0) ** 0.5, (-2.0 * log_2) ** 0.5
+    cosine_0, sine_0 = cosine_and_sine_of_turns(u_1 - 0.5)
+    cosine_1, sine_1 = cosine_and_sine_of_turns(u_3 - 0.5)
+    return radius_0 * cosine_0, radius_0 * sine_0, radius_1 * cosine_1, radius_1 * sine_1
 
 
 @inlined
 def normal_block(block, step, stream, key_0, key_1):
     """Four independent standard normals (|value| < 6.8) for one block of one step of one stream."""
     u0, u1, u2, u3 = uniform_block(block, step, stream, key_0, key_1)
-    radius_0 = (-2.0 * logarithm(u0)) ** 0.5
-    radius_1 = (-2.0 * logarithm(u2)) ** 0.5
-    cosine_0, sine_0 = cosine_and_sine_of_turns(u1 - 0.5)
-    cosine_1, sine_1 = cosine_and_sine_of_turns(u3 - 0.5)
-    return radius_0 * cosine_0, radius_0 * sine_0, radius_1 * cosine_1, radius_1 * sine_1
+    return polar(logarithm(u0), u1, logarithm(u2), u3)
 
 
 @overloaded

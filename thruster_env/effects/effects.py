@@ -1,37 +1,31 @@
 """Effects that disturb a plant: immutable values, registered by name, that JSON can hold.
 
-An effect is a frozen dataclass of plain numbers with the function that acts on a block of copies,
+An effect is a frozen dataclass of plain numbers with the function by which it acts in each step,
 
-    act(memory, b, target, rows, number, numbers, at, begin)
+    act(e, value, memory, t) -> value, memory
 
-where `memory[b, target, j]` is the value that it changes for copy j, `memory[b, rows + i, j]` are its own states,
-`numbers[at + i]` its parameters, `number` distinguishes its random draws from those of other effects, and `begin`
-is true at the start of an episode. The same function serves a single env, a batch and a vector env. Anyone may
-register further effects before the first env is made.
-
-Effects are called, not inlined: each loops over all copies of a block, and a plant's two kernels share them.
+of its parameters e, the value that it changes, the memory of the last step and the moment t. At the start of an
+episode `t.begin` is true and the memory None. The function is pure; it is traced once and runs for any number of
+copies (`thruster_env.env.page`). Anyone may register further effects.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
-from typing import Any, ClassVar, TypeVar
+from collections import namedtuple
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
 from thruster_env.core.checks import positive, short_repr, within
-from thruster_env.core.compiled import inlined, not_inlined
-from thruster_env.core.memory import KEY_0, KEY_1, STEP
-from thruster_env.core.sources import written_out
-from thruster_env.core.streams import CHANCE, DISTURBANCE, normal_block, uniform_block
+from thruster_env.core.streams import CHANCE, DISTURBANCE
+from thruster_env.graphs.draws import Draws
+from thruster_env.graphs.values import shape_of, traceable
 
-# An effect in a row of numbers: its length, kind, row that it acts on, first row of its own, number, parameters.
-EFFECT_KIND, EFFECT_TARGET, EFFECT_ROWS, EFFECT_NUMBER, EFFECT_PARAMETERS = range(1, 6)
 MAGNITUDES = (1e-100, 1e100)  # of an effect's arguments and of what follows from them
 LONGEST = 1e9  # [s], and in steps: what an effect may hold
-PLANT_ROWS, TRIED_ROW = 4096, 2048  # more rows than a plant has, and one of them: where an effect is tried
 SPACING = 64  # effects of each chain have numbers of their own, whatever the other chains hold
 
 
@@ -40,7 +34,43 @@ class Context:
     """The context from which an effect computes its parameters; a plant may extend it in a subclass."""
 
     dt: float  # sample time [s]
-    valid_offset: int  # from the row of a measured channel to the one that says whether it is valid
+
+
+def unrolled(count: int, body: Callable, x: tuple, inputs: Any) -> tuple:
+    """X after `count` calls x = body(x, inputs)."""
+    for _ in range(count):
+        x = body(x, inputs)
+    return x
+
+
+class Moment(NamedTuple):
+    """A step of a plant, and what an effect may ask of it.
+
+    Attributes:
+        begin: whether an episode starts, known when the function is traced.
+        step: the number of the step.
+        dt: the sample time [s].
+        draws: the random numbers of the step.
+        state: the plant's state: sensors know that of the step, the amplifier that before it.
+        number: distinguishes the effect's random numbers from those of other effects.
+        repeat: repeat(count, body, x, inputs) is x after `count` calls x = body(x, inputs).
+    """
+
+    begin: bool
+    step: Any
+    dt: Any
+    draws: Draws
+    state: tuple = ()
+    number: int = 0
+    repeat: Callable = unrolled
+
+    def uniforms(self, stream: int = CHANCE, step: Any = None) -> tuple:
+        """Four uniform numbers in (0, 1), independent of other effects and steps."""
+        return self.draws.uniforms(stream, self.number, self.step if step is None else step)
+
+    def normals(self, stream: int = DISTURBANCE, step: Any = None) -> tuple:
+        """Four standard normals, independent of other effects and steps."""
+        return self.draws.normals(stream, 4, self.number, self.step if step is None else step)
 
 
 class Effect:
@@ -53,7 +83,6 @@ class Effect:
     act: ClassVar[Callable]  # the function above, a staticmethod
     name: ClassVar[str]
     checks: ClassVar[Mapping[str, Callable]] = {}  # `check(name, value)` of an argument returns its stored value
-    row_count: ClassVar[int] = 0  # states that a copy keeps for this effect
     loses: ClassVar[bool] = False  # whether measurements may be missing: then their validity is observed
 
     def __post_init__(self):
@@ -61,13 +90,13 @@ class Effect:
         for name, check in self.checks.items():
             set_field(self, name, check(name, getattr(self, name)))
 
-    def parameters(self, context: Any) -> list[float]:
-        """Parameters that `act` reads from `numbers[at]` on: the fields in order, unless overridden."""
-        return [float(value) for value in dataclasses.astuple(self)]
+    def parameters(self, context: Any) -> dict[str, Any]:
+        """The parameters e by name: the arguments, unless overridden.
 
-    def rows(self, context: Any) -> int:
-        """Number of states that a copy keeps for this effect: `row_count`, unless overridden."""
-        return self.row_count
+        A float or a tuple of floats is a number at run time, an array a table (`graphs.values.Table`). An integer
+        is known when `act` is traced, and another one makes another program.
+        """
+        return {name: float(getattr(self, name)) for name in self.__dataclass_fields__}
 
     def largest(self) -> float:
         """Largest magnitude of a signal, at four standard deviations of its random part."""
@@ -93,8 +122,7 @@ def checked_probability(name: str, value) -> float:
     return float(value)
 
 
-Kind = TypeVar("Kind", bound=Effect)
-_tried: set[tuple[type[Effect], int]] = set()  # types of effects, and their rows, that stay within their memory
+Registered = TypeVar("Registered", bound=Effect)
 
 
 class Registry:
@@ -107,10 +135,10 @@ class Registry:
         for name, effect in (effects or {}).items():
             self.register(name)(effect)
 
-    def register(self, name: str) -> Callable[[type[Kind]], type[Kind]]:
+    def register(self, name: str) -> Callable[[type[Registered]], type[Registered]]:
         """Return a class decorator that makes a frozen dataclass an effect of this name."""
 
-        def decorate(cls: type[Kind]) -> type[Kind]:
+        def decorate(cls: type[Registered]) -> type[Registered]:
             cls.name = name
             self.effects[name] = cls
             return cls
@@ -154,100 +182,85 @@ class Registry:
             raise ValueError(f"{rule}, but got {short_repr(arguments)}") from None
 
 
-@inlined
-def normals(memory, b, j, number):
-    """Four standard normals of one effect, copy and step."""
-    return normal_block(number, memory[b, STEP, j], DISTURBANCE, memory[b, KEY_0, j], memory[b, KEY_1, j])
+# Chains of effects that act one after the other: kinds, for which a plant's step is traced, and parameters.
 
 
-@inlined
-def uniforms(memory, b, j, number):
-    """Four uniform numbers in (0, 1) of one effect, copy and step."""
-    return uniform_block(number, memory[b, STEP, j], CHANCE, memory[b, KEY_0, j], memory[b, KEY_1, j])
+class Kind(NamedTuple):
+    """What a program is made for: the type of an effect, its parameters known now, and the names of the others."""
+
+    effect: type[Effect]
+    known: tuple[tuple[str, int], ...]
+    names: tuple[str, ...]
+    number: int
+
+    def arguments(self, values: Sequence) -> tuple:
+        """The parameters e of `act`, of the values of those that are not known now."""
+        known = tuple(value for _, value in self.known)
+        return _record((*self.names, *(name for name, _ in self.known)))(*values, *known)
 
 
-def encoded(
-    effects,
-    kinds: tuple[type[Effect], ...],
-    target: int,
-    first_row: int,
-    first_number: int,
-    context: Context,
-    lost_with: int | None = None,
-):
-    """Numbers of some effects on one target row, and the number of rows that they take.
-
-    With `lost_with`, the first number of another channel's effects, measurements are lost when that channel's are.
-    """
-    numbers: list[float] = []
-    rows = 0
-    for index, effect in enumerate(effects):
-        parameters = _representable(effect, effect.parameters(context))
-        _check_reach(effect, parameters, context)
-        number = index + (lost_with if effect.loses and lost_with is not None else first_number)
-        header = [5 + len(parameters), kinds.index(type(effect)), target, first_row + rows, number]
-        numbers += [*header, *parameters]
-        rows += effect.rows(context)
-    return numbers, rows
+@cache
+def _record(names: tuple[str, ...]) -> Callable[..., tuple]:
+    return namedtuple("Parameters", names)
 
 
-def encoded_chains(
-    chains: Iterable[tuple[int, Sequence[Effect], int, int, int | None]],
-    kinds: tuple[tuple[type[Effect], ...], ...],
-    first_row: int,
-    context: Context,
-) -> tuple[list[float], list[int], int]:
-    """Numbers of a plant's effects in the order in which they act, their count by section, and the rows they take.
+def chain_of(
+    effects: Sequence[Effect], context: Context, first: int = 0, lost_with: int | None = None
+) -> tuple[tuple[Kind, ...], tuple[tuple, ...]]:
+    """The kinds of some effects and their parameters.
 
     Args:
-        chains: section, effects, target row, first number and `lost_with` (see `encoded`) of each chain.
-        kinds: the known types of effects of each section.
-        first_row: the first row of the memory that effects may have.
+        effects: that act one after the other.
         context: of the plant.
+        first: the number of the first of them.
+        lost_with: the first number of another chain: measurements are lost when those of that one are.
     """
-    program: list[float] = []
-    counts, rows = [0] * len(kinds), 0
-    for section, effects, target, number, lost_with in chains:
-        code, row_count = encoded(effects, kinds[section], target, first_row + rows, number, context, lost_with)
-        program += code
-        counts[section] += len(effects)
-        rows += row_count
-    return program, counts, rows
+    kinds, parameters = [], []
+    for index, effect in enumerate(effects):
+        values = _representable(effect, effect.parameters(context))
+        number = index + (lost_with if effect.loses and lost_with is not None else first)
+        known = tuple((name, value) for name, value in values.items() if isinstance(value, int))
+        names = tuple(name for name, value in values.items() if not isinstance(value, int))
+        kinds.append(Kind(type(effect), known, names, number))
+        parameters.append(tuple(values[name] for name in names))
+    return tuple(kinds), tuple(parameters)
 
 
-def _representable(effect: Effect, parameters: list[float]) -> list[float]:
-    """An effect's parameters as floats; ValueError if an argument or a parameter is too large or too small."""
+def run_chain(
+    kinds: Sequence[Kind], parameters: Sequence, value: Any, memories: Sequence | None, t: Moment
+) -> tuple[Any, tuple]:
+    """The value after some effects, and their memories, from those of the last step.
+
+    Raises:
+        ValueError: if `act` of an effect cannot be traced, or keeps another number of values than at the start.
+    """
+    memories_after = []
+    for kind, numbers, memory in zip(kinds, parameters, memories or (None,) * len(kinds), strict=True):
+        name = kind.effect.name
+        try:
+            value, after = traceable(kind.effect.act)(
+                kind.arguments(numbers), value, memory, t._replace(number=kind.number)
+            )
+        except TypeError as error:
+            rule = f"act of {name!r} must be a function of numbers, and where(condition, a, b) choose between them"
+            raise ValueError(f"{rule}, but {error}") from error
+        if not t.begin and shape_of(after) != shape_of(memory):
+            rule = "must have a memory of the same shape in each step as at the start of an episode"
+            raise ValueError(f"act of {name!r} {rule}, but got {after!r}")
+        memories_after.append(after)
+    return value, tuple(memories_after)
+
+
+def _representable(effect: Effect, parameters: Mapping[str, Any]) -> Mapping[str, Any]:
+    """An effect's parameters; ValueError if an argument or a parameter is too large or too small."""
     smallest, largest = MAGNITUDES
     parts: list[Any] = [*_numbers(dataclasses.astuple(effect)), 0.0]
     magnitudes = [abs(value) for value in np.hstack(parts) if value]
-    if min(magnitudes, default=1.0) < smallest or not all(
-        abs(value) <= largest for value in (*magnitudes, *parameters)
-    ):
+    following = np.abs(np.hstack([0.0, *map(np.ravel, parameters.values())]))
+    if min(magnitudes, default=1.0) < smallest or not max(*magnitudes, 0.0, following.max()) <= largest:
         rule = f"arguments of {effect.name!r} must be zero, or from {smallest:g} to {largest:g} in magnitude"
         raise ValueError(f"{rule}, and so must what follows from them, but got {short_repr(effect)}")
-    return [float(value) for value in parameters]
-
-
-def _check_reach(effect: Effect, parameters: list[float], context: Context) -> None:
-    """Raise ValueError if `act` goes beyond the effect's rows or parameters, which compiled code would not notice.
-
-    It is tried as Python, once for each type and number of rows, at the end of a memory that NumPy guards.
-    """
-    rows = effect.rows(context)
-    if (type(effect), rows) in _tried:
-        return
-    memory, numbers = np.zeros((1, PLANT_ROWS + rows, 1)), np.array([0.0] * EFFECT_PARAMETERS + parameters)
-    memory[0, [KEY_0, KEY_1], 0] = 1.0, 2.0
-    try:
-        for step in range(3):
-            memory[0, STEP, 0] = step
-            effect.act(memory, 0, TRIED_ROW, PLANT_ROWS, 1, numbers, EFFECT_PARAMETERS, step == 0)
-    except IndexError as error:
-        rule = (
-            f"act of {effect.name!r} must stay within its {rows} rows (row_count) and {len(parameters)} parameters"
-        )
-        raise ValueError(f"{rule}, but goes beyond them: {error}") from None
-    _tried.add((type(effect), rows))
+    return parameters
 
 
 def _numbers(values: tuple) -> list:
@@ -258,37 +271,3 @@ def _numbers(values: tuple) -> list:
 def set_field(effect: object, name: str, value) -> None:
     """Set a checked value on a frozen effect, from its __post_init__."""
     object.__setattr__(effect, name, value)
-
-
-# Chains of effects in compiled code: packed parameters of effects that act one after the other.
-
-
-def _dispatch(effects: tuple[type[Effect], ...]) -> Callable:
-    """Write out `run(kind, ...)`, which calls the function of one of some effects."""
-    arguments = "memory, b, target, rows, number, numbers, at, begin"
-    functions: dict[str, Any] = {f"act_{i}": not_inlined(effect.act) for i, effect in enumerate(effects)}
-    lines = [line for i, name in enumerate(functions) for line in (f"if kind == {i}:", f"    {name}({arguments})")]
-    return written_out("run_effect", f"kind, {arguments}", *lines, "None", **functions)
-
-
-def chain_of(effects: tuple[type[Effect], ...], count: int) -> Callable:
-    """Return `run(memory, b, numbers, at, begin)`: run the effects that `effects.encoded` put at numbers[at].
-
-    It returns the offset behind them.
-
-    Args:
-        effects: the known types of effects, as `encoded` had them.
-        count: the offset in numbers of the number of effects.
-    """
-    dispatch = _dispatch(effects)
-
-    @not_inlined
-    def run_chain(memory, b, numbers, at, begin):
-        for _ in range(int(numbers[count])):
-            kind, target = int(numbers[at + EFFECT_KIND]), int(numbers[at + EFFECT_TARGET])
-            rows, number = int(numbers[at + EFFECT_ROWS]), int(numbers[at + EFFECT_NUMBER])
-            dispatch(kind, memory, b, target, rows, number, numbers, at + EFFECT_PARAMETERS, begin)
-            at += int(numbers[at])
-        return at
-
-    return run_chain

@@ -9,37 +9,38 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from thruster_env.core.checks import at_least, finite, positive
-from thruster_env.core.compiled import inlined
-from thruster_env.core.memory import STEP
 from thruster_env.effects.effects import (
     Context,
     Effect,
     Registry,
     checked_probability,
-    normals,
     not_negative,
     set_field,
-    uniforms,
 )
+from thruster_env.graphs.graphs import where
+from thruster_env.graphs.values import Line
 
 SENSOR_EFFECTS = Registry("sensors")
 LONGEST_INTERVAL = 1_000_000  # steps between two samples
 LONGEST_DELAY = 10_000  # steps, each of which takes two numbers of every copy's memory
 
 
-@inlined
-def hold_missing(memory, b, j, target, last, valid, missing, begin):
-    """If copy j's measurement is missing, repeat the last one, stored in row `last`, and mark it as not valid."""
-    if begin:
-        memory[b, last, j] = 0.0
-    if missing:
-        memory[b, target, j] = memory[b, last, j]
-        memory[b, valid, j] = 0.0
-    memory[b, last, j] = memory[b, target, j]
+class Reading(NamedTuple):
+    """What a sensor's effects change: the measurement, and 1.0 if it is valid, 0.0 if it is missing."""
+
+    z: Any
+    valid: Any
+
+
+def hold_missing(reading: Reading, arrives, last) -> tuple[Reading, Any]:
+    """The reading if it arrives, else the last one (0 before the first) as not valid; and the next last one."""
+    z = where(arrives, reading.z, 0.0 if last is None else last)
+    return Reading(z, where(arrives, reading.valid, 0.0)), z
 
 
 def _degrees(name: str, value) -> float:
@@ -63,19 +64,12 @@ class StudentT(Effect):
     degrees: float = 3.0
     checks = {"scale": not_negative, "degrees": _degrees}
 
-    def parameters(self, context: Context) -> list[float]:
-        """Degrees of freedom and scale."""
-        return [self.degrees, self.scale]
-
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, reading, memory, t):
         """Add scale times a Student-t variate: Bailey's (1994) form of the transform of Box and Muller."""
-        degrees, scale = numbers[at], numbers[at + 1]
-        for j in range(memory.shape[2]):
-            u0, u1, _, _ = uniforms(memory, b, j, number)
-            radius = (degrees * (u0 ** (-2.0 / degrees) - 1.0)) ** 0.5
-            memory[b, target, j] += scale * radius * math.cos(2.0 * math.pi * u1)
+        u0, u1, _, _ = t.uniforms()
+        radius = (e.degrees * (u0 ** (-2.0 / e.degrees) - 1.0)) ** 0.5
+        return reading._replace(z=reading.z + e.scale * radius * math.cos(2.0 * math.pi * u1)), memory
 
 
 @SENSOR_EFFECTS.register("outliers")
@@ -87,20 +81,11 @@ class Outliers(Effect):
     probability: float = 0.05
     checks = {"std": not_negative, "probability": checked_probability}
 
-    def parameters(self, context: Context) -> list[float]:
-        """Probability and standard deviation."""
-        return [self.probability, self.std]
-
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, reading, memory, t):
         """With a probability add a normal variate of a standard deviation."""
-        probability, std = numbers[at], numbers[at + 1]
-        for j in range(memory.shape[2]):
-            u, _, _, _ = uniforms(memory, b, j, number)
-            v, _, _, _ = normals(memory, b, j, number)
-            if u < probability:
-                memory[b, target, j] += std * v
+        z = where(t.uniforms()[0] < e.probability, reading.z + e.std * t.normals()[0], reading.z)
+        return reading._replace(z=z), memory
 
 
 @SENSOR_EFFECTS.register("bias")
@@ -112,19 +97,13 @@ class Bias(Effect):
     std: float = 0.0
     drift: float = 0.0
     checks = {"value": finite, "std": not_negative, "drift": not_negative}
-    row_count = 1  # the bias
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, reading, bias, t):
         """Add a bias that starts at value + std n and drifts by a random walk."""
-        for j in range(memory.shape[2]):
-            v, _, _, _ = normals(memory, b, j, number)
-            if begin:
-                memory[b, rows, j] = numbers[at] + numbers[at + 1] * v
-            else:
-                memory[b, rows, j] += numbers[at + 2] * v
-            memory[b, target, j] += memory[b, rows, j]
+        n = t.normals()[0]
+        bias = e.value + e.std * n if t.begin else bias + e.drift * n
+        return reading._replace(z=reading.z + bias), bias
 
 
 @SENSOR_EFFECTS.register("quantisation")
@@ -136,12 +115,9 @@ class Quantisation(Effect):
     checks = {"step": positive}
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, reading, memory, t):
         """Round to the nearest multiple of a step."""
-        step = numbers[at]
-        for j in range(memory.shape[2]):  # math.floor would make an integer, which ends at 2^63
-            memory[b, target, j] = np.floor(memory[b, target, j] / step + 0.5) * step
+        return reading._replace(z=np.floor(reading.z / e.step + 0.5) * e.step), memory
 
 
 @SENSOR_EFFECTS.register("saturation")
@@ -161,11 +137,9 @@ class SensorSaturation(Effect):
         set_field(self, "high", high)
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, reading, memory, t):
         """Clip to an interval."""
-        for j in range(memory.shape[2]):
-            memory[b, target, j] = min(max(memory[b, target, j], numbers[at]), numbers[at + 1])
+        return reading._replace(z=min(max(reading.z, e.low), e.high)), memory
 
 
 @SENSOR_EFFECTS.register("dropout")
@@ -183,7 +157,6 @@ class Dropout(Effect):
 
     probability: float = 0.1
     mean_length: float | None = None
-    row_count = 2  # the last valid measurement, and whether one is missing
     loses = True
 
     def __post_init__(self):
@@ -198,27 +171,19 @@ class Dropout(Effect):
         set_field(self, "probability", share)
         set_field(self, "mean_length", length)
 
-    def parameters(self, context: Context) -> list[float]:
-        """Probabilities that a run of missing measurements begins and ends; offset of the validity flag."""
+    def parameters(self, context: Context) -> dict[str, Any]:
+        """Probabilities that a run of missing measurements begins and ends."""
         assert self.mean_length is not None  # it is set when the effect is made
         begins = self.probability / (1.0 - self.probability) / self.mean_length
-        return [begins, 1.0 / self.mean_length, context.valid_offset]
+        return {"begins": begins, "ends": 1.0 / self.mean_length}
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, reading, memory, t):
         """Lose measurements in runs (a two-state Markov chain); a lost one repeats the last and is not valid."""
-        begins, ends, valid = numbers[at], numbers[at + 1], target + int(numbers[at + 2])
-        last, lost = rows, rows + 1
-        for j in range(memory.shape[2]):
-            u, _, _, _ = uniforms(memory, b, j, number)
-            if begin:
-                memory[b, lost, j] = 0.0
-            if memory[b, lost, j] > 0.0:
-                memory[b, lost, j] = 0.0 if u < ends else 1.0
-            else:
-                memory[b, lost, j] = 1.0 if u < begins else 0.0
-            hold_missing(memory, b, j, target, last, valid, memory[b, lost, j] > 0.0, begin)
+        (u, _, _, _), (last, was_lost) = t.uniforms(), (None, 0.0) if t.begin else memory
+        lost = where(was_lost > 0.0, where(u < e.ends, 0.0, 1.0), where(u < e.begins, 1.0, 0.0))
+        reading, last = hold_missing(reading, lost == 0.0, last)
+        return reading, (last, lost)
 
 
 def _delay_steps(name: str, value) -> int:
@@ -236,30 +201,15 @@ class Delay(Effect):
     steps: int = 1
     checks = {"steps": _delay_steps}
 
-    def parameters(self, context: Context) -> list[float]:
-        """Steps, and offset of the validity flag."""
-        return [self.steps, context.valid_offset]
-
-    def rows(self, context: Context) -> int:
-        """Measurements on their way, and whether they are valid."""
-        return 2 * self.steps
+    def parameters(self, context: Context) -> dict[str, Any]:
+        """Steps, the length of the line."""
+        return {"steps": self.steps}
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
-        """Report the measurement of `steps` steps ago, from a ring of rows; at first the first measurement."""
-        steps, valid = int(numbers[at]), target + int(numbers[at + 1])
-        for j in range(memory.shape[2]):
-            if begin:
-                for i in range(steps):
-                    memory[b, rows + i, j] = memory[b, target, j]
-                    memory[b, rows + steps + i, j] = memory[b, valid, j]
-            slot = rows + int(memory[b, STEP, j]) % steps
-            now, now_valid = memory[b, target, j], memory[b, valid, j]
-            memory[b, target, j] = memory[b, slot, j]
-            memory[b, valid, j] = memory[b, slot + steps, j]
-            memory[b, slot, j] = now
-            memory[b, slot + steps, j] = now_valid
+    def act(e, reading, line, t):
+        """Report the measurement of `steps` steps ago; at first the first measurement."""
+        line = Line(e.steps, reading) if t.begin else line
+        return line.push(reading)
 
 
 @SENSOR_EFFECTS.register("sample-every")
@@ -273,7 +223,6 @@ class SampleEvery(Effect):
 
     steps: int
     first: int = 0
-    row_count = 1  # the last sample
     loses = True
 
     def __post_init__(self):
@@ -282,15 +231,7 @@ class SampleEvery(Effect):
         set_field(self, "steps", steps)
         set_field(self, "first", at_least("first", self.first, 0, LONGEST_INTERVAL) % steps)
 
-    def parameters(self, context: Context) -> list[float]:
-        """Steps between two samples, number of the first one, and offset of the validity flag."""
-        return [self.steps, self.first, context.valid_offset]
-
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, reading, last, t):
         """Take a sample at steps first, first + steps, first + 2 steps, ...; between them the last is repeated."""
-        steps, first, valid = int(numbers[at]), int(numbers[at + 1]), target + int(numbers[at + 2])
-        for j in range(memory.shape[2]):
-            between = (int(memory[b, STEP, j]) - first) % steps != 0
-            hold_missing(memory, b, j, target, rows, valid, between, begin)
+        return hold_missing(reading, (t.step - e.first) % e.steps == 0.0, last)

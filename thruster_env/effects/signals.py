@@ -10,30 +10,23 @@ import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from thruster_env.core.checks import finite, positive, short_repr, vector
-from thruster_env.core.compiled import inlined
-from thruster_env.core.memory import STEP
-from thruster_env.effects.effects import Context, Effect, normals, not_negative, set_field, uniforms
+from thruster_env.effects.effects import Context, Effect, not_negative, set_field
+from thruster_env.graphs.graphs import where
 
 
-@inlined
-def recorded_value(time, numbers, at):
-    """Value of a series at a time [s], linear between samples; numbers: sample time, repeat, count, values."""
-    sample_time, repeat, count = numbers[at], numbers[at + 1], int(numbers[at + 2])
-    position = max(time / sample_time, 0.0)
-    if repeat > 0.0:
-        position = position % count
-    else:
-        position = min(position, count - 1.0)
-    before = min(int(position), count - 1)
-    after = before + 1
-    if after >= count:
-        after = 0 if repeat > 0.0 else before
+def recorded_value(e, time):
+    """The value at a time [s] of a series e with its sample time, linear between its values."""
+    position, count = max(time / e.sample_time, 0.0), e.series.count
+    position = position % count if e.repeat else min(position, count - 1.0)
+    before = min(np.floor(position), count - 1.0)
+    after = where(before + 1.0 < count, before + 1.0, 0.0 if e.repeat else before)
     share = position - before
-    return (1.0 - share) * numbers[at + 3 + before] + share * numbers[at + 3 + after]
+    return (1.0 - share) * e.series[before] + share * e.series[after]
 
 
 @dataclass(frozen=True)
@@ -48,11 +41,9 @@ class ConstantSignal(Effect):
         return abs(self.value)
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, value, memory, t):
         """Add a constant."""
-        for j in range(memory.shape[2]):
-            memory[b, target, j] += numbers[at]
+        return value + e.value, memory
 
 
 @dataclass(frozen=True)
@@ -68,18 +59,11 @@ class Sinusoid(Effect):
         """The amplitude."""
         return abs(self.amplitude)
 
-    def parameters(self, context: Context) -> list[float]:
-        """Amplitude, period [s], phase [rad], sample time [s]."""
-        return [self.amplitude, self.period, self.phase, context.dt]
-
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, value, memory, t):
         """Add amplitude sin(2 pi t/period + phase)."""
-        amplitude, period, phase, dt = numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3]
-        for j in range(memory.shape[2]):
-            time = (memory[b, STEP, j] - 0.5) * dt
-            memory[b, target, j] += amplitude * math.sin(2.0 * math.pi * time / period + phase)
+        time = (t.step - 0.5) * t.dt
+        return value + e.amplitude * math.sin(2.0 * math.pi * time / e.period + e.phase), memory
 
 
 @dataclass(frozen=True)
@@ -89,26 +73,21 @@ class GaussMarkov(Effect):
     std: float
     time_constant: float = 1.0
     checks = {"std": not_negative, "time_constant": positive}
-    row_count = 1  # the process
 
     def largest(self) -> float:
         """Four standard deviations."""
         return 4.0 * self.std
 
-    def parameters(self, context: Context) -> list[float]:
+    def parameters(self, context: Context) -> dict[str, Any]:
         """Standard deviation and the correlation of neighbouring steps."""
-        return [self.std, math.exp(-context.dt / self.time_constant)]
+        return {"std": self.std, "decay": math.exp(-context.dt / self.time_constant)}
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, value, x, t):
         """Add a first-order Gauss-Markov process, x' = a x + s sqrt(1 - a^2) n, stationary from the start."""
-        std, decay = numbers[at], numbers[at + 1]
-        spread = (1.0 - decay * decay) ** 0.5
-        for j in range(memory.shape[2]):
-            n, _, _, _ = normals(memory, b, j, number)
-            memory[b, rows, j] = std * n if begin else decay * memory[b, rows, j] + std * spread * n
-            memory[b, target, j] += memory[b, rows, j]
+        n = t.normals()[0]
+        x = e.std * n if t.begin else e.decay * x + e.std * (1.0 - e.decay * e.decay) ** 0.5 * n
+        return value + x, x
 
 
 @dataclass(frozen=True)
@@ -125,34 +104,25 @@ class Gusts(Effect):
     rate: float = 0.5
     duration: float = 0.5
     checks = {"std": not_negative, "rate": not_negative, "duration": positive}
-    row_count = 2  # time since the gust began, and its height
 
     def largest(self) -> float:
         """Four standard deviations of the height [m/s]."""
         return 4.0 * self.std
 
-    def parameters(self, context: Context) -> list[float]:
-        """Probability that one begins in a calm step, standard deviation, duration [s], sample time [s]."""
-        return [1.0 - math.exp(-self.rate * context.dt), self.std, self.duration, context.dt]
+    def parameters(self, context: Context) -> dict[str, Any]:
+        """Probability that one begins in a calm step, standard deviation, duration [s]."""
+        chance = 1.0 - math.exp(-self.rate * context.dt)
+        return {"chance": chance, "std": self.std, "duration": self.duration}
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, value, memory, t):
         """Add gusts that begin at random; each is height/2 (1 - cos(2 pi t/duration)), with a normal height."""
-        chance, std, duration, dt = numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3]
-        since, height = rows, rows + 1
-        for j in range(memory.shape[2]):
-            u, _, _, _ = uniforms(memory, b, j, number)
-            n, _, _, _ = normals(memory, b, j, number)
-            if begin:
-                memory[b, since, j] = duration
-            memory[b, since, j] += dt
-            if memory[b, since, j] >= duration and u < chance:
-                memory[b, since, j] = 0.5 * dt
-                memory[b, height, j] = std * n
-            if memory[b, since, j] < duration:
-                turn = 2.0 * math.pi * memory[b, since, j] / duration
-                memory[b, target, j] += 0.5 * memory[b, height, j] * (1.0 - math.cos(turn))
+        since, height = (e.duration, 0.0) if t.begin else memory
+        since = since + t.dt
+        begins = (since >= e.duration) & (t.uniforms()[0] < e.chance)
+        since, height = where(begins, 0.5 * t.dt, since), where(begins, e.std * t.normals()[0], height)
+        gust = 0.5 * height * (1.0 - math.cos(2.0 * math.pi * since / e.duration))
+        return value + where(since < e.duration, gust, 0.0), (since, height)
 
 
 @dataclass(frozen=True)
@@ -196,9 +166,9 @@ class RecordedSeries(Effect):
         """Largest magnitude in the series."""
         return max(map(abs, self._series))
 
-    def parameters(self, context: Context) -> list[float]:
-        """The plant's sample time [s], and the parameters of `recorded_value`."""
-        return [context.dt, self.sample_time, float(self.repeat), float(len(self._series)), *self._series]
+    def parameters(self, context: Context) -> dict[str, Any]:
+        """The parameters of `recorded_value`."""
+        return {"sample_time": self.sample_time, "repeat": int(self.repeat), "series": np.array(self._series)}
 
 
 def _column(file: str, column: str | None) -> np.ndarray:
@@ -224,9 +194,6 @@ class RecordedSignal(RecordedSeries):
     """A recorded signal."""
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, value, memory, t):
         """Add a recorded series."""
-        for j in range(memory.shape[2]):
-            time = (memory[b, STEP, j] - 0.5) * numbers[at]
-            memory[b, target, j] += recorded_value(time, numbers, at + 1)
+        return value + recorded_value(e, (t.step - 0.5) * t.dt), memory

@@ -3,58 +3,64 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
-from typing import Any, ClassVar, NamedTuple
+from itertools import repeat
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from thruster_env.core.checks import covariance_root
 from thruster_env.core.checks import options as checked_options
-from thruster_env.core.compiled import CompiledOrPython, compiled, function_fingerprint, inlined, is_interpreting
-from thruster_env.core.memory import KEY_0, KEY_1, STEP, gathered, new_memory, scatter, set_row
+from thruster_env.core.compiled import inlined, is_interpreting
+from thruster_env.core.memory import KEY_0, KEY_1, gathered, new_memory, scatter, set_row
 from thruster_env.core.results import as_array
 from thruster_env.core.sources import tuple_of, written_out
-from thruster_env.core.streams import normal_block
-from thruster_env.core.threads import in_parts, worker_threads
+from thruster_env.core.threads import worker_threads
+from thruster_env.env.page import LANES, machine_code_of, packed, programs_of
 from thruster_env.env.plant_data import checked_state
+from thruster_env.graphs.graphs import where
+from thruster_env.graphs.values import built, shape_of
 from thruster_env.model.quantities import Quantity
 
 THREADED_BLOCKS = 8  # fewer blocks are done before a second thread has woken up
+PICKLED = ("page_of", "plant", "task", "count", "memory")
 
 
 class PlantCopies:
     """N copies of a plant with a task, each with its own key; a report of them is an array (reported, N).
 
-    A plant's class defines the rows of commands and reports, packs its parameters (`encode`) and finds its
-    compiled step, `advance(first, last, memory, numbers, out, begin)` on blocks first ... last - 1: with `begin`
-    it starts an episode of every copy from the keys in its memory and takes the first measurement; otherwise it
-    applies the commands for one sample time. It writes its report to out (reported, blocks, width).
-
     Attributes:
-        commands: rows of the memory that hold the inputs of the next step.
+        report_rows: the row or rows of a report by name.
         reported: the row after the last one that a step reports.
+        commands: rows of the memory that hold the inputs of the next step.
     """
 
-    commands: tuple[int, ...]
-    reported: ClassVar[int]
     advance: Callable
 
-    def __init__(self, plant: Any, task: Any, count: int):
-        """Allocate the memory of `count` copies; call `begin` next."""
-        self.plant, self.task, self.count = plant, task, count
-        self.numbers, rows = self.encode(plant)
-        self.memory = new_memory(count, rows)
-        self._find_machine_code()
+    def __init__(self, page_of: Callable, plant: Any, task: Any, count: int):
+        """Allocate the memory of `count` copies; call `begin` next.
 
-    def encode(self, plant: Any) -> tuple[np.ndarray, int]:
-        """Packed parameters of a plant with the task, which the compiled step reads, and a copy's rows of memory.
-
-        The rows in front (`thruster_env.core.memory.FRONT`) are included.
+        Args:
+            page_of: `page_of(plant, task)` returns the `Page` and its parameters, a named tuple with the sample
+                time `dt`, and `prior_mean` and `prior_root` of the initial state.
+            plant: the plant.
+            task: its task.
+            count: number of copies.
         """
-        raise NotImplementedError
+        self.page_of, self.plant, self.task, self.count = page_of, plant, task, count
+        self._find_machine_code()
+        self.memory = new_memory(count, self.programs.rows, self._lanes)
 
-    def machine_code(self) -> tuple[Callable, CompiledOrPython]:
-        """The compiled step, and the same for several threads, from `machine_code_of`."""
-        raise NotImplementedError
+    def _find_machine_code(self) -> None:
+        page, parameters = self.page_of(self.plant, self.task)
+        shape = shape_of(parameters)
+        self.parameters, self.numbers, self.programs = parameters, packed(parameters), programs_of(page, shape)
+        self.report_rows, self.reported = self.programs.report, self.programs.reported
+        self.commands, self.lines = self.programs.action, self.programs.lines
+        self.advance, self._advance_in_parts = machine_code_of(page, shape, self.count == 1, is_interpreting())
+
+    @property
+    def _lanes(self) -> int:
+        return 1 if self.count == 1 else LANES
 
     def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
         """Numbers for `begin` with the initial state that a reset's options fix in "state", or None.
@@ -64,22 +70,19 @@ class PlantCopies:
         start = checked_options(options).get("state")
         if start is None:
             return None
-        n = len(self.plant.initial_mean)
-        state = checked_state("the state of options", start, n)
-        return self.encode(self.plant._replace(initial_mean=state, initial_cov=np.zeros((n, n))))[0]
-
-    def prepare(self, memory: np.ndarray, keys: np.ndarray) -> None:
-        """Write further initial values of episodes with keys (count, 2), such as random parameters."""
-
-    def _find_machine_code(self) -> None:
-        self.advance, self._advance_in_parts = self.machine_code()
+        p = self.parameters
+        state = checked_state("the state of options", start, len(p.prior_mean))
+        root = built(shape_of(p.prior_root), repeat(0.0))
+        return packed(p._replace(prior_mean=tuple(state), prior_root=root))
 
     def __getstate__(self) -> dict:
-        """All but the machine code, which pickle cannot hold and every process finds for itself."""
-        return {key: value for key, value in vars(self).items() if key not in ("advance", "_advance_in_parts")}
+        """All but the page and its machine code, which every process finds for itself."""
+        return {name: getattr(self, name) for name in PICKLED}
 
     def __setstate__(self, state: dict) -> None:
-        """Find the machine code for the restored memory."""
+        """Find the machine code for the restored memory; ValueError for the memory of another version."""
+        if state.keys() != set(PICKLED):
+            raise ValueError("copies of a plant must be pickled by this version, but these are from an older one")
         vars(self).update(state)
         self._find_machine_code()
 
@@ -94,10 +97,9 @@ class PlantCopies:
         `numbers` may replace the plant's own, with another initial state.
         """
         numbers = self.numbers if numbers is None else numbers
-        memory = self.memory if which is None else gathered(self.memory, which)
+        memory = self.memory if which is None else gathered(self.memory, which, self._lanes)
         set_row(memory, KEY_0, keys[:, 0])
         set_row(memory, KEY_1, keys[:, 1])
-        self.prepare(memory, keys)
         out = self._run(memory, numbers, True)
         if which is not None:
             scatter(memory, self.memory, which)
@@ -121,53 +123,33 @@ class PlantCopies:
         blocks, _, width = memory.shape
         # A block more than there are: rows that lie a power of two apart would drive one another out of the cache.
         out = np.empty((self.reported, blocks + 1, width))
+        arguments = memory, numbers, self.lines, out, begin
         if blocks < THREADED_BLOCKS:
-            self.advance(0, blocks, memory, numbers, out, begin)
+            self.advance(0, blocks, *arguments)
         else:
-            worker_threads().run(self._advance_in_parts, blocks, memory, numbers, out, begin)
+            worker_threads().run(self._advance_in_parts, blocks, *arguments)
         return out.reshape(self.reported, -1)
 
 
-def machine_code_of(step: Callable) -> tuple[Callable, CompiledOrPython]:
-    """The step of a plant's class for `PlantCopies.machine_code`, from a plain function."""
-    return _machine_code_of(step, is_interpreting())
+# What pages are written with.
 
 
-@cache
-def _machine_code_of(step: Callable, interpreting: bool) -> tuple[Callable, CompiledOrPython]:
-    inlined(step)
-    fingerprint = function_fingerprint(step, within=step.__module__)
-
-    def advance(first, last, memory, numbers, out, begin):
-        fingerprint  # noqa: B018 - part of the cache's key
-        step(first, last, memory, numbers, out, begin)
-
-    return compiled(advance), in_parts(step)
+def root_of(cov: np.ndarray) -> tuple[tuple[float | None, ...], ...]:
+    """The lower triangular root of a covariance by rows; None for zeros, with which nothing is computed."""
+    root = covariance_root(cov)
+    return tuple(tuple(value or None for value in row[: i + 1]) for i, row in enumerate(root.tolist()))
 
 
-BLOCK = 4  # normals of one draw
+def correlated(root: Sequence[Sequence], draws: Sequence) -> list:
+    """L w of a root L from `root_of` and independent draws w."""
+    rows = ([a * b for a, b in zip(row, draws, strict=False) if a is not None] for row in root)
+    return [sum(terms[1:], terms[0]) if terms else 0.0 for terms in rows]
 
 
-@inlined
-def add_noise(memory, b, numbers, size, first, root, stream, scratch):
-    """Add w ~ N(0, L L') to rows first ... first + size - 1 of every copy.
-
-    The lower triangular L (size, size) lies at numbers[root], by rows; its zeros cost nothing. The draws are those
-    of `thruster_env.model.simulate` with the same keys; `stream` is the purpose of the noise, from
-    `thruster_env.core.streams`. For initial states the row STEP must be 0. Draws are written into the rows from
-    `scratch` on, `size` rounded up to a multiple of BLOCK.
-    """
-    for block in range((size + BLOCK - 1) // BLOCK):
-        at = scratch + BLOCK * block
-        for j in range(memory.shape[2]):
-            w = normal_block(block, memory[b, STEP, j], stream, memory[b, KEY_0, j], memory[b, KEY_1, j])
-            memory[b, at, j], memory[b, at + 1, j], memory[b, at + 2, j], memory[b, at + 3, j] = w
-    for i in range(size):
-        for k in range(i + 1):
-            factor = numbers[root + i * size + k]
-            if factor != 0.0:
-                for j in range(memory.shape[2]):
-                    memory[b, first + i, j] += factor * memory[b, scratch + k, j]
+def clipped(value, low, high):
+    """A number within low ... high."""
+    value = where(value < low, low, value)
+    return where(value > high, high, value)
 
 
 # Channels: a sensor's measurement of a plant, defined once for the plant's step and for a filter's model.
@@ -182,8 +164,6 @@ class Channel(NamedTuple):
     Attributes:
         quantity: the measured quantity, with its unit.
         variance: default variance of the channel's Gaussian noise [unit^2].
-        code: unique integer that identifies the channel in compiled code; it never changes, so the order of
-            channels has no meaning.
         read: h(x, y, u, c).
         slopes: `slopes(x, dy, c)`, the n derivatives dh/dx, where row i of dy is the gradient of output i; None if
             the channel depends on the input.
@@ -192,34 +172,9 @@ class Channel(NamedTuple):
 
     quantity: Quantity
     variance: float
-    code: int
     read: Callable
     slopes: Callable | None = None
     affine: bool = True
-
-
-def reader_of(channels: Sequence[Channel], of_copy: Callable[[Callable], Callable], arguments: str) -> Callable:
-    """Return `read(code, *arguments)`, which reads the channel of a code for one copy of a plant.
-
-    Args:
-        channels: data for compiled code.
-        of_copy: `of_copy(read)` makes a function of the arguments that finds the inputs of a channel's `read` in a
-            copy, and reads it; so compiled code computes only what this channel needs.
-        arguments: their names, "memory, b, j".
-
-    Raises:
-        ValueError: if two channels have one code.
-    """
-    codes = sorted(channel.code for channel in channels)
-    if len(set(codes)) < len(codes):
-        raise ValueError(f"codes of channels must differ from one another, but got {codes}")
-    functions: dict[str, Any] = {
-        f"read_{channel.code}": inlined(of_copy(inlined(channel.read))) for channel in channels
-    }
-    source = f"read_{codes[0]}({arguments})"
-    for code in codes[1:]:
-        source = f"read_{code}({arguments}) if code == {code} else {source}"
-    return written_out("read", f"code, {arguments}", source, **functions)
 
 
 def functions_of(

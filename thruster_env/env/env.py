@@ -22,6 +22,7 @@ from thruster_env.core.sources import written_out
 from thruster_env.core.streams import EpisodeKeys, draw_key, reset_mask
 from thruster_env.env.commands import of_copies, one_number, some_numbers
 from thruster_env.env.copies import PlantCopies
+from thruster_env.env.page import Page
 from thruster_env.env.plant_data import as_json
 from thruster_env.model.quantities import Quantity
 
@@ -62,6 +63,20 @@ class ReportRows(NamedTuple):
     dropping: tuple[int, ...]  # channels whose measurements may be missing; their validity stands in observations
     appended: tuple[int, ...]  # rows that stand last in the observation, such as a reference
     info: Mapping[str, int | slice]  # what info has, in order: a row for a number, several for a vector
+
+    @classmethod
+    def of(
+        cls,
+        rows: Mapping[str, Any],
+        info: Sequence[str],
+        appended: Sequence[str] = (),
+        dropping: Sequence[int] = (),
+    ) -> ReportRows:
+        """Of the rows of a report by name: those that info has and that the observation appends."""
+        rows = {"time": TIME, **rows}
+        last = np.concatenate([[], *(np.r_[rows[name]] for name in appended)]).astype(int).tolist()
+        entries = {name: rows[name] for name in info}
+        return cls(rows["measurement"], rows["valid"], tuple(dropping), tuple(last), entries)
 
     @property
     def states(self) -> int:
@@ -143,8 +158,8 @@ VIEWS = ("_memory", "_command", "_arguments", "_advance", "_report", "_outcome",
 class PlantEnv(gym.Env):
     """An env of one copy of a plant, whose compiled step does all the computation.
 
-    A plant's env has `inputs`, makes `copies_of` the plant, and calls `_set_up` from its `__init__`. If its
-    `metadata` has modes, it defines `make_renderer`, and `moment_of`, the renderer's input from a step's report.
+    A plant's env has `inputs` and `page_of`, and calls `_set_up` from its `__init__`. If its `metadata` has modes,
+    it defines `make_renderer`, and `moment_of`, the renderer's input from a step's report.
     `thruster_env.env.model_env` offers its model to filters. The vector env is then a class of two lines, see
     `PlantVectorEnv`.
 
@@ -162,9 +177,14 @@ class PlantEnv(gym.Env):
     task: Any = None
     _renderer: PlantRenderer | None = None
 
+    @staticmethod
+    def page_of(plant: Any, task: Any) -> tuple[Page, Any]:
+        """The page of a plant with a task, and its parameters; see `thruster_env.env.copies.PlantCopies`."""
+        raise NotImplementedError
+
     def copies_of(self, count: int) -> PlantCopies:
         """Return `count` copies of the plant, with the env's task."""
-        raise NotImplementedError
+        return PlantCopies(self.page_of, self.plant, self.task, count)
 
     def make_renderer(self) -> PlantRenderer:
         """The renderer of this env for its `render_mode`."""
@@ -173,6 +193,10 @@ class PlantEnv(gym.Env):
     def moment_of(self, report: list[float]) -> tuple:
         """The renderer's input from a report."""
         raise NotImplementedError
+
+    def _by_name(self, report: list[float]) -> dict[str, Any]:
+        """The numbers and lists of a report."""
+        return {name: report[rows] for name, rows in self._copies.report_rows.items()}
 
     def _prepare_rendering(self, render_mode: str | None, render_size: Sequence[int] | None = None) -> None:
         modes = self.metadata["render_modes"]
@@ -214,15 +238,19 @@ class PlantEnv(gym.Env):
     def _set_up(
         self,
         action_space: gym.spaces.Box,
-        rows: ReportRows,
+        info: Sequence[str],
+        appended: Sequence[str] = (),
+        dropping: Sequence[int] = (),
         render_mode: str | None = None,
         render_size: Sequence[int] | None = None,
     ) -> None:
-        """Make spaces and memory; `plant`, and what `copies_of` needs, must be there.
+        """Make spaces and memory; `plant` and `task` must be there.
 
         Args:
             action_space: of shape (p,).
-            rows: what a report holds, and which of it is shown.
+            info: what the info has of a report, in order.
+            appended: what the observation has of it after the measurement.
+            dropping: channels whose measurements may be missing.
             render_mode: None, or one of the modes in `metadata`.
             render_size: of pictures, (width, height) [px]; 640 x 400 if None.
 
@@ -230,14 +258,14 @@ class PlantEnv(gym.Env):
             ValueError: if there is no such mode, or the size is none.
         """
         self._prepare_rendering(render_mode, render_size)
-        self._rows, self._observed = rows, rows.observed
-        self._readings = rows.observed[0]
+        self._copies = self.copies_of(1)
+        self._rows = rows = ReportRows.of(self._copies.report_rows, info, appended, dropping)
+        self._observed, self._readings = rows.observed, rows.observed[0]
         self._single = len(rows.observed) == 1  # the frequent case, which has to be quick
         self._one_input = len(self.inputs) == 1
         self.action_space = action_space
         shape = (len(rows.observed),)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=shape, dtype=np.float32)
-        self._copies = self.copies_of(1)
         self._out = np.zeros((self._copies.reported, 1, 1))
         self._observation_buffer = np.zeros(1, dtype=np.float32)
         self._set_views()
@@ -247,7 +275,7 @@ class PlantEnv(gym.Env):
         copies = self._copies
         self._advance: Callable = copies.advance
         self._memory = copies.memory
-        self._arguments = (0, 1, self._memory, copies.numbers, self._out, False)
+        self._arguments = (0, 1, self._memory, copies.numbers, copies.lines, self._out, False)
         self._command = self._memory[0, copies.commands[0] : copies.commands[-1] + 1, 0]
         self._report = self._out.reshape(-1)
         self._outcome = self._report[REWARD : TERMINATED + 1]

@@ -27,8 +27,8 @@ from thruster_env.model.state_space import StateSpaceModel
 
 def record(
     copies_of: Callable[[int], PlantCopies], keys: np.ndarray, inputs: np.ndarray, name: str, count: int
-) -> np.ndarray:
-    """Reports (B, K + 1, reported) of a batch of B copies from their start on.
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Reports (B, K + 1, reported) of a batch of B copies from their start on, and the row or rows by name.
 
     Args:
         copies_of: `copies_of(count)` makes that many copies.
@@ -54,7 +54,7 @@ def record(
     reports[0] = copies.begin(keys)
     for k in range(inputs.shape[1]):
         reports[k + 1] = copies.step(inputs[:, k])
-    return np.ascontiguousarray(reports.transpose(2, 0, 1))
+    return np.ascontiguousarray(reports.transpose(2, 0, 1)), copies.report_rows
 
 
 def check_finite(what: str, *parts: np.ndarray) -> None:

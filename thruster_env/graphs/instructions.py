@@ -18,12 +18,13 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 
 from thruster_env.core.compiled import FASTMATH
-from thruster_env.core.streams import ROUNDER, ROUNDER_BITS
+from thruster_env.core.streams import ROUNDER, ROUNDER_BITS, SQRT_HALF_BITS
 from thruster_env.graphs.graphs import COMPARISONS, Number
 from thruster_env.graphs.programs import (
     BY_MEMBERS,
     CALLED,
     OF_MEMBERS,
+    READ_NUMBERS,
     SIDE_BY_SIDE,
     Body,
     Cut,
@@ -41,6 +42,7 @@ OF_LLVM = {"sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos
 IN_LIBRARY = {"arctan": "atan", "arctan2": "atan2", "arcsinh": "asinh", "arccosh": "acosh", "arctanh": "atanh"}
 """Other names than NumPy's in C's library."""
 DOUBLE, LONG = ir.DoubleType(), ir.IntType(64)
+MOST_NUMBERS = 2**40  # the length of an array of which only the pointer is known
 
 
 def teach(work: Callable, program: Program, width: int, names: Sequence[str]) -> None:
@@ -53,12 +55,17 @@ def teach(work: Callable, program: Program, width: int, names: Sequence[str]) ->
         return eval(f"lambda {', '.join(names)}: none", {"none": types.none})
 
     @lower_builtin(work, *[types.Array] * len(names))
-    def write(context, builder, signature, arrays):
-        data = [
-            context.make_array(kind)(context, builder, a).data
-            for kind, a in zip(signature.args, arrays, strict=True)
+    def write(context, builder, signature, arguments):
+        arrays = [
+            context.make_array(kind)(context, builder, a)
+            for kind, a in zip(signature.args, arguments, strict=True)
         ]
-        Writer(context, builder, dict(zip(names, data, strict=True)), width).write(program)
+        data = dict(zip(names, (array.data for array in arrays), strict=True))
+        writer = Writer(context, builder, data, width)
+        if "memory" in data:
+            stride = builder.extract_value(arrays[names.index("memory")].strides, 0)
+            writer.stride = builder.sdiv(stride, ir.Constant(LONG, 8))
+        writer.write(program)
         return context.get_dummy_value()
 
 
@@ -69,12 +76,14 @@ class Writer:
         values: of numbers of a graph, by their places.
         values_of: of operations without arguments, by their names.
         pointer_of: where a place lies, as a pointer to vectors or numbers.
+        stride: numbers between two rows of the array `memory`.
     """
 
     def __init__(self, context, builder: ir.IRBuilder, arrays: dict, width: int):
         """Begin; arrays are pointers to their first numbers."""
         self._context, self._builder, self._arrays, self._width = context, builder, arrays, width
-        self._vector = ir.VectorType(DOUBLE, width)
+        self._vector, self._longs = ir.VectorType(DOUBLE, width), ir.VectorType(LONG, width)
+        self.stride: ir.Value | None = None
         self.values: dict[int, ir.Value] = {}
         self.values_of: dict[str, ir.Value] = {}
         self.pointer_of: Callable[[Place], ir.Value] = self._pointer
@@ -109,7 +118,10 @@ class Writer:
 
     def _pointer(self, location: Place) -> ir.Value:
         of_all = location.array in SIDE_BY_SIDE
-        at = ir.Constant(LONG, location.at * (self._width if of_all else 1))
+        if location.array == "memory":
+            at = self._builder.mul(ir.Constant(LONG, location.at), self.stride)
+        else:
+            at = ir.Constant(LONG, location.at * (self._width if of_all else 1))
         pointer = self._builder.gep(self._arrays[location.array], [at], source_etype=DOUBLE)
         return self._builder.bitcast(pointer, self._vector.as_pointer()) if of_all else pointer
 
@@ -144,7 +156,8 @@ class Writer:
         if operation == "entry":
             return values[0][number.arguments[1]]
         without_flags = {"where": builder.select, "and": builder.and_, "or": builder.or_}
-        without_flags |= {"two_to": self._two_to, "hypot": self._length}
+        without_flags |= {"two_to": self._two_to, "hypot": self._length, "philox": self._philox}
+        without_flags |= {"exponent": self._exponent, "mantissa": self._mantissa, "table": self._looked_up}
         if operation in without_flags:
             return without_flags[operation](*values)
         if operation == "!=":
@@ -176,15 +189,59 @@ class Writer:
         _, scaled = root_of_squares(*(builder.fdiv(value, scale, flags=EXACT) for value in (x, y)))
         return builder.select(usual, root, times(scale, scaled))
 
+    def _constant(self, value: float) -> ir.Constant:
+        """A vector of one number, of integers if it is one."""
+        return ir.Constant(self._longs if isinstance(value, int) else self._vector, [value] * self._width)
+
     def _two_to(self, exponents: ir.Value) -> ir.Value:
         """2^k of whole numbers k, whose last bits become the exponent's."""
-        builder, longs = self._builder, ir.VectorType(LONG, self._width)
-        rounder, offset = (
-            ir.Constant(kind, [value] * self._width)
-            for kind, value in ((self._vector, ROUNDER), (longs, 1023 - ROUNDER_BITS))
-        )
-        bits = builder.add(builder.bitcast(builder.fadd(exponents, rounder), longs), offset)
-        return builder.bitcast(builder.shl(bits, ir.Constant(longs, [52] * self._width)), self._vector)
+        builder = self._builder
+        bits = builder.bitcast(builder.fadd(exponents, self._constant(ROUNDER)), self._longs)
+        bits = builder.add(bits, self._constant(1023 - ROUNDER_BITS))
+        return builder.bitcast(builder.shl(bits, self._constant(52)), self._vector)
+
+    def _exponent_bits(self, x: ir.Value) -> tuple[ir.Value, ir.Value]:
+        bits = self._builder.bitcast(x, self._longs)
+        exponent = self._builder.sub(bits, self._constant(SQRT_HALF_BITS))
+        return bits, self._builder.ashr(exponent, self._constant(52))
+
+    def _exponent(self, x: ir.Value) -> ir.Value:
+        """The exponent of `streams.exponent_and_mantissa`."""
+        return self._builder.sitofp(self._exponent_bits(x)[1], self._vector)
+
+    def _mantissa(self, x: ir.Value) -> ir.Value:
+        """Its mantissa."""
+        bits, exponent = self._exponent_bits(x)
+        bits = self._builder.sub(bits, self._builder.shl(exponent, self._constant(52)))
+        return self._builder.bitcast(bits, self._vector)
+
+    def _philox(self, *words: ir.Value) -> list[ir.Value]:
+        """The four uniform numbers of `streams.uniform_block`."""
+        b, low, shift = self._builder, self._constant(0xFFFFFFFF), self._constant(32)
+        block, step, stream, *key = (b.fptoui(word, self._longs) for word in words)
+        counter = (block, step, stream, self._constant(0))
+        for i in range(10):
+            if i:
+                weyl = map(self._constant, (0x9E3779B9, 0xBB67AE85))
+                key = [b.and_(b.add(k, w), low) for k, w in zip(key, weyl, strict=True)]
+            first = b.mul(self._constant(0xD2511F53), b.and_(counter[0], low))
+            second = b.mul(self._constant(0xCD9E8D57), b.and_(counter[2], low))
+            left = b.xor(b.xor(b.lshr(second, shift), counter[1]), key[0])
+            right = b.xor(b.xor(b.lshr(first, shift), counter[3]), key[1])
+            counter = (left, second, right, first)
+        numbers = [b.fadd(b.sitofp(b.and_(w, low), self._vector), self._constant(0.5)) for w in counter]
+        return [b.fmul(number, self._constant(2.0**-32)) for number in numbers]
+
+    def _looked_up(self, index: ir.Value) -> ir.Value:
+        """The entry of the array `numbers` at a whole number, which differs between runs."""
+        builder, entries = self._builder, ir.Constant(self._vector, ir.Undefined)
+        index = builder.fptosi(index, self._longs)
+        for k in range(self._width):
+            lane = ir.Constant(ir.IntType(32), k)
+            at = builder.extract_element(index, lane)
+            pointer = builder.gep(self._arrays["numbers"], [at], source_etype=DOUBLE)
+            entries = builder.insert_element(entries, builder.load(pointer, typ=DOUBLE), lane)
+        return entries
 
     def _worked_out_by(self, name: str, count: int, values: list[ir.Value]) -> list[ir.Value]:
         """The results of a function of two arrays, run after run."""
@@ -194,13 +251,14 @@ class Writer:
         if self._context is None:
             raise TypeError(f"numba compiles {name}")
         builder, context, kind = self._builder, self._context, types.Array(types.float64, 1, "C")
-        arrays = []
-        for length in (len(values), count):
+        arrays, eight = [], ir.Constant(LONG, 8)
+        lengths = [len(values), count] + [MOST_NUMBERS] * (name in READ_NUMBERS)
+        for length, data in zip(lengths, (None, None, self._arrays.get("numbers")), strict=False):
             array, size = context.make_array(kind)(context, builder), ir.Constant(LONG, length)
-            data, eight = cgutils.alloca_once(builder, DOUBLE, size), ir.Constant(LONG, 8)
+            data = cgutils.alloca_once(builder, DOUBLE, size) if data is None else data
             populate_array(array, data, (size,), (eight,), eight, None)
             arrays.append(array)
-        signature, work = typing.signature(types.none, kind, kind), CALLED[name]
+        signature, work = typing.signature(types.none, *[kind] * len(arrays)), CALLED[name]
         results = [ir.Constant(self._vector, ir.Undefined)] * count
         for k in range(self._width):
             at = ir.Constant(ir.IntType(32), k)

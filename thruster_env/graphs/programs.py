@@ -44,14 +44,16 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from thruster_env.core.compiled import overloaded
+from thruster_env.core.streams import exponent_and_mantissa, uniform_block
 from thruster_env.graphs.folding import as_single
 from thruster_env.graphs.graphs import COMPARISONS, CONDITIONS, REDUCTIONS, Number, needed_by
 
 ARRAYS = ("rows", "change", "numbers", "move")  # arguments of programs with derivatives
 OF_STEPS = ("rows", "given", "numbers")  # arguments of programs that run a filter
 OF_MEMBERS = ("rows", "given", "numbers", "table", "draws", "size")  # those of programs with loops over members
+OF_COPIES = ("memory", "numbers")  # those of programs of copies of a plant; memory (rows, copies) has a stride
 BY_MEMBERS = ("table", "draws")  # of these, those with a row for each number and a column for each member
-SIDE_BY_SIDE = ("rows", "change", "given")  # of all, those with a number for each run at each place
+SIDE_BY_SIDE = ("rows", "change", "given", "memory")  # of all, those with a number for each run at each place
 SPECIAL = {
     "negative": "-{}",
     "pow": "{} ** {}",
@@ -61,11 +63,14 @@ SPECIAL = {
     "largest": "largest_of_members({}, size)",
     "size": "float(size)",
     "two_to": "exp2({})",
+    "table": "table(numbers, {})",
 }
 
 
 CALLED: dict[str, Callable] = {}
 """Functions work(given, found) of two arrays that programs call: what would be too long if it were written out."""
+READ_NUMBERS: set[str] = set()
+"""Names of those that have the array `numbers` of the program as a third argument."""
 CALLED_IN_ROUNDS: dict[str, Callable[[], tuple[Program, Program, Program, int, int]]] = {}
 """Makers of the same as programs: what is done at first, in each round and at last; how many rounds there are, and
 how many numbers are in the array `kept` from which and to which rounds lead."""
@@ -111,6 +116,7 @@ def _expression(operation: str, values: list[str]) -> str:
         return f"float.fromhex({values[0]!r})"
     if operation == "call":
         name, count, *arguments = values
+        arguments = [*arguments, "numbers=numbers"] if name in READ_NUMBERS else arguments
         return f"called({name!r}, {count}, {', '.join(arguments)})"
     if operation == "entry":
         return "{}[{}]".format(*values)
@@ -186,8 +192,13 @@ _TEXTS: WeakValueDictionary[str, Text] = WeakValueDictionary()
 
 
 def _run(digest: str, width: int, *arrays) -> None:
-    kind = {len(names): names for names in (ARRAYS, OF_STEPS, OF_MEMBERS)}[len(arrays)]
+    kind = {len(names): names for names in (ARRAYS, OF_STEPS, OF_MEMBERS, OF_COPIES)}[len(arrays)]
     work = _TEXTS[digest].in_python(kind)
+    if kind is OF_COPIES:
+        memory, numbers = arrays
+        with np.errstate(all="ignore"):
+            work(memory[:, 0] if memory.shape[1] == 1 else memory, numbers)
+        return
     if kind is OF_MEMBERS:
         *before, table, draws, size = arrays
         columns = table.shape[1]
@@ -212,6 +223,10 @@ def work_names() -> dict:
         "over_members": _total,
         "largest_of_members": _largest,
         "called": _called,
+        "philox": uniform_block,
+        "exponent": lambda x: exponent_and_mantissa(x)[0],
+        "mantissa": lambda x: exponent_and_mantissa(x)[1],
+        "table": lambda numbers, index: numbers[np.asarray(index).astype(np.int64)],
         "erf": lambda x: _special("erf", x),
         "erfc": lambda x: _special("erfc", x),
     }
@@ -238,9 +253,13 @@ def _largest(row, size):
     return np.fmax.reduce(row[:size], initial=-np.inf) if np.ndim(row) else row
 
 
-def _called(name: str, count: int, *arguments):
+def _called(name: str, count: int, *arguments, **named):
+    shape = np.broadcast_shapes(*map(np.shape, arguments))
+    if shape:
+        lanes = np.stack([np.broadcast_to(a, shape) for a in arguments], axis=-1)
+        return np.stack([_called(name, count, *lane, **named) for lane in lanes], axis=-1)
     results = np.empty(count, dtype=np.result_type(*arguments))
-    CALLED[name](np.array(arguments), results)
+    CALLED[name](np.array(arguments), results, *named.values())
     return results
 
 

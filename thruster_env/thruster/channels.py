@@ -52,16 +52,15 @@ def current(x, y, u, c):
 MAX_CHANNELS = 4  # that a thruster may be measured by at once; a draw of noise makes four numbers
 
 CHANNELS: dict[str, Channel] = {
-    "thrust": Channel(Quantity("measured thrust", "thrust", "N"), 0.25, 0, thrust, thrust_slopes),
-    "speed": Channel(Quantity("measured speed", "speed", "rad/s"), 4.0, 1, speed, speed_slopes),
+    "thrust": Channel(Quantity("measured thrust", "thrust", "N"), 0.25, thrust, thrust_slopes),
+    "speed": Channel(Quantity("measured speed", "speed", "rad/s"), 4.0, speed, speed_slopes),
     "speed-magnitude": Channel(
         Quantity("measured speed-magnitude", "speed-magnitude", "rad/s"),
         4.0,
-        2,
         speed_magnitude,
         speed_magnitude_slopes,
         affine=False,
     ),
-    "current": Channel(Quantity("measured current", "current", "A"), 0.01, 3, current),
+    "current": Channel(Quantity("measured current", "current", "A"), 0.01, current),
 }
-"""Channels by name. A further one may be added before the first env is made, with a code of its own."""
+"""Channels by name; a further one may be added."""

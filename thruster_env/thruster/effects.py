@@ -14,9 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from thruster_env.core.checks import finite, one_of, positive, short_repr, vector
-from thruster_env.core.compiled import inlined
-from thruster_env.core.memory import KEY_0, KEY_1, STEP
-from thruster_env.core.streams import PARAMETERS, REFERENCE_SIGNAL, normal_block, uniform_block
+from thruster_env.core.streams import PARAMETERS, REFERENCE_SIGNAL
 from thruster_env.effects.effects import LONGEST, Context, Effect, Registry, not_negative, set_field
 from thruster_env.effects.signals import (
     ConstantSignal,
@@ -27,6 +25,8 @@ from thruster_env.effects.signals import (
     Sinusoid,
     recorded_value,
 )
+from thruster_env.graphs.draws import Draws
+from thruster_env.graphs.graphs import where
 from thruster_env.thruster.parameters import ThrusterParameters, checked
 
 # Ambient flow U_0 along the thruster's axis [m/s]: signals that add to the constant `ambient_velocity`.
@@ -46,7 +46,6 @@ class ThrusterContext(Context):
 
     thrust_scale: float  # steady thrust at max_voltage [N]
     back_emf: float  # motor speed to back-EMF, K1/K2 [V s/rad]
-    speed_row: int  # of the memory: the motor speed [rad/s]
 
 
 # The amplifier between the commanded voltage and the motor.
@@ -55,7 +54,6 @@ class ThrusterContext(Context):
 AMPLIFIER_EFFECTS = Registry("amplifier")
 
 
-@inlined
 def outside(voltage, low, high):
     """A voltage behind a dead band low ... high: zero within the band, the distance to its end beyond."""
     return voltage - min(max(voltage, low), high)
@@ -77,9 +75,9 @@ class DeadBand(Effect):
     astern: float | None = None
     checks = {"width": not_negative, "astern": _width_or_none}
 
-    def parameters(self, context: Context) -> list[float]:
+    def parameters(self, context: Context) -> dict[str, Any]:
         """The band's ends [V]."""
-        return [-self.width if self.astern is None else -self.astern, self.width]
+        return {"low": -self.width if self.astern is None else -self.astern, "high": self.width}
 
     def as_mapping(self) -> dict:
         """As plain data; without `astern` where the band is symmetric."""
@@ -87,12 +85,9 @@ class DeadBand(Effect):
         return {name: value for name, value in mapping.items() if value is not None}
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, voltage, memory, t):
         """Apply the dead band to the voltage."""
-        low, high = numbers[at], numbers[at + 1]
-        for j in range(memory.shape[2]):
-            memory[b, target, j] = outside(memory[b, target, j], low, high)
+        return outside(voltage, e.low, e.high), memory
 
 
 def dead_band_of(low: float, high: float) -> tuple[DeadBand, ...]:
@@ -107,22 +102,17 @@ class SlewLimit(Effect):
 
     rate: float
     checks = {"rate": positive}
-    row_count = 1  # the voltage of the last step
 
-    def parameters(self, context: Context) -> list[float]:
+    def parameters(self, context: Context) -> dict[str, Any]:
         """The largest change in a step [V]."""
-        return [self.rate * context.dt]
+        return {"change": self.rate * context.dt}
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, voltage, before, t):
         """Limit the change of the voltage per step; it starts from zero."""
-        change = numbers[at]
-        for j in range(memory.shape[2]):
-            before = 0.0 if begin else memory[b, rows, j]
-            after = min(max(memory[b, target, j], before - change), before + change)
-            memory[b, target, j] = after
-            memory[b, rows, j] = after
+        before = 0.0 if t.begin else before
+        voltage = min(max(voltage, before - e.change), before + e.change)
+        return voltage, voltage
 
 
 @AMPLIFIER_EFFECTS.register("saturation")
@@ -134,12 +124,9 @@ class AmplifierSaturation(Effect):
     checks = {"limit": positive}
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, voltage, memory, t):
         """Clip to plus and minus a limit."""
-        limit = numbers[at]
-        for j in range(memory.shape[2]):
-            memory[b, target, j] = min(max(memory[b, target, j], -limit), limit)
+        return min(max(voltage, -e.limit), e.limit), memory
 
 
 def _fraction(name: str, value) -> float:
@@ -161,18 +148,15 @@ class Sag(Effect):
     fraction: float
     checks = {"fraction": _fraction}
 
-    def parameters(self, context: ThrusterContext) -> list[float]:
-        """Fraction, back-EMF constant [V s/rad], row of the motor speed."""
-        return [self.fraction, context.back_emf, context.speed_row]
+    def parameters(self, context: ThrusterContext) -> dict[str, Any]:
+        """Fraction and back-EMF constant [V s/rad]."""
+        return {"fraction": self.fraction, "back_emf": context.back_emf}
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, voltage, memory, t):
         """Lose a fraction of the voltage that drives current, V_s - k_e omega_m."""
-        fraction, back_emf, speed = numbers[at], numbers[at + 1], int(numbers[at + 2])
-        for j in range(memory.shape[2]):
-            driving = memory[b, target, j] - back_emf * memory[b, speed, j]
-            memory[b, target, j] -= 0.0 if begin else fraction * driving
+        driving = 0.0 if t.begin else voltage - e.back_emf * t.state[0]
+        return voltage - e.fraction * driving, memory
 
 
 # Reference thrust: signals that the thruster has to follow; those of a list are added.
@@ -184,10 +168,9 @@ class Sag(Effect):
 REFERENCE_SIGNALS = Registry("reference")
 
 
-@inlined
-def _uniform(memory, b, j, number, index):
-    u, _, _, _ = uniform_block(number, index, REFERENCE_SIGNAL, memory[b, KEY_0, j], memory[b, KEY_1, j])
-    return u
+def _level(t, part):
+    """A uniform number that is drawn for a part of the episode."""
+    return t.uniforms(REFERENCE_SIGNAL, part)[0]
 
 
 @REFERENCE_SIGNALS.register("constant")
@@ -207,12 +190,12 @@ class Constant(Effect):
         name = "level" if self.thrust is None else "thrust"
         set_field(self, name, finite(name, getattr(self, name)))
 
-    def parameters(self, context: ThrusterContext) -> list[float]:
+    def parameters(self, context: ThrusterContext) -> dict[str, Any]:
         """The thrust [N]."""
         if self.level is not None:
-            return [self.level * context.thrust_scale]
+            return {"value": self.level * context.thrust_scale}
         assert self.thrust is not None  # one of the two is given
-        return [self.thrust]
+        return {"value": self.thrust}
 
 
 def held_time(name: str, value) -> float:
@@ -239,10 +222,10 @@ class _Levels(Effect):
         set_field(self, "high", high)
         set_field(self, "hold_time", held_time("hold_time", self.hold_time))
 
-    def parameters(self, context: ThrusterContext) -> list[float]:
+    def parameters(self, context: ThrusterContext) -> dict[str, Any]:
         """Lowest and highest level [N], steps between two levels."""
-        hold = max(1.0, round(self.hold_time / context.dt))
-        return [self.low * context.thrust_scale, self.high * context.thrust_scale, hold]
+        hold, scale = max(1.0, round(self.hold_time / context.dt)), context.thrust_scale
+        return {"low": self.low * scale, "high": self.high * scale, "hold": float(hold)}
 
 
 @REFERENCE_SIGNALS.register("steps")
@@ -251,14 +234,10 @@ class Steps(_Levels):
     """Levels drawn between `low` and `high` [T_max], each held for `hold_time` [s]."""
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, value, memory, t):
         """Add levels that are drawn from an interval and held."""
-        low, high, hold = numbers[at], numbers[at + 1], numbers[at + 2]
-        for j in range(memory.shape[2]):
-            part = math.floor((memory[b, STEP, j] + 1.0) / hold)
-            u = _uniform(memory, b, j, number, part)
-            memory[b, target, j] += low + (high - low) * u
+        u = _level(t, math.floor((t.step + 1.0) / e.hold))
+        return value + e.low + (e.high - e.low) * u, memory
 
 
 @REFERENCE_SIGNALS.register("ramps")
@@ -267,15 +246,12 @@ class Ramps(_Levels):
     """Straight lines between levels drawn from `low` to `high` [T_max], each line taking `hold_time` [s]."""
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, value, memory, t):
         """Add straight lines between levels that are drawn from an interval."""
-        low, high, hold = numbers[at], numbers[at + 1], numbers[at + 2]
-        for j in range(memory.shape[2]):
-            position = (memory[b, STEP, j] + 1.0) / hold
-            part = math.floor(position)
-            before, after = _uniform(memory, b, j, number, part), _uniform(memory, b, j, number, part + 1.0)
-            memory[b, target, j] += low + (high - low) * (before + (position - part) * (after - before))
+        position = (t.step + 1.0) / e.hold
+        part = math.floor(position)
+        before, after = _level(t, part), _level(t, part + 1.0)
+        return value + e.low + (e.high - e.low) * (before + (position - part) * (after - before)), memory
 
 
 @REFERENCE_SIGNALS.register("prbs")
@@ -284,14 +260,10 @@ class BinarySequence(_Levels):
     """Pseudo-random binary sequence: `low` or `high` [T_max] with equal chance, drawn every `hold_time` [s]."""
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, value, memory, t):
         """Add a pseudo-random binary sequence: one of two levels, drawn and held."""
-        low, high, hold = numbers[at], numbers[at + 1], numbers[at + 2]
-        for j in range(memory.shape[2]):
-            part = math.floor((memory[b, STEP, j] + 1.0) / hold)
-            u = _uniform(memory, b, j, number, part)
-            memory[b, target, j] += high if u < 0.5 else low
+        u = _level(t, math.floor((t.step + 1.0) / e.hold))
+        return value + where(u < 0.5, e.high, e.low), memory
 
 
 def _periods(name: str, values) -> tuple[float, ...]:
@@ -308,29 +280,20 @@ class MultiSine(Effect):
     periods: tuple[float, ...] = (4.0, 1.7, 0.7)
     checks = {"amplitude": finite, "offset": finite, "periods": _periods}
 
-    def parameters(self, context: ThrusterContext) -> list[float]:
-        """Offset and amplitude [N], sample time [s], number of sines, their periods [s]."""
+    def parameters(self, context: ThrusterContext) -> dict[str, Any]:
+        """Offset and amplitude [N], periods [s]."""
         scale = context.thrust_scale
-        return [self.offset * scale, self.amplitude * scale, context.dt, float(len(self.periods)), *self.periods]
-
-    def rows(self, context: ThrusterContext) -> int:
-        """The phases."""
-        return len(self.periods)
+        return {"offset": self.offset * scale, "amplitude": self.amplitude * scale, "periods": self.periods}
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, value, phases, t):
         """Add sines of equal amplitude with phases that are drawn."""
-        offset, amplitude, dt, count = numbers[at], numbers[at + 1], numbers[at + 2], int(numbers[at + 3])
-        for j in range(memory.shape[2]):
-            memory[b, target, j] += offset
-            for i in range(count):
-                if begin:
-                    u = _uniform(memory, b, j, number, i)
-                    memory[b, rows + i, j] = 2.0 * math.pi * u
-                time = (memory[b, STEP, j] + 1.0) * dt
-                phase = 2.0 * math.pi * time / numbers[at + 4 + i] + memory[b, rows + i, j]
-                memory[b, target, j] += amplitude * math.sin(phase)
+        if t.begin:
+            phases = tuple(2.0 * math.pi * _level(t, float(i)) for i in range(len(e.periods)))
+        time = (t.step + 1.0) * t.dt
+        pairs = zip(e.periods, phases, strict=True)
+        sines = [math.sin(2.0 * math.pi * time / period + phase) for period, phase in pairs]
+        return value + e.offset + e.amplitude * sum(sines), phases
 
 
 LEAST_BANDWIDTH = 1e-5  # of the sample rate; a narrower low-pass is lost in rounding
@@ -348,9 +311,8 @@ class BandLimitedNoise(Effect):
     offset: float = 0.4
     bandwidth: float = 0.5
     checks = {"std": not_negative, "offset": finite, "bandwidth": positive}
-    row_count = 2  # the states of the low-pass
 
-    def parameters(self, context: ThrusterContext) -> list[float]:
+    def parameters(self, context: ThrusterContext) -> dict[str, Any]:
         """Offset [N]; A, b, c of the filter with unit variance times std [N]; root of the state's covariance."""
         from scipy.linalg import solve_discrete_lyapunov
         from scipy.signal import butter, tf2ss
@@ -363,26 +325,20 @@ class BandLimitedNoise(Effect):
         cov = solve_discrete_lyapunov(a, b @ b.T)
         c = c * self.std * context.thrust_scale / float((c @ cov @ c.T).item()) ** 0.5
         root = np.linalg.cholesky(cov)
-        numbers = [*a.ravel(), *b.ravel(), *c.ravel(), root[0, 0], root[1, 0], root[1, 1]]
-        return [self.offset * context.thrust_scale, *map(float, numbers)]
+        parts = {"a": a, "b": b, "c": c, "root": root[np.tril_indices(2)]}
+        numbers = {name: tuple(part.ravel().tolist()) for name, part in parts.items()}
+        return {"offset": self.offset * context.thrust_scale} | numbers
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, value, memory, t):
         """Add white noise through a low-pass, x' = A x + b n, r = c x, stationary from the start."""
-        offset = numbers[at]
-        for j in range(memory.shape[2]):
-            step = memory[b, STEP, j] + 1.0
-            n, m, _, _ = normal_block(number, step, REFERENCE_SIGNAL, memory[b, KEY_0, j], memory[b, KEY_1, j])
-            x, y = memory[b, rows, j], memory[b, rows + 1, j]
-            if begin:
-                memory[b, rows, j] = numbers[at + 9] * n
-                memory[b, rows + 1, j] = numbers[at + 10] * n + numbers[at + 11] * m
-            else:
-                memory[b, rows, j] = numbers[at + 1] * x + numbers[at + 2] * y + numbers[at + 5] * n
-                memory[b, rows + 1, j] = numbers[at + 3] * x + numbers[at + 4] * y + numbers[at + 6] * n
-            memory[b, target, j] += offset
-            memory[b, target, j] += numbers[at + 7] * memory[b, rows, j] + numbers[at + 8] * memory[b, rows + 1, j]
+        n, m, _, _ = t.normals(REFERENCE_SIGNAL, t.step + 1.0)
+        if t.begin:
+            x, y = e.root[0] * n, e.root[1] * n + e.root[2] * m
+        else:
+            x, y = memory
+            x, y = e.a[0] * x + e.a[1] * y + e.b[0] * n, e.a[2] * x + e.a[3] * y + e.b[1] * n
+        return value + e.offset + (e.c[0] * x + e.c[1] * y), (x, y)
 
 
 @REFERENCE_SIGNALS.register("recorded")
@@ -391,12 +347,9 @@ class RecordedReference(RecordedSeries):
     """A recorded reference thrust; its values are in newtons."""
 
     @staticmethod
-    @inlined
-    def act(memory, b, target, rows, number, numbers, at, begin):
+    def act(e, value, memory, t):
         """Add a recorded series."""
-        for j in range(memory.shape[2]):
-            time = (memory[b, STEP, j] + 1.0) * numbers[at]
-            memory[b, target, j] += recorded_value(time, numbers, at + 1)
+        return value + recorded_value(e, (t.step + 1.0) * t.dt), memory
 
 
 # Uncertain parameters: factors on a preset's values, drawn once per episode from its key.
@@ -430,10 +383,16 @@ class Uniform(_Distribution):
         set_field(self, "low", low)
         set_field(self, "high", high)
 
-    def factors(self, number: int, keys: np.ndarray) -> np.ndarray:
-        """Factors of the number-th uncertain parameter for keys (B, 2), shape (B,)."""
-        u = uniform_block(number, 0, PARAMETERS, keys[:, 0].astype(np.uint64), keys[:, 1].astype(np.uint64))[0]
-        return self.low + (self.high - self.low) * u
+    @property
+    def numbers(self) -> tuple[float, float]:
+        """The numbers of `factor`."""
+        return self.low, self.high
+
+    @staticmethod
+    def factor(numbers: tuple, number: int, draws: Draws):
+        """The factor of the number-th uncertain parameter in an episode."""
+        low, high = numbers
+        return low + (high - low) * draws.uniforms(PARAMETERS, number)[0]
 
     @property
     def extremes(self) -> tuple[float, float]:
@@ -457,10 +416,15 @@ class LogNormal(_Distribution):
             )
         set_field(self, "std", std)
 
-    def factors(self, number: int, keys: np.ndarray) -> np.ndarray:
-        """Factors of the number-th uncertain parameter for keys (B, 2), shape (B,)."""
-        n = normal_block(number, 0, PARAMETERS, keys[:, 0].astype(np.uint64), keys[:, 1].astype(np.uint64))[0]
-        return np.exp(self.std * n)
+    @property
+    def numbers(self) -> tuple[float]:
+        """The number of `factor`."""
+        return (self.std,)
+
+    @staticmethod
+    def factor(numbers: tuple, number: int, draws: Draws):
+        """The factor of the number-th uncertain parameter in an episode."""
+        return np.exp(numbers[0] * draws.normals(PARAMETERS, block=number)[0])
 
     @property
     def extremes(self) -> tuple[float, float]:
@@ -500,16 +464,21 @@ def make_uncertainty(uncertainty) -> dict[str, Uniform | LogNormal]:
     return distributions
 
 
-def drawn_parameters(nominal: ThrusterParameters, uncertainty: Mapping, keys: np.ndarray) -> ThrusterParameters:
-    """Parameters of the episodes with keys (B, 2): the uncertain ones as arrays (B,), the others numbers.
+def drawn_parameters(nominal: ThrusterParameters, uncertain: Mapping, draws: Draws) -> ThrusterParameters:
+    """The parameters of an episode, from its draws of step 0; of keys that are arrays, arrays.
 
     A parameter's draw depends on the key and on the parameter, not on which others are uncertain.
+
+    Args:
+        nominal: the nominal parameters.
+        uncertain: the class of the distribution and its numbers, by parameter.
+        draws: of step 0.
     """
-    drawn = {
-        name: getattr(nominal, name) * distribution.factors(UNCERTAIN.index(name), keys)
-        for name, distribution in uncertainty.items()
+    factors = {
+        name: distribution.factor(numbers, UNCERTAIN.index(name), draws)
+        for name, (distribution, numbers) in uncertain.items()
     }
-    return nominal._replace(**drawn)
+    return nominal._replace(**{name: getattr(nominal, name) * factor for name, factor in factors.items()})
 
 
 def extreme_parameters(nominal: ThrusterParameters, uncertainty: Mapping) -> list[ThrusterParameters]:

@@ -11,27 +11,17 @@ import numpy as np
 
 from thruster_env.core.checks import arguments_of, finite, takes_arguments_of
 from thruster_env.core.memory import KEY_0, KEY_1, TIME
-from thruster_env.env.env import PlantEnv, PlantVectorEnv, ReportRows
+from thruster_env.env.env import PlantEnv, PlantVectorEnv
 from thruster_env.env.model_env import ModelledEnv
+from thruster_env.graphs.draws import Draws
 from thruster_env.render.renderer import MODES
 from thruster_env.thruster.analysis import state_range
 from thruster_env.thruster.effects import Constant, drawn_parameters
+from thruster_env.thruster.equations import page_of
 from thruster_env.thruster.linear import PUBLISHED_NOISE, make_linear_plant
 from thruster_env.thruster.parameters import INPUTS, ThrusterParameters
 from thruster_env.thruster.plant import Plant, make_plant
 from thruster_env.thruster.rendering import Moment, Renderer
-from thruster_env.thruster.simulation import (
-    AMBIENT,
-    COMMAND,
-    FLOW,
-    NEXT_REFERENCE,
-    OMEGA,
-    READINGS,
-    REFERENCE,
-    THRUST,
-    VALID,
-    Copies,
-)
 from thruster_env.thruster.task import half_thrust, make_task, thrust_scale
 
 # What every bow thruster env and vector env offers to filters.
@@ -142,6 +132,7 @@ class BowThrusterEnv(ModelledThruster, PlantEnv):
 
     metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}
     inputs = INPUTS
+    page_of = staticmethod(page_of)
     observes_reference = False
 
     @takes_arguments_of(make_plant, make_task, leaving_out=["substeps"])
@@ -153,23 +144,10 @@ class BowThrusterEnv(ModelledThruster, PlantEnv):
         self.plant = plant
         of_task = arguments_of(make_task, arguments)
         self.task = make_task(**{**of_task, "reference": self._reference_signals(of_task["reference"])})
-        m, top = len(plant.channels), plant.max_voltage
-        measurement = slice(READINGS, READINGS + m)
-        info: dict[str, int | slice] = {
-            "state": slice(OMEGA, FLOW + 1),
-            "thrust": THRUST,
-            "measurement": measurement,
-            "reference": REFERENCE,
-            "ambient_velocity": AMBIENT,
-            "time": TIME,
-        }
-        appended = (NEXT_REFERENCE,) if self.observes_reference else ()
-        rows = ReportRows(measurement, slice(VALID, VALID + m), plant.dropping_channels, appended, info)
-        self._set_up(gym.spaces.Box(-top, top, shape=(1,), dtype=np.float32), rows, *rendering)
-
-    def copies_of(self, count: int) -> Copies:
-        """Return `count` thrusters with the env's task."""
-        return Copies(self.plant, self.task, count)
+        top, appended = plant.max_voltage, ("next_reference",) if self.observes_reference else ()
+        info = "state", "thrust", "measurement", "reference", "ambient_velocity", "time"
+        space = gym.spaces.Box(-top, top, shape=(1,), dtype=np.float32)
+        self._set_up(space, info, appended, plant.dropping_channels, *rendering)
 
     def make_renderer(self) -> Renderer:
         """What draws the thruster in its water."""
@@ -178,17 +156,18 @@ class BowThrusterEnv(ModelledThruster, PlantEnv):
 
     def moment_of(self, report: list[float]) -> Moment:
         """What the renderer adds of a report: truth, measured thrust, reference and voltage."""
-        channels = self.plant.channels
-        measured = report[READINGS + channels.index("thrust")] if "thrust" in channels else math.nan
+        values = self._by_name(report)
+        omega, flow = values["state"]
+        readings = dict(zip(self.plant.channels, values["measurement"], strict=True))
         return Moment(
             time=report[TIME],
-            omega_m=report[OMEGA],
-            U_a=report[FLOW],
-            thrust=report[THRUST],
-            measured_thrust=measured,
-            reference=report[REFERENCE],
-            voltage=float(self._memory[0, COMMAND, 0]),
-            ambient_velocity=report[AMBIENT],
+            omega_m=omega,
+            U_a=flow,
+            thrust=values["thrust"],
+            measured_thrust=readings.get("thrust", math.nan),
+            reference=values["reference"],
+            voltage=float(np.clip(self._command[0], -self.plant.max_voltage, self.plant.max_voltage)),
+            ambient_velocity=values["ambient_velocity"],
         )
 
     def _reference_signals(self, reference):
@@ -202,9 +181,10 @@ class BowThrusterEnv(ModelledThruster, PlantEnv):
     @property
     def parameters(self) -> ThrusterParameters:
         """The parameters of this episode, which differ from the plant's where these are uncertain."""
-        keys = self._memory[:1, KEY_0 : KEY_1 + 1, 0]
-        drawn = drawn_parameters(self.plant.parameters, self.plant.uncertainty, keys)
-        values: dict[str, Any] = {name: float(getattr(drawn, name)[0]) for name in self.plant.uncertainty}
+        key = self._memory[0, [KEY_0, KEY_1], 0]
+        uncertain = {name: (type(kind), kind.numbers) for name, kind in self.plant.uncertainty.items()}
+        drawn = drawn_parameters(self.plant.parameters, uncertain, Draws(tuple(key), 0))
+        values: dict[str, Any] = {name: float(getattr(drawn, name)) for name in uncertain}
         return drawn._replace(**values)
 
 

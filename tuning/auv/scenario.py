@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from filters.bounds import path_bound, wrapped_variances
+from thruster_env.auv.equations import simulate
 from thruster_env.auv.model import MODELS, model_of_plant, state_range
 from thruster_env.auv.paths import MANOEUVRES
 from thruster_env.auv.plant import (
@@ -31,7 +32,6 @@ from thruster_env.auv.plant import (
     make_plant,
     plant_data,
 )
-from thruster_env.auv.simulation import simulate
 from thruster_env.core.checks import at_least, one_of, positive, short_repr, vector
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.effects.effects import set_field

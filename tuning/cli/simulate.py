@@ -12,8 +12,8 @@ from thruster_env.core.checks import at_least, positive, within
 from thruster_env.core.streams import episode_keys
 from thruster_env.logs.write import check_suffix, header_of, write_columns
 from thruster_env.thruster.channels import CHANNELS
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MEASUREMENT_NOISE, DEFAULT_PROCESS_NOISE, make_plant
-from thruster_env.thruster.simulation import simulate
 from tuning.cli.options import INPUT, OUTPUT, RUNS, JsonOption, PresetOption, SeedOption
 from tuning.cli.output import announce_compilation, check_targets, emit, warn_beyond
 from tuning.problems.excitation import held_levels

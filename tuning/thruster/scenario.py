@@ -30,6 +30,7 @@ from thruster_env.thruster.analysis import equilibrium, jacobians, state_range, 
 from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.controllers import PIController, lambda_gains
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
+from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.linear import make_linear_plant, operating_points
 from thruster_env.thruster.model import model_of_plant
 from thruster_env.thruster.parameters import is_file, preset_mapping
@@ -42,7 +43,6 @@ from thruster_env.thruster.plant import (
     make_plant,
     plant_data,
 )
-from thruster_env.thruster.simulation import NEXT_REFERENCE, READINGS, Copies, simulate
 from thruster_env.thruster.task import Task
 from tuning.problems.bound import average_bound
 from tuning.problems.data import Data
@@ -110,12 +110,12 @@ class ClosedLoop(Excitation):
         controller = PIController(
             plant, operating_points(plant), *lambda_gains(plant), plant.channels.index("thrust")
         )
-        copies = Copies(plant, Task(self.reference), len(keys))
+        copies = copies_of(plant, Task(self.reference), len(keys))
         out, state, report = np.empty((len(keys), steps)), None, copies.begin(keys)
-        measured = slice(READINGS, READINGS + len(plant.channels))
+        measured, following = (copies.report_rows[name] for name in ("measurement", "next_reference"))
         for k in range(steps):
             # float32, as an env's observation.
-            observation = np.concatenate([report[measured], report[[NEXT_REFERENCE]]]).T.astype(np.float32)
+            observation = np.concatenate([report[measured], report[[following]]]).T.astype(np.float32)
             action, state = controller.predict(observation, state)
             out[:, k] = action[:, 0]
             report = copies.step(out[:, k])

@@ -6,8 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from thruster_env.auv.equations import simulate
 from thruster_env.auv.plant import CHANNELS, INSTRUMENTS, SUITES, VEHICLE_SENSOR_EFFECTS, make_current, make_plant
-from thruster_env.auv.simulation import simulate
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 
 pytestmark = pytest.mark.usefixtures("as_python")

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
-from thruster_env.core.memory import row
 from thruster_env.core.streams import episode_keys
 from thruster_env.thruster.analysis import run_substeps
+from thruster_env.thruster.equations import copies_of
 from thruster_env.thruster.parameters import PRESETS, TUNNEL_PHYSICAL
 from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.simulation import COMMAND, FLOW, OMEGA, VOLTAGE, Copies
 from thruster_env.thruster.task import Task
 
 DT = 0.01
@@ -48,14 +47,11 @@ NAIVE = {"dead-band": dead_band, "slew-limit": slew_limit, "saturation": saturat
 def trace(effects, voltages, preset="tunnel", **arguments):
     """Commanded and applied voltages (K,) and states (K + 1, 2) of one thruster without noise."""
     plant = make_plant(preset, amplifier=effects, process_noise_cov=[0, 0], initial_state=[20.0, 0.5], **arguments)
-    copies = Copies(plant, Task(), 1)
-    copies.begin(episode_keys([0]))
-    rows = [[row(copies.memory, i, 1)[0] for i in (COMMAND, VOLTAGE, OMEGA, FLOW)]]
-    for voltage in voltages:
-        copies.step(np.array([voltage]))
-        rows.append([row(copies.memory, i, 1)[0] for i in (COMMAND, VOLTAGE, OMEGA, FLOW)])
-    rows = np.array(rows)
-    return rows[1:, 0], rows[1:, 1], rows[:, 2:], plant
+    copies = copies_of(plant, Task(), 1)
+    reports = [copies.begin(episode_keys([0]))[:, 0]]
+    reports += [copies.step(np.array([voltage]))[:, 0] for voltage in voltages]
+    applied, states = (np.array(reports)[:, copies.report_rows[name]] for name in ("voltage", "state"))
+    return np.clip(voltages, -plant.max_voltage, plant.max_voltage), applied[1:], states, plant
 
 
 def commands(count=200, top=40.0):
@@ -97,12 +93,12 @@ def test_a_slew_limit_counts_volts_a_second():
 
 
 def test_a_slew_limit_starts_at_zero_in_every_episode():
-    copies = Copies(make_plant(amplifier=[SLEW]), Task(), 1)
+    copies = copies_of(make_plant(amplifier=[SLEW]), Task(), 1)
     for _ in range(3):
         copies.begin(episode_keys([0]))
         for k in range(1, 5):
-            copies.step(np.array([-24.0]))
-            assert row(copies.memory, VOLTAGE, 1)[0] == pytest.approx(-3.0 * k)
+            report = copies.step(np.array([-24.0]))
+            assert report[copies.report_rows["voltage"], 0] == pytest.approx(-3.0 * k)
 
 
 def test_effects_do_not_commute():

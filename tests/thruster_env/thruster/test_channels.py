@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from thruster_env.core.streams import episode_keys
-from thruster_env.env.copies import Channel, reader_of
+from thruster_env.env.copies import Channel
 from thruster_env.model.quantities import Quantity
 from thruster_env.thruster.channels import CHANNELS
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.linear import make_linear_plant
 from thruster_env.thruster.model import model_of_plant, thruster_model
 from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.simulation import simulate
 
 pytestmark = pytest.mark.usefixtures("as_python")
 
 FLOW = Channel(
-    Quantity("measured flow", "flow", "m/s"), 1e-4, 17, lambda x, y, u, c: x[1], lambda x, dy, c: (0.0, 1.0)
+    Quantity("measured flow", "flow", "m/s"), 1e-4, lambda x, y, u, c: x[1], lambda x, dy, c: (0.0, 1.0)
 )
 
 
@@ -92,9 +92,3 @@ def test_a_linear_plant_has_the_channels_that_are_affine():
         model_of_plant(make_linear_plant(sensors=["speed-magnitude"]))
     with pytest.raises(ValueError, match="that a model of the state can predict must be thrust, speed, speed-mag"):
         thruster_model(sensors=["current", "thrust"])
-
-
-def test_codes_differ():
-    twice = (FLOW, FLOW._replace(variance=1.0))
-    with pytest.raises(ValueError, match=r"codes of channels must differ from one another, but got \[17, 17\]"):
-        reader_of(twice, lambda read: read, "x, y, u, c")

@@ -8,14 +8,13 @@ import pytest
 from scipy import stats
 
 import thruster_env  # noqa: F401 - registers the envs
-from thruster_env.core.memory import row
 from thruster_env.core.streams import episode_keys
 from thruster_env.effects.signals import RecordedSeries
 from thruster_env.thruster.analysis import run_substeps, state_range
 from thruster_env.thruster.effects import FLOW_SIGNALS
+from thruster_env.thruster.equations import copies_of
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
 from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.simulation import AMBIENT, Copies
 from thruster_env.thruster.task import Task
 
 DT = 0.01
@@ -30,9 +29,10 @@ SIGNALS = [
 
 def flows(signals, copies=3, steps=100, seed=0, **arguments):
     """U_0 of every step (copies, steps): column k - 1 acts from t_{k-1} to t_k."""
-    plant = Copies(make_plant(flow=signals, **arguments), Task(), copies)
+    plant = copies_of(make_plant(flow=signals, **arguments), Task(), copies)
     plant.begin(episode_keys(range(seed, seed + copies)))
-    return np.transpose([plant.step(np.zeros(copies))[AMBIENT].copy() for _ in range(steps)])
+    row = plant.report_rows["ambient_velocity"]
+    return np.transpose([plant.step(np.zeros(copies))[row].copy() for _ in range(steps)])
 
 
 def middles(steps=100, dt=DT):
@@ -258,9 +258,8 @@ def test_a_file_that_holds_no_such_column_of_numbers_is_refused(tmp_path, text, 
 
 def test_spare_copies_of_a_block_change_nothing():
     plant = make_plant(flow=SIGNALS)
-    many = Copies(plant, Task(), 130)
+    many = copies_of(plant, Task(), 130)
     many.begin(episode_keys(range(130)))
-    for _ in range(10):
-        many.step(np.zeros(130))
-    np.testing.assert_array_equal(row(many.memory, AMBIENT, 130)[127:], flows(SIGNALS, 130, 10)[127:, -1])
-    np.testing.assert_allclose(row(many.memory, AMBIENT, 130)[127:], flows(SIGNALS, 3, 10, 127)[:, -1], atol=1e-12)
+    last = [many.step(np.zeros(130)) for _ in range(10)][-1][many.report_rows["ambient_velocity"], 127:]
+    np.testing.assert_array_equal(last, flows(SIGNALS, 130, 10)[127:, -1])
+    np.testing.assert_allclose(last, flows(SIGNALS, 3, 10, 127)[:, -1], atol=1e-12)

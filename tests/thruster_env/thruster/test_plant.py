@@ -8,12 +8,11 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from thruster_env.core.checks import at_least, covariance, covariance_root, finite, one_of, positive, vector
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.memory import row
 from thruster_env.core.streams import draw_key, episode_keys
 from thruster_env.thruster.analysis import run_substeps, steady_state
+from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, checked
 from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.simulation import COMMAND, FLOW, OMEGA, READINGS, THRUST, Copies, simulate
 from thruster_env.thruster.task import Task
 
 MAPPING = TUNNEL._asdict()
@@ -190,10 +189,11 @@ def test_voltages_are_clipped():
 
 
 def single_run(plant, key, voltages):
-    copies = Copies(plant, Task(), 1)
+    copies = copies_of(plant, Task(), 1)
     reports = [copies.begin(key[None])]
     reports += [copies.step(voltages[k : k + 1]) for k in range(len(voltages))]
-    return np.array(reports)[:, [OMEGA, FLOW, THRUST, READINGS], 0]
+    rows = np.r_[*(copies.report_rows[name] for name in ("state", "thrust", "measurement"))]
+    return np.array(reports)[:, rows, 0]
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -210,11 +210,11 @@ def test_a_batch_is_a_loop_over_single_plants(preset):
 
 @pytest.mark.parametrize("count", [1, 4, 128, 300, 1100])
 def test_a_voltage_beyond_the_range_is_clipped_in_every_copy(count):
-    copies = Copies(make_plant(), Task(), count)
+    copies = copies_of(make_plant(), Task(), count)
     copies.begin(np.zeros((count, 2)))
     voltages = np.linspace(-40.0, 40.0, count)
-    copies.step(voltages)
-    np.testing.assert_array_equal(row(copies.memory, COMMAND, count), np.clip(voltages, -24, 24))
+    report = copies.step(voltages)
+    np.testing.assert_array_equal(report[copies.report_rows["voltage"]], np.clip(voltages, -24, 24))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -260,8 +260,8 @@ def test_python_and_machine_code_agree():
 
 def test_nothing_of_the_plant_is_compiled_within_interpreted():
     with interpreted():
-        assert inspect.isfunction(Copies(make_plant(), Task(), 1).advance)
-    assert not inspect.isfunction(Copies(make_plant(), Task(), 1).advance)
+        assert inspect.isfunction(copies_of(make_plant(), Task(), 1).advance)
+    assert not inspect.isfunction(copies_of(make_plant(), Task(), 1).advance)
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,9 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.thruster.analysis import steady_state
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
 from thruster_env.thruster.env import BowThrusterReversalEnv, BowThrusterTrackingEnv
+from thruster_env.thruster.equations import copies_of
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
 from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.simulation import NEXT_REFERENCE, REFERENCE, Copies
 from thruster_env.thruster.task import Task, make_task
 
 T_MAX = steady_state(TUNNEL, 24.0).thrust
@@ -36,10 +36,13 @@ def references(signals, copies=3, steps=100, seed=0, sensors=None, **arguments):
     """r_0 ... r_steps of some copies, in T_max: (copies, steps + 1)."""
     plant = make_plant(sensors=sensors, **arguments)
     task = Task(REFERENCE_SIGNALS.make(signals))
-    thrusters = Copies(plant, task, copies)
+    thrusters = copies_of(plant, task, copies)
     reports = [thrusters.begin(episode_keys(range(seed, seed + copies))).copy()]
     reports += [thrusters.step(np.zeros(copies)).copy() for _ in range(steps)]
-    seen, ahead = (np.transpose([report[i] for report in reports]) for i in (REFERENCE, NEXT_REFERENCE))
+    seen, ahead = (
+        np.transpose([report[thrusters.report_rows[name]] for report in reports])
+        for name in ("reference", "next_reference")
+    )
     np.testing.assert_array_equal(ahead[:, :-1], seen[:, 1:])
     return seen / T_MAX
 

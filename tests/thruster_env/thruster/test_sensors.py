@@ -1,6 +1,7 @@
 """Every channel and every sensor effect against its definition, written here once more or as statistics."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import gymnasium as gym
@@ -9,17 +10,17 @@ import pytest
 from scipy import stats
 
 import thruster_env  # noqa: F401 - registers the envs
-from thruster_env.core.compiled import inlined
+from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.effects.effects import Effect
 from thruster_env.effects.sensors import SENSOR_EFFECTS, Bias, Quantisation
 from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.dynamics import thrust_and_torque
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.parameters import PRESETS, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.simulation import simulate
 
-NOTHING = {"name": "bias"}  # adds zero, and makes the same machine code run
+NOTHING = {"name": "bias"}  # adds zero
 EVERY_EFFECT = [
     {"name": "student-t", "scale": 0.3},
     {"name": "outliers", "std": 5.0},
@@ -30,13 +31,15 @@ EVERY_EFFECT = [
     {"name": "delay", "steps": 3},
     {"name": "sample-every", "steps": 3},
 ]
+LEAST_COMPILED = 40_000  # steps of copies, from which machine code takes less time than its compilation
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds
 
 
 def run_of(chain, copies=400, steps=100, channel="thrust", r=0.0, top=24.0, **arguments):
     plant = make_plant(sensors={channel: chain}, measurement_noise_cov=r, **arguments)
     voltages = np.random.default_rng(7).uniform(-top, top, (copies, steps))
-    return simulate(plant, episode_keys(range(copies)), voltages)
+    with interpreted() if copies * steps <= LEAST_COMPILED else nullcontext():
+        return simulate(plant, episode_keys(range(copies)), voltages)
 
 
 def read(chain, **arguments):
@@ -262,27 +265,45 @@ def test_every_effect_is_tried():
     assert {effect["name"] for effect in EVERY_EFFECT} == set(SENSOR_EFFECTS.effects)
 
 
-@pytest.mark.parametrize("written, at", [("rows", 0), ("rows + 1", 0), ("target", 1)])
-def test_an_effect_that_goes_beyond_its_rows_or_parameters_is_refused(monkeypatch, written, at):
-    """Compiled code would overwrite the next effect's state without a word."""
-    row = {"rows": 0, "rows + 1": 1}.get(written)
+def registered(monkeypatch, act):
+    """An effect of a user with one argument, `factor`."""
 
     @dataclass(frozen=True)
-    class Reaching(Effect):
+    class OwnEffect(Effect):
         factor: float
-        row_count = row or 0
+        name = "own"
 
-        @staticmethod
-        @inlined
-        def act(memory, b, target, rows, number, numbers, first, begin):
-            for j in range(memory.shape[2]):
-                memory[b, target if row is None else rows + row, j] = numbers[first + at]
+    OwnEffect.act = staticmethod(act)
+    monkeypatch.setitem(SENSOR_EFFECTS.effects, "own", OwnEffect)
+    return {"name": "own", "factor": 1.5}
 
-    monkeypatch.setitem(SENSOR_EFFECTS.effects, "reaching", Reaching)
-    monkeypatch.setattr(Reaching, "name", "reaching", raising=False)
-    rule = r"act of 'reaching' must stay within its . rows \(row_count\) and 1 parameters, but goes beyond them"
-    with pytest.raises(ValueError, match=rule):
-        gym.make("BowThruster-v0", sensors={"thrust": [{"name": "reaching", "factor": 1.0}]})
+
+def test_an_effect_of_one_s_own_may_decide_and_keep_what_it_likes(monkeypatch):
+    def act(e, reading, peak, t):
+        peak = abs(reading.z) if t.begin else max(peak, abs(reading.z))
+        if reading.z < 0.0:
+            return reading._replace(z=-peak * e.factor), peak
+        return reading._replace(z=peak), peak
+
+    raw, changed = read([NOTHING], r=0.25, copies=20), read([registered(monkeypatch, act)], r=0.25, copies=20)
+    peak = np.maximum.accumulate(np.abs(raw), axis=1)
+    np.testing.assert_allclose(changed, np.where(raw < 0, -1.5 * peak, peak), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("act", "rule"),
+    [
+        (
+            lambda e, reading, n, t: (reading, 0.0 if t.begin else (n, n)),
+            "must have a memory of the same shape in",
+        ),
+        (lambda e, reading, n, t: (reading._replace(z=[0.0, 1.0][reading.z]), n), "must be a function of numbers"),
+    ],
+)
+def test_an_effect_that_is_no_function_of_numbers_is_refused(monkeypatch, act, rule):
+    with pytest.raises(ValueError, match=f"act of 'own' {rule}") as error:
+        gym.make("BowThruster-v0", sensors={"thrust": [registered(monkeypatch, act)]})
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("effect", EVERY_EFFECT, ids=lambda effect: effect["name"])

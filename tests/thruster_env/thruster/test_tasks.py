@@ -18,9 +18,9 @@ from thruster_env.effects.sensors import Dropout
 from thruster_env.effects.signals import Sinusoid
 from thruster_env.thruster.effects import LogNormal
 from thruster_env.thruster.env import BowThrusterLinearEnv
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.linear import PUBLISHED, make_linear_plant
 from thruster_env.thruster.parameters import TUNNEL_PHYSICAL
-from thruster_env.thruster.simulation import simulate
 
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds
 IDS = ["BowThruster-v0", "BowThrusterTracking-v0", "BowThrusterReversal-v0", "BowThrusterLinear-v0"]

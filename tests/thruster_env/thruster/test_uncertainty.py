@@ -9,8 +9,8 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 import thruster_env  # noqa: F401 - registers the envs
-from thruster_env.core.memory import row
 from thruster_env.core.streams import episode_keys
+from thruster_env.graphs.draws import Draws
 from thruster_env.thruster.analysis import (
     required_substeps,
     required_substeps_of_all,
@@ -18,7 +18,7 @@ from thruster_env.thruster.analysis import (
     state_range,
     steady_state,
 )
-from thruster_env.thruster.dynamics import Constants, rates, thrust_and_torque
+from thruster_env.thruster.dynamics import rates, thrust_and_torque
 from thruster_env.thruster.effects import (
     UNCERTAIN,
     LogNormal,
@@ -28,9 +28,9 @@ from thruster_env.thruster.effects import (
     make_uncertainty,
 )
 from thruster_env.thruster.env import BowThrusterVectorEnv
+from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.simulation import CONSTANT_ROWS, Copies, simulate
 from thruster_env.thruster.task import Task
 
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds
@@ -39,10 +39,14 @@ SOME = {"load_gain": LOG_NORMAL, "motor_damping": UNIFORM, "lift_coefficient": U
 EXACT = {"process_noise_cov": [0, 0], "measurement_noise_cov": 0}
 
 
+def numbers_of(plant):
+    return {name: (type(kind), kind.numbers) for name, kind in plant.uncertainty.items()}
+
+
 def factors(parameter, uncertainty, count=4000):
     """Drawn over nominal values of one parameter for as many episodes."""
     plant = make_plant("tunnel_physical", uncertainty=uncertainty)
-    drawn = drawn_parameters(plant.parameters, plant.uncertainty, episode_keys(range(count)))
+    drawn = drawn_parameters(plant.parameters, numbers_of(plant), Draws(tuple(episode_keys(range(count)).T), 0))
     return getattr(drawn, parameter) / getattr(TUNNEL_PHYSICAL, parameter)
 
 
@@ -113,14 +117,14 @@ def test_substeps_suffice_for_every_extreme():
 def test_the_constants_in_memory_are_those_of_the_drawn_parameters():
     plant = make_plant("t200", uncertainty=SOME, ambient_velocity=0.3)
     keys = episode_keys(range(150))
-    copies = Copies(plant, Task(), 150)
+    copies = copies_of(plant, Task(), 150)
     copies.begin(keys)
-    first = int(copies.numbers[CONSTANT_ROWS])
-    stored = np.array([row(copies.memory, first + i, 150) for i in range(len(Constants._fields))])
+    stored = copies.memory.transpose(1, 0, 2).reshape(copies.memory.shape[1], -1)
     for i in (0, 1, 127, 128, 149):
-        p = drawn_parameters(plant.parameters, plant.uncertainty, keys[i : i + 1])
-        p = p._replace(**{name: float(getattr(p, name)[0]) for name in SOME})
-        np.testing.assert_allclose(stored[:, i], derive_constants(p, 0.3, plant.dt / plant.substeps), rtol=1e-13)
+        p = drawn_parameters(plant.parameters, numbers_of(plant), Draws(tuple(keys[i]), 0))
+        constants = derive_constants(p, 0.3, plant.dt / plant.substeps)
+        first = next(k for k in range(len(stored)) if stored[k, i] == pytest.approx(constants[0], rel=1e-13))
+        np.testing.assert_allclose(stored[first : first + len(constants), i], constants, rtol=1e-13)
 
 
 def test_each_copy_has_its_own_parameters_and_keeps_them_when_another_begins_anew():
