@@ -11,8 +11,9 @@ from thruster_env.core.checks import one_of
 from thruster_env.core.modules import to_install
 from tuning.likelihood.family import check_gradient
 from tuning.methods.correlations import als, desroziers, mehra, stationary
-from tuning.methods.em import em, maximum_a_posteriori, nuts, posterior, squarem
+from tuning.methods.em import em, squarem
 from tuning.methods.okf import okf
+from tuning.methods.posterior import maximum_a_posteriori, nuts, posterior
 from tuning.methods.scoring import noise_estimation, scoring
 from tuning.methods.searches import (
     INFLATION,
