@@ -5,13 +5,16 @@
         return tuple(x[i] + c.dt * ...)                               return its results
 
 So loops over known numbers, comprehensions, arrays, dataclasses and dictionaries are machine code wherever a model
-is used. numba compiles what cannot be traced, such as a loop until a value is small, if it can; else the model
-runs as Python, and one warning names the function, the line, the reason and what to write in its place.
+is used. numba compiles the package's own functions, plain loops over large arrays, and what cannot be traced, such
+as a loop until a value is small, if it can; else the model runs as Python, and one warning names the function, the
+line, the reason and what to write in its place.
 """
 
 from __future__ import annotations
 
+import dis
 import hashlib
+import inspect
 import traceback
 import types
 from collections.abc import Callable, Sequence
@@ -25,13 +28,17 @@ from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.modules import error_line
 from thruster_env.core.results import array_valued
 from thruster_env.core.sources import is_array, written_out
-from thruster_env.core.user_functions import is_copy, needs_python, stand_in
+from thruster_env.core.user_functions import codes_in, functions_in, is_copy, is_plain, needs_python, stand_in
 from thruster_env.graphs.graphs import TooLarge
 from thruster_env.graphs.programs import OF_STEPS, Program, callable_of
 from thruster_env.graphs.python_floats import in_python
 from thruster_env.model.traced import traced_function
 
 MOST = 3000  # operations of a program: numba compiles loops of more in less time
+ODD = {  # instructions of what numba refuses, or makes no array of
+    *"IMPORT_NAME FORMAT_VALUE FORMAT_SIMPLE BUILD_MAP BUILD_CONST_KEY_MAP".split(),
+    *"BUILD_LIST LIST_APPEND LIST_EXTEND".split(),
+}
 MOST_INLINED = 300  # operations of a program of which each caller has a copy
 
 
@@ -61,6 +68,10 @@ def called_function(
 
 def _machine_code(function: Callable, arguments: str, sizes: Sequence[int], form, shape: Sequence[int]) -> Instead:
     """Machine code of a function's graph, else the function for numba, if that takes it."""
+    parts, for_numba = [*functions_in(function)], array_valued(function, arguments, *shape)
+    large = is_array(max(sizes[:-1])) or is_array(*shape)
+    if not parts or large and all(map(_has_plain_loops, parts)):
+        return Instead(for_numba, "", frozenset(fastmath_of(function)))
     try:
         program = traced_function(function, sizes, form, shape).program()
         if len(program.works) > MOST:
@@ -70,9 +81,19 @@ def _machine_code(function: Callable, arguments: str, sizes: Sequence[int], form
     except Exception as error:  # whatever a user's function raises if it gets Numbers
         reason = why_not_traced(function, error)
     if not isinstance(function, types.FunctionType) and not hasattr(function, "py_func"):
-        return Instead(None, reason=f"{reason}; numba compiles plain functions, and no {type(function).__name__}")
-    other = None if needs_python(function) else array_valued(function, arguments, *shape)
-    return Instead(other, "", frozenset(fastmath_of(function)), reason)
+        return Instead(None, reason=f"{reason}; numba takes no {type(function).__name__}")
+    return Instead(None if needs_python(function) else for_numba, "", frozenset(fastmath_of(function)), reason)
+
+
+def _has_plain_loops(function: types.FunctionType) -> bool:
+    """Whether numba takes a function, by its code: loops over large arrays are shorter than their graph."""
+    codes = [*codes_in(function.__code__)]
+    later = any(code.co_flags & inspect.CO_GENERATOR for code in codes)
+    odd = any(not ODD.isdisjoint(part.opname for part in dis.get_instructions(code)) for code in codes)
+    cells = (cell.cell_contents for cell in function.__closure__ or ())
+    names = (function.__globals__.get(name) for name in function.__code__.co_names)
+    kinds = types.ModuleType, types.FunctionType, types.BuiltinFunctionType, np.ufunc, type
+    return not (later or odd) and all(is_plain(value) or isinstance(value, kinds) for value in (*cells, *names))
 
 
 def _evaluation(program: Program, arguments: str, sizes: Sequence[int], shape: Sequence[int]) -> Callable:
