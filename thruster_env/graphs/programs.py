@@ -66,7 +66,6 @@ SPECIAL = {
     "table": "table(numbers, {})",
 }
 
-
 CALLED: dict[str, Callable] = {}
 """Functions work(given, found) of two arrays that programs call: what would be too long if it were written out."""
 READ_NUMBERS: set[str] = set()
