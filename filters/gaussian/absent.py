@@ -60,7 +60,7 @@ def completer(
     priors: Sequence[tuple[int, int]],
     scratch: int,
 ) -> Callable:
-    """Return `complete(row, weights, numbers)`: fill in the states that parts lack; see this module.
+    """Return `complete(row, weights, numbers)`: fill in the states that parts lack, by unbiased mixing.
 
     Mean and covariance come first in each part. `priors` are the offsets of the prior mean and covariance of each
     mode's model in the filter's numbers; from `scratch` on the row has room for weights, a mean and a covariance.

@@ -1,6 +1,6 @@
 """The tuned file: one JSON file with a filter's parameters, their origin and their held-out metrics.
 
-`verify` recomputes these metrics.
+`verify` recomputes the metrics on the file's own seeds.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Objectives that a study minimises, and the constraint on the mean NIS.
 
-NEES is the normalised estimation error squared, NIS the normalised innovation squared. Sources: Chen, Heckman,
-Julier, Ahmed (2018), arXiv 1807.08855 (`nees`, `nis`); Chen, Biggie, Ahmed, Julier, Heckman, arXiv 2306.07225
+Sources: for NEES and NIS, the normalised squares of estimation errors and innovations, Chen, Heckman, Julier,
+Ahmed (2018), arXiv 1807.08855 (`nees`, `nis`), and Chen, Biggie, Ahmed, Julier, Heckman, arXiv 2306.07225
 (`c-nees`, `c-nis`); Abbeel, Coates, Montemerlo, Ng, Thrun (2005), "Discriminative training of Kalman filters",
 Robotics: Science and Systems (`mse`, `log-score`).
 """

@@ -1,10 +1,8 @@
 """The thruster's scenarios: `Scenario`, a named, seeded and immutable recipe, and the built-in ones.
 
-A scenario makes truth, inputs and measurements once for all filters.
-
     python -m tuning.thruster.scenario [NAME ...]
 
-recomputes the scales and prints them.
+recomputes their scales and prints them.
 """
 
 from __future__ import annotations
