@@ -42,6 +42,7 @@ from thruster_env.graphs.graphs import CONDITIONS, Graph, Number, needed_by, whe
 
 MOST_OUTCOMES = 64  # calls of a function
 MOST_DECISIONS = 64  # in one call
+MOST_IN_ALL = 4096  # calls of a function and of all that it calls
 NUMBERS = Number, int, float, np.generic
 
 
@@ -58,11 +59,13 @@ def on_every_side(function: Callable[[], Any], graph: Graph) -> Any:
     """
     calls, failure = 0, None
     outside, outer = graph.decide, graph.answers
+    graph.outcomes = 0 if outside is None else graph.outcomes
 
     def outcome(known: dict[int, bool]) -> Any:
         nonlocal calls, failure
         calls += 1
-        if calls > MOST_OUTCOMES:
+        graph.outcomes += calls > 1
+        if calls > MOST_OUTCOMES or graph.outcomes > MOST_IN_ALL:
             raise TypeError(f"a function must have at most {MOST_OUTCOMES} outcomes of its decisions")
         asked: list[Number] = []
         answers = outer | known

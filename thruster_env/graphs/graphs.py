@@ -87,6 +87,7 @@ class Graph:
         self.size = size
         self.decide: Callable[[Number], bool] | None = None  # what a condition is taken for, see `branches`
         self.answers: dict[int, bool] = {}  # what conditions are taken for now, by their places
+        self.outcomes = 0  # of decisions that were not the first, as far as a function has been traced
         self.whole: set[int] = set()  # places of numbers that are not taken apart, as along them slopes are taken
         self.exact = False  # whether a model's function is being traced: see `as_written`
         self._made: dict[tuple, Number] = {}

@@ -57,10 +57,62 @@ def of_floats(x, y):
 FUNCTIONS = [drag, nested, in_loop, of_truth, dead_zone, of_floats]
 
 
+class Wind:
+    """What a helper returns."""
+
+    def __init__(self, speed, names):
+        self.speed, self.names = speed, names
+
+
+def wind_at(x):
+    if x > 0.5:
+        return {"wind": Wind([x, -x], "strong")}
+    return {"wind": Wind([0.0, x * x], "strong")}
+
+
+def saturated(x):
+    return 1.0 if x > 1.0 else -1.0 if x < -1.0 else x
+
+
+def extend(values, y):
+    values.append(y if y > 0.0 else -2.0 * y)
+
+
+def of_helpers(x, y):
+    """Eight helpers that decide have more outcomes together than are traced, and 22 one by one."""
+    total = sum(saturated(k * x - y) for k in range(8))
+    first, second = wind_at(x)["wind"].speed
+    return total + first, second + saturated(y)
+
+
+def of_changes(x, y):
+    """A helper that decides and changes its argument is traced with the function that calls it."""
+    parts = [x]
+    extend(parts, y)
+    return sum(parts), parts[1]
+
+
+FUNCTIONS += [of_helpers, of_changes]
+
+
+def test_helpers_are_joined_one_by_one_unless_they_change_what_they_get():
+    for function, by_function in ((of_helpers, True), (of_changes, False)):
+        graph = Graph()
+        x, y = graph.given("x"), graph.given("y")
+        with pytest.raises(TypeError, match="outcomes" if by_function else "change its arguments"):
+            on_every_side(lambda: np.array(traced(function, not by_function)(x, y), dtype=object), graph)  # noqa: B023
+
+
+def test_decisions_within_decisions_end(monkeypatch):
+    monkeypatch.setattr("thruster_env.graphs.branches.MOST_IN_ALL", 10)
+    with pytest.raises(TypeError, match="at most 64 outcomes"):
+        graph_of(of_helpers)
+
+
 def graph_of(function):
     graph = Graph()
     x, y = graph.given(Place("numbers", 0)), graph.given(Place("numbers", 1))
-    copy = traced(function)
+    copy = traced(function, by_function=function is not of_changes)
     found = on_every_side(lambda: np.array(copy(x, y), dtype=object), graph)
     return [graph.number(one) for one in found], (x, y)
 
