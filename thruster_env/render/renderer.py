@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
-from gymnasium.error import DependencyNotInstalled
 
 from thruster_env.core.checks import one_of, positive
 from thruster_env.core.files import check_target, write_whole
@@ -72,6 +71,8 @@ class PlantRenderer:
         try:
             import pygame  # noqa: F401
         except ImportError as error:
+            from gymnasium.error import DependencyNotInstalled  # here, because a model needs no Gymnasium
+
             raise DependencyNotInstalled(
                 f"rendering needs pygame, which is not installed: {to_install('render')}"
             ) from error
