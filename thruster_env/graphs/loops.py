@@ -50,7 +50,7 @@ class Array(NamedTuple):
 
 
 def machine_code_of(function: Callable, shapes: Sequence, *, as_builtin: bool = False) -> Code | None:
-    """Machine code of a function, or None if it cannot be translated; see `add_function`.
+    """Machine code of a function, or None if it cannot be translated or linked; see `add_function`.
 
     Called from Python as a builtin function it has the last argument of the function; the words have the others.
     """
@@ -61,7 +61,10 @@ def machine_code_of(function: Callable, shapes: Sequence, *, as_builtin: bool = 
         return None
     if as_builtin:
         add_builtin(module, "call", entry, word_count - 1)
-    return code_of(module, "call" if as_builtin else "run")
+    try:
+        return code_of(module, "call" if as_builtin else "run")
+    except RuntimeError:  # this system's libraries lack a function that numba brings
+        return None
 
 
 def add_function(module: ir.Module, name: str, function: Callable, shapes: Sequence) -> tuple[ir.Function, int]:

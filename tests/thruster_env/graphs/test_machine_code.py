@@ -11,7 +11,7 @@ from llvmlite import ir
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.graphs import machine_code
 from thruster_env.graphs.graphs import Graph
-from thruster_env.graphs.loops import Untranslated, add_function
+from thruster_env.graphs.loops import Untranslated, add_function, machine_code_of
 from thruster_env.graphs.machine_code import add_builtin, builtin_of, code_of, function_of
 from thruster_env.graphs.programs import OF_STEPS, Place, callable_of, program_of
 
@@ -119,6 +119,15 @@ def named(x):
 def test_what_cannot_be_translated_is_refused(function):
     with pytest.raises(Untranslated):
         add_function(ir.Module(), "run", function, [(None,)])
+
+
+def test_what_cannot_be_linked_is_left_to_numba(monkeypatch):
+    def refuse(module, name):
+        raise RuntimeError("Symbols not found: [ cos ]")
+
+    assert machine_code_of(count_up, [(None,), None]) is not None
+    monkeypatch.setattr("thruster_env.graphs.loops.code_of", refuse)
+    assert machine_code_of(count_up, [(None,), None]) is None
 
 
 def count_up(x, by):
