@@ -27,9 +27,9 @@ from llvmlite import ir
 from thruster_env.core.compiled import private_folder
 
 FOLDER = "thruster-env-code"  # within the folder of numba's cache or of the user's
-# Levels of LLVM's optimisation: of the module, and of its translation. A third level of passes takes longer and gives
-# the same code; without LLVM's two schedulers (-disable-post-ra, -enable-misched=false) batches of 8 states take 7 %
-# longer, and compilation hardly less.
+# Levels of LLVM's optimisation: of the module, and of its translation. A third level of passes takes longer and
+# gives the same code; without LLVM's two schedulers (-disable-post-ra, -enable-misched=false) batches of 8 states
+# take 7 % longer, and compilation hardly less.
 PASSES, SELECTION = 1, 2
 DIGEST = hashlib.sha256().digest_size
 LONG, POINTER = ir.IntType(64), ir.IntType(8).as_pointer()
