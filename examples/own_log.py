@@ -66,7 +66,7 @@ before
 # ``identify`` finds the maximum-likelihood parameters with standard errors, and reports which of them the runs do
 # not determine.
 
-identified = tuning.identify(runs[:3], ["voltage_gain"], preset="tunnel_physical")
+identified = tuning.identify(("tunnel_physical", runs[:3]), ["voltage_gain"])
 print(f"true voltage gain {TRUE_GAIN:.4g}")
 identified
 

@@ -34,7 +34,7 @@ def runs(recorded, tmp_path):
 
 @pytest.fixture(scope="module")
 def found(recorded):
-    return tuning.identify(recorded, FREE, **WHOSE, noise=False, starts=1, progress=False)
+    return tuning.identify(tuning.read_logs(recorded, **WHOSE), FREE, noise=False, starts=1, progress=False)
 
 
 def test_estimate_is_the_command_in_one_call(as_json, runs, tmp_path):  # noqa: F811
@@ -54,7 +54,7 @@ def test_a_pair_of_model_and_log_is_the_same(recorded):
     pair = tuning.estimate(tuning.read_logs(("tunnel_physical", recorded[0]), sensors=WHOSE["sensors"]))
     assert pair.log_likelihood == alone.log_likelihood
     with pytest.raises(ValueError, match="'mass'"):  # the logs of the pair are read as those of the thruster
-        tuning.identify(("tunnel_physical", [recorded[0]]), "mass", sensors=WHOSE["sensors"])
+        tuning.identify(tuning.read_logs(("tunnel_physical", [recorded[0]]), sensors=WHOSE["sensors"]), "mass")
 
 
 def test_estimates_are_drawn_and_copied(recorded):
@@ -74,7 +74,9 @@ def test_identify_is_the_command_in_one_call(as_json, runs, tmp_path):  # noqa: 
     options = ("--free", ",".join(FREE), "--hold-noise", "--starts", 2, "--range", "voltage_gain=100:5000")
     told = as_json("identify", *runs, *OF_LOGS, *options, "--out", "theirs.toml")
     ranges = {"voltage_gain": (100, 5000)}
-    mine = tuning.identify(runs, FREE, **WHOSE, noise=False, starts=2, ranges=ranges, progress=False)
+    mine = tuning.identify(
+        tuning.read_logs(runs, **WHOSE), FREE, noise=False, starts=2, ranges=ranges, progress=False
+    )
     assert mine.values == told["values"] and mine.standard_errors == told["standard_errors"]
     assert plain({name: one._asdict() for name, one in mine.validation.items()}) == told["validation"]
     assert mine.save("mine.toml").read_text() == (tmp_path / "theirs.toml").read_text()
@@ -94,7 +96,9 @@ def test_what_was_identified_shows_itself(found):
 
 def test_runs_that_are_held_out_only_validate(recorded):
     options = {"noise": False, "starts": 1, "progress": False}
-    mine = tuning.identify([recorded[0]], "voltage_gain", **WHOSE, held_out=[recorded[1]], **options)
+    mine = tuning.identify(
+        tuning.read_logs([recorded[0]], **WHOSE, held_out=[recorded[1]]), "voltage_gain", **options
+    )
     assert [log.name for log in mine.held_out] == [recorded[1].name] and len(mine.runs) == 1
     assert set(mine.validation) == {"start", "identified"}
 
@@ -110,15 +114,24 @@ WRONG = [
     ),
     (lambda log: tuning.identify(log, lambda dt: None), "free must be names of parameters, but got .*model=..."),
     (
-        lambda log: tuning.identify(log, FREE, model="motor"),
+        lambda log: tuning.read_logs(log, model="motor"),
         "or a thruster's preset, but got 'motor'",
     ),
     (lambda log: tuning.read_logs(("tunnel", log), model="a:b"), "a pair .* must come without another model"),
     (lambda log: tuning.identify([]), "at least one log must be left to learn from"),
-    (lambda log: tuning.identify(log, "mass", **WHOSE), "free parameters must be of .*, but got 'mass'"),
-    (lambda log: tuning.identify(log, model="tunnel", preset="t200"), "give either a model or a preset"),
-    (lambda log: tuning.identify(log, FREE, **WHOSE, filter="kf"), "a thruster must be identified with the ekf"),
-    (lambda log: tuning.identify(log, FREE, **WHOSE, start={"x": 1.0}), "must be of free parameters, .*but got x"),
+    (
+        lambda log: tuning.identify(tuning.read_logs(log, **WHOSE), "mass"),
+        "free parameters must be of .*, but got 'mass'",
+    ),
+    (lambda log: tuning.read_logs(log, model="tunnel", preset="t200"), "give either a model or a preset"),
+    (
+        lambda log: tuning.identify(tuning.read_logs(log, **WHOSE), FREE, filter="kf"),
+        "a thruster must be identified with the ekf",
+    ),
+    (
+        lambda log: tuning.identify(tuning.read_logs(log, **WHOSE), FREE, start={"x": 1.0}),
+        "must be of free parameters, .*but got x",
+    ),
 ]
 
 

@@ -43,8 +43,10 @@ def table(model, size, rows, seed):
     return {"time_s": DT * np.arange(rows), "u": u, "z": drawn.measurements[0, :, 0].copy()}
 
 
-def found_in(run, make, free, **options):
-    return tuning.identify(run, free, model=make, starts=1, use_all=True, **options)
+def found_in(run, make, free, hold_gaps=False, **options):
+    return tuning.identify(
+        tuning.read_logs(run, model=make, hold_gaps=hold_gaps), free, starts=1, use_all=True, **options
+    )
 
 
 @cache

@@ -141,9 +141,9 @@ def test_gradients_along_constants_and_the_numbers_of_the_grid():
 @pytest.mark.slow
 def test_a_jittering_clock_does_not_move_what_is_identified():
     """On a grid 0.4 of a step's motion passes for noise of the sensors."""
-    logs, options = [recorded(stamps_of(250, seed), seed) for seed in (3, 4)], {"model": plant(), "dt": DT}
+    logs = [recorded(stamps_of(250, seed), seed) for seed in (3, 4)]
     own, on_grid = (
-        tuning.identify(logs, FREE, **options, grid=grid, starts=1, start=START, progress=False)
+        tuning.identify(tuning.read_logs(logs, model=plant(), dt=DT, grid=grid), FREE, starts=1, start=START)
         for grid in (False, True)
     )
     truth = {"stiffness": 4.0, "damping": 0.6, "R11": 1e-4, "R22": 4e-4}
@@ -185,9 +185,10 @@ def fixed_channels(x, c):
 def test_what_needs_a_grid_is_refused(changes, rule):
     data = recorded(stamps_of(30, 5), 5)
     data |= {"V_s": data["u_1"], "thrust": data["rate"]}
-    options = {"free": FREE, "model": plant(), "dt": DT, "grid": False, "progress": False} | changes
+    options = {"model": plant(), "dt": DT, "grid": False} | changes
+    search = {name: options.pop(name) for name in ("free", "filter") if name in options}
     with pytest.raises(ValueError, match=rule):
-        tuning.identify(data, **options)
+        tuning.identify(tuning.read_logs(data, **options), **{"free": FREE, "progress": False} | search)
 
 
 def test_logs_are_all_on_grids_or_none():
@@ -198,7 +199,7 @@ def test_logs_are_all_on_grids_or_none():
     logs = [dataclasses.replace(log, name=name) for log, name in zip(logs, ("even", "own"), strict=True)]
     assert all(isinstance(log, Log) for log in logs)
     with pytest.raises(ValueError, match="logs must all lie on grids or none, but own does not and even does"):
-        tuning.identify(logs, FREE, model=plant(), progress=False)
+        tuning.identify((plant(), logs), FREE, progress=False)
 
 
 def test_models_made_of_rates_can_be_sent_to_another_process():

@@ -1,30 +1,59 @@
-"""`tuning.identify`: a thruster's parameters, or any model's, from recorded runs."""
+"""`tuning.identify` and `thruster identify`: a thruster's parameters, or any model's, from recorded runs."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from rich.console import Console
+from rich.console import RenderableType
+from rich.text import Text
 
-from thruster_env.core.checks import short_repr
+from thruster_env.core.checks import finite, short_repr
+from thruster_env.core.files import save_figure
+from thruster_env.core.text_tables import plain_text, table
 from thruster_env.logs.log import Log
+from thruster_env.logs.write import check_picture
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.display import drawn, frame, html
+from tuning.api.markers import (
+    FILTER,
+    LOGS,
+    OUTPUT,
+    READ,
+    SEARCH,
+    WRITTEN,
+    FilterOption,
+    LogsArgument,
+    Option,
+    Progress,
+    Seed,
+)
 from tuning.api.progress import console_for
+from tuning.api.read_logs import recorded_runs
 from tuning.identification.family import with_ranges
 from tuning.identification.identify import STARTS, check_excitation
 from tuning.identification.identify import identify as identify_runs
 from tuning.identification.objective import Objective
-from tuning.identification.profiles import Validation, fall_sentence, profile_figure, profiles, validate
+from tuning.identification.profiles import (
+    Profile,
+    Validation,
+    fall_sentence,
+    profile_figure,
+    profiles,
+    validate,
+)
 from tuning.identification.result import Identification
 from tuning.logs.problem import AnyStepFamily, check_offsets, family_of, remarks, split_runs, write_found
-from tuning.logs.read import model_of_logs
+from tuning.logs.read import pairs
 from tuning.problems.problem import Coordinates, Parameter
+from tuning.search.parameters import index_pairs
+
+DEFAULT_OUT = Path("out/identified.toml")  # of the command
+RANGE, START = "ranges (--range)", "start (--start)"
 
 # `Identified`: parameters identified from recorded runs, as a value.
 
@@ -44,6 +73,8 @@ class Identified:
         family: the thruster or the model whose parameters are free.
         runs: runs used for identification.
         held_out: runs used only for validation.
+        curves: profile likelihoods, if a picture of them was asked for.
+        files: that were written.
     """
 
     found: Identification
@@ -51,6 +82,8 @@ class Identified:
     family: Any
     runs: tuple[Log, ...]
     held_out: tuple[Log, ...] = ()
+    curves: tuple[Profile, ...] = ()
+    files: tuple[str, ...] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -133,6 +166,81 @@ class Identified:
         """
         return drawn(profile_figure(self.found, profiles(self.found, names)))
 
+    def _rows(self) -> list[list[str]]:
+        """A row per parameter: unit, start, value, standard error, whether it is determined, and a test."""
+        tests, rows = self.found.null_tests, []
+        units = {parameter.name: parameter.unit for parameter in self.found.objective.coordinates.free}
+        for name, value in self.values.items():
+            known = "yes" if self.determined[name] else "at the end" if self.found.at_end[name] else "no"
+            test = tests.get(name)
+            numbers = [f"{number:.5g}" for number in (self.found.start[name], value, self.standard_errors[name])]
+            without = ["-", "-"] if test is None else [f"{test.at:.4g}", test.said]
+            rows.append([name, units[name], *numbers, known, *without])
+        return rows
+
+    def _title(self) -> str:
+        count, steps = len(self.runs), sum(log.steps for log in self.runs)
+        return f"Identified on {count} run{'' if count == 1 else 's'}, {steps} steps"
+
+    def tables(self) -> list[RenderableType]:
+        """The parameters, the validation and what the runs determine, for a terminal."""
+        heads = ["", "start", "value", "standard\nerror", "determined", "if left\nout, at", "p"]
+        labels = [
+            [index_pairs(name) + (f" [{unit}]" if unit else ""), *cells] for name, unit, *cells in self._rows()
+        ]
+        where = "On the runs used for identification"
+        if self.held_out:
+            where = f"Validation on {'; '.join(log.name for log in self.held_out)}"
+        checked, rows = self.validation, []
+        for symbol in checked["start"].one_step:
+            for what, part in (("one step", "one_step"), ("simulation", "simulation")):
+                errors = [f"{getattr(check, part)[symbol]:.4g}" for check in checked.values()]
+                rows.append([f"RMSE, {what}, {symbol}", *errors])
+            fits = [f"{check.fit[symbol]:.1f}" for check in checked.values()]
+            rows.append([f"fit of the simulation, {symbol} [%]", *fits])
+        rows.append(["mean NIS over channels", *(f"{check.nis:.3g}" for check in checked.values())])
+        rows.append(["log-likelihood", *(f"{check.log_likelihood:.6g}" for check in checked.values())])
+        tables = [table(self._title(), heads, labels), table(where, ["", *checked], rows)]
+        return [*tables, *self.sentences(), *(f"wrote {path}" for path in self.files)]
+
+    def as_dict(self) -> dict[str, Any]:
+        """All results as plain data, as in `thruster identify --json`."""
+        result = self.found
+        return {
+            "logs": [log.name for log in self.runs],
+            "held_out": [log.name for log in self.held_out],
+            "values": result.values,
+            "start": result.start,
+            "standard_errors": result.standard_errors,
+            "determined": result.determined,
+            "at_end": result.at_end,
+            "left_out": {name: test._asdict() for name, test in result.null_tests.items()},
+            "begun_elsewhere": [self.runs[i].name for i in result.begun_elsewhere],
+            "correlations": {"names": result.names, "matrix": result.correlations},
+            "trade_off": result.traded,
+            "least_known_direction": result.least_determined,
+            "log_likelihood": result.log_likelihood,
+            "log_likelihood_at_start": result.start_log_likelihood,
+            "optima": [optimum._asdict() for optimum in result.optima],
+            "starts_that_agree": result.agreement,
+            "evaluations": result.evaluations,
+            "samples_left_out": result.left_out,
+            "interrupted": result.interrupted,
+            "validation": {name: check._asdict() for name, check in self.validation.items()},
+            "profiles": [{**profile._asdict(), "interval": profile.interval} for profile in self.curves],
+            "sentences": self.sentences(),
+            "files": list(self.files),
+        }
+
+    @property
+    def exit_code(self) -> int:
+        """Of the command: 130 if it was interrupted."""
+        return 130 if self.interrupted else 0
+
+    def __str__(self) -> str:
+        """What `thruster identify` prints."""
+        return plain_text(self.tables())
+
     def __repr__(self) -> str:
         values = ", ".join(f"{name} {value:.4g}" for name, value in list(self.values.items())[:6])
         more = ", ..." if len(self.values) > 6 else ""
@@ -141,83 +249,72 @@ class Identified:
         return f"Identified({values}{more}; {verdict}, {len(self.runs)} runs)"
 
     def _repr_html_(self) -> str:
-        tests = self.found.null_tests
-        units = {parameter.name: parameter.unit for parameter in self.found.objective.coordinates.free}
-        rows = [
-            [name, units[name], f"{self.found.start[name]:.5g}", f"{value:.5g}"]
-            + [f"{self.standard_errors[name]:.2g}", "yes" if self.determined[name] else "no"]
-            + ([f"{tests[name].at:.4g}", tests[name].said] if name in tests else ["-", "-"])
-            for name, value in self.values.items()
-        ]
-        columns = ["", "unit", "start", "value", "standard error", "determined", "if left out, at", "p"]
-        steps = sum(log.steps for log in self.runs)
-        title = f"Identified on {len(self.runs)} runs, {steps} steps"
-        return html(title, columns, rows, " ".join(self.sentences()))
+        heads = ["", "unit", "start", "value", "standard error", "determined", "if left out, at", "p"]
+        return html(self._title(), heads, self._rows(), " ".join(self.sentences()))
 
 
 def identify(
-    logs: Any,
-    free: str | Sequence[str] = (),
+    logs: Annotated[Any, LogsArgument(metavar="LOG...", type=list[Path], file=READ, last="outliers")],
+    free: Annotated[str | Sequence[str], Option(SEARCH, type=str)] = (),
     *,
-    model: Any = None,
-    preset: str | Path | None = None,
-    sensors: Sequence[str] | None = None,
-    columns: Any = None,
-    clock_offset: Any = None,
-    dt: float | None = None,
-    ranges: Mapping[str, tuple[float, float]] | None = None,
-    start: Mapping[str, float] | None = None,
-    noise: bool = True,
-    held_out: Any = None,
-    use_all: bool = False,
-    hold_gaps: bool = False,
-    grid: bool = True,
-    stamps: str | None = None,
-    filter: str = "ekf",
-    predicted: Sequence[str] = (),
-    degrees: float = math.inf,
-    gate: float = math.inf,
-    starts: int = STARTS,
-    seed: int = 0,
-    progress: bool | None = None,
+    ranges: Annotated[
+        Mapping[str, tuple[float, float]] | Sequence[str] | None,
+        Option(SEARCH, ("--range",), "NAME=LOW:HIGH", list[str]),
+    ] = None,
+    start: Annotated[
+        Mapping[str, float] | Sequence[str] | None, Option(SEARCH, metavar="NAME=VALUE", type=list[str])
+    ] = None,
+    noise: Annotated[bool, Option(SEARCH, ("--noise/--hold-noise",))] = True,
+    use_all: Annotated[bool, Option(LOGS)] = False,
+    filter: Annotated[str, FilterOption] = "ekf",
+    predicted: Annotated[Sequence[str], Option(FILTER, metavar="CHANNEL")] = (),
+    degrees: Annotated[float, Option(SEARCH)] = math.inf,
+    gate: Annotated[float, Option(SEARCH)] = math.inf,
+    starts: Annotated[int, Option(SEARCH)] = STARTS,
+    out: Annotated[str | Path | None, Option(OUTPUT, type=Path, file=WRITTEN, unset=DEFAULT_OUT)] = None,
+    plot: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
+    seed: Seed = 0,
+    progress: Progress = None,
 ) -> Identified:
     """Find the maximum-likelihood parameters for recorded runs, and say which of them the runs determine.
 
-    A thruster's free parameters may be its constants (motor_damping, voltage_gain, ...), dead_band,
-    thrust_asymmetry, ambient_velocity, bias_CHANNEL, lag_CHANNEL, clock_offset_CHANNEL, and the variances of Q and
-    R; another model's may be its arguments with numeric defaults and its named constants. Ctrl-C keeps the best so
-    far.
+    The free parameters of a thruster may be its constants (motor_damping, voltage_gain, ...), dead_band or
+    dead_band_low and dead_band_high, thrust_asymmetry, ambient_velocity, bias_CHANNEL, lag_CHANNEL,
+    clock_offset_CHANNEL, and the variances of Q and R; of another model, the arguments with numeric defaults and
+    its named constants.
 
-        found = tuning.identify(["run1.csv", "run2.csv"], ["motor_damping", "voltage_gain"], preset="tunnel")
+    With `predicted` the result predicts that channel best for a filter that does not see it: --sensor speed
+    --sensor thrust --predicted thrust identifies, on a test stand, a model that estimates thrust on the ship.
+
+    The file that is written is a preset for other commands, for a thruster also for gym.make(preset=...); of
+    another model it contains the values. Ctrl-C keeps the best so far.
+
+        found = tuning.identify(("tunnel", ["run1.csv", "run2.csv"]), ["motor_damping", "voltage_gain"])
         found.to_frame()
         found.save("mine.toml")
 
+    Example: thruster identify run*.csv --preset tunnel --free motor_damping,voltage_gain,dead_band
+
+    Example: thruster identify run.csv --model my_module:model --free stiffness,damping --range damping=0:2
+
     Args:
-        logs: one recorded run or several: paths of .csv, .parquet or .npz files, or of recorders', tables, or
-            `Log`s; or a pair (model, logs).
-        free: names of the free parameters; for a thruster its damping, gain and lift by default.
-        model: instead of a thruster: a function that returns a `StateSpaceModel` (called with dt if it has that
-            argument), a model, "module:object" for either, or a thruster's preset.
-        preset: the thruster where the search starts, by name or file.
-        sensors: a thruster's channels that the filter sees.
-        columns: headers by quantity.
-        clock_offset: seconds by quantity that a channel's clock is ahead.
-        dt: sample time [s] of logs without times, or of the grid.
-        ranges: search ranges (low, high) by name.
-        start: values by name where the search begins.
-        noise: whether the variances of Q and R are also free.
-        held_out: runs used only for validation, as objects or paths; by default every third of three or more.
-        use_all: hold no run out.
-        hold_gaps: hold the last input over gaps of a log; by default runs are split there.
-        stamps: of bags, "header" or "receipt", as in `estimate`.
-        grid: whether logs are put on one; else on their own stamps, for a model whose sample time is a constant:
-            Q of a step is then in proportion to its length, and the values are those of `dt`.
-        filter: "ekf", or "kf" for affine models.
-        predicted: channels that the filter predicts but never sees, such as a load cell's thrust.
-        degrees: of freedom of Student-t errors, such as 20, of predicted channels, if there are any.
+        logs: recorded run, or several. In Python as `tuning.read_logs` reads them, files or tables of a thruster,
+            or a pair (model, logs).
+        free: names of the free parameters, separated by commas; a wrong name lists the known ones; of a thruster
+            by default its damping, gain and lift. In Python also a list.
+        ranges: range of a parameter; may be repeated. In Python (low, high) by name.
+        start: where the search begins; may be repeated. In Python values by name.
+        noise: whether the variances of Q and R are free, too.
+        use_all: hold out no run.
+        filter: ekf, or kf for affine models.
+        predicted: a channel that the filter predicts but never sees, such as a load cell's thrust.
+        degrees: degrees of freedom of Student-t errors, such as 20; of the predicted channels, if any.
         gate: leave out samples beyond so many standard deviations, such as 5, as outliers.
         starts: number of starts of the search.
-        seed: of the random starts.
+        out: file for the result, a preset for other commands; out/identified.toml by default. In Python none by
+            default.
+        plot: profile likelihoods, .png, .svg or .pdf.
+        seed: seed of all randomness; the same seed gives the same results.
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
@@ -227,69 +324,60 @@ def identify(
         ValueError: states the rule and the value.
         KeyboardInterrupt: after Ctrl-C before there is a best so far.
     """
-    names = names_of(free)
-    logs, model, preset = model_of_logs(logs, model, preset)
-    whose: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensors}
-    read: dict[str, Any] = {**whose, "columns": columns, "clock_offset": clock_offset, "dt": dt, "grid": grid}
-    read["stamps"] = stamps
-    runs, proving = split_runs(logs, held_out, use_all=use_all, hold_gaps=hold_gaps, **read)
-    family = family_of(runs, names, **whose, noise=noise, filter=filter)
-    search: dict[str, Any] = {"predicted": tuple(predicted), "degrees": degrees, "gate": gate, "starts": starts}
-    return identified(
-        family, runs, proving, ranges, start, console_for(progress), filter=filter, seed=seed, **search
-    )
-
-
-def names_of(free: Any) -> list[str]:
-    """Names of free parameters as a list; ValueError for anything but one name or some."""
-    names = [free] if isinstance(free, str) else list(free) if isinstance(free, list | tuple) else None
-    if names is None or not all(isinstance(name, str) for name in names):
-        raise ValueError(
-            f"free must be names of parameters, "
-            f"but got {short_repr(free)}: a model is given as model=..., or with the "
-            "logs as the pair (model, logs)"
-        )
-    return names
-
-
-def identified(
-    family: Any,
-    runs: Sequence[Log],
-    proving: Sequence[Log],
-    ranges: Mapping[str, tuple[float, float]] | None,
-    start: Mapping[str, float] | None,
-    console: Console,
-    *,
-    filter: str,
-    predicted: Sequence[str] = (),
-    starts: int = STARTS,
-    **search: Any,
-) -> Identified:
-    """Check the request, search with progress, and validate, as `thruster identify` does.
-
-    Args:
-        family: from `tuning.logs.problem.family_of`.
-        runs: for identification.
-        proving: for validation; if there are none, `runs` are used.
-        ranges: of some free parameters.
-        start: of some.
-        console: where progress is shown.
-        filter: whose innovations count.
-        predicted: channels that it never sees.
-        starts: how many.
-        **search: further options of `tuning.identification.identify.identify`.
-    """
-    parameters: tuple[Parameter, ...] = with_ranges(family.free, ranges or {}, start or {})
+    if plot is not None:
+        check_picture(plot, "--plot")
+    if out is not None and not str(out).endswith(".toml"):
+        raise ValueError(f"out (--out) must end in .toml, but got {str(out)!r}")
+    names, recorded = names_of(free), recorded_runs(logs)
+    recorded.check_uncut("an identification")
+    runs, proving = split_runs(recorded.files, use_all=use_all, **recorded.splits, **recorded.reading)
+    whose = {key: recorded.reading.get(key) for key in ("preset", "model", "sensors")}
+    family, console = family_of(runs, names, **whose, noise=noise, filter=filter), console_for(progress)
+    begin = {name: finite(f"start (--start) of {name}", value) for name, value in pairs(START, start).items()}
+    parameters: tuple[Parameter, ...] = with_ranges(family.free, _ranges(ranges), begin)
     check_offsets(parameters, runs)
-    coordinates = Coordinates(parameters)
-    objective = Objective(family.data, family.model, coordinates, filter=filter, predicted=predicted)
+    coordinates, unseen = Coordinates(parameters), tuple(predicted)
+    objective = Objective(family.data, family.model, coordinates, filter=filter, predicted=unseen)
     check_excitation(objective, runs, coordinates.start())
     with console.status("identifying ...") as status:
 
         def tell(number: int, value: float, values: dict[str, float]) -> None:
             status.update(f"start {number + 1} of {starts}: log-likelihood {value:.2f}")
 
-        options: dict[str, Any] = {"filter": filter, "predicted": predicted, "starts": starts, **search}
-        identification = identify_runs(family.data, family.model, parameters, **options, progress=tell)
+        options: dict[str, Any] = {"filter": filter, "predicted": unseen, "starts": starts, "seed": seed}
+        options |= {"degrees": degrees, "gate": gate, "progress": tell}
+        identification = identify_runs(family.data, family.model, parameters, **options)
     checked = validate(identification, family.shifted(proving)) if proving else validate(identification)
-    return Identified(identification, checked, family, tuple(runs), tuple(proving))
+    result = Identified(identification, checked, family, tuple(runs), tuple(proving))
+    curves: Sequence[Profile] = ()
+    if plot is not None and not result.interrupted:
+        with console.status("profiles ...") as status:
+            curves = profiles(identification, progress=lambda name: status.update(Text(f"profile of {name} ...")))
+    if out is not None:
+        result.save(out)
+    if plot is not None and curves:
+        save_figure(profile_figure(identification, curves), Path(plot))
+    files = [str(path) for path in (out, plot if curves else None) if path is not None]
+    return replace(result, curves=tuple(curves), files=tuple(files))
+
+
+def _ranges(ranges: Mapping[str, Any] | Sequence[str] | None) -> dict[str, tuple[float, float]]:
+    """Ranges by name, also from texts NAME=LOW:HIGH; ValueError for another form."""
+    numbers = {}
+    for name, ends in pairs(RANGE, ranges).items():
+        low, colon, high = ends.partition(":") if isinstance(ends, str) else (ends[0], ":", ends[1])
+        if not colon:
+            raise ValueError(f"{RANGE} must have the form NAME=LOW:HIGH, but got {short_repr(f'{name}={ends}')}")
+        numbers[name] = finite(f"low of {name}", low), finite(f"high of {name}", high)
+    return numbers
+
+
+def names_of(free: Any) -> list[str]:
+    """Names of free parameters as a list, also from a text with commas; ValueError for anything else."""
+    names = free.split(",") if isinstance(free, str) else list(free) if isinstance(free, list | tuple) else None
+    if names is None or not all(isinstance(name, str) for name in names):
+        raise ValueError(
+            f"free must be names of parameters, but got {short_repr(free)}: a model is given as "
+            "read_logs(..., model=...), or with the logs as the pair (model, logs)"
+        )
+    return [name.strip() for name in names if name.strip()]

@@ -28,13 +28,13 @@ PANELS = {
         "export",
         "compare",
     ),
-    "Recorded logs": ("log", "identify", "estimate"),
+    "Recorded logs": ("log", "identify", "bollard", "estimate"),
     "Policies and learned estimators": ("train", "score", "play", "train-estimator"),
     "Published results and long studies": ("reproduce", "study"),
 }
 VERBS = {
     "tune": "study",
-    **{name: name for name in ("compare", "evaluate", "estimate")},
+    **{name: name for name in ("compare", "evaluate", "estimate", "identify")},
 }  # functions, and their files in tuning.api
 COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
 MARKUP: Final = "markdown"

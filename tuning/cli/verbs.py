@@ -136,8 +136,8 @@ def parts_of_parameter(parameter: Parameter, kind: Any, marker: Option, text: st
     kind = simplified(kind) if marker.type is None else marker.type
     default = parameter.default if marker.default is UNSET else marker.default
     default = None if isinstance(marker, ProblemOption) else default
-    if get_origin(kind) is list and default is not Parameter.empty:
-        default = None
+    if default == () or (get_origin(kind) is list and default is not Parameter.empty):
+        default = None  # the docstring says what is taken then
     kind = kind | None if default is None else kind
     choices, listed = marker.choices, ""
     if isinstance(choices, str):

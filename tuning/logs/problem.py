@@ -26,7 +26,7 @@ from tuning.logs.read import check_model, name_of, read_named, texts
 from tuning.problems.assumed import name_and_unknown
 from tuning.problems.find import named
 from tuning.problems.log_parts import check_apart, check_times
-from tuning.problems.log_problem import LogProblem
+from tuning.problems.log_problem import MISSING, LogProblem, without_outliers
 from tuning.problems.plant_packages import logs_package
 from tuning.problems.problem import Parameter, Problem
 
@@ -221,7 +221,13 @@ def model_named_in(problem: Problem) -> str | None:
 
 
 def split_runs(
-    logs: Any, held_out: Any = None, *, use_all: bool = False, hold_gaps: bool = False, **options: Any
+    logs: Any,
+    held_out: Any = None,
+    *,
+    use_all: bool = False,
+    hold_gaps: bool = False,
+    outliers: str | None = None,
+    **options: Any,
 ) -> tuple[list[Log], list[Log]]:
     """The training logs, and the held-out ones for validation: by default every third of three or more.
 
@@ -230,6 +236,7 @@ def split_runs(
         held_out: the held-out runs, or their paths or names.
         use_all: whether no run is held out.
         hold_gaps: whether runs are not cut at gaps, and their inputs are held there; on their own stamps they are.
+        outliers: "missing" leaves out samples that the logs' findings call outliers.
         **options: options of `read_named`.
 
     Raises:
@@ -249,6 +256,7 @@ def split_runs(
     read = [read_named(runs[name], **options, name=name)[0] for name in (*learning, *validating)]
     check_times(read)
     read = without_rescaled(read, validating)
+    read = list(map(without_outliers, read)) if outliers == MISSING else read
     parts = [log for log in read if log.name not in validating], [log for log in read if log.name in validating]
     check_apart(*parts)
     if hold_gaps or any(log.stamps is not None for log in read):

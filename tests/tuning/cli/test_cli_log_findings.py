@@ -100,7 +100,7 @@ def test_identify_names_the_gate_and_cuts_at_gaps(folder, thruster, as_json):  #
     held = as_json("identify", "gap.csv", *options, "--hold-gaps")
     assert held["logs"] == ["gap.csv"]
     assert abs(cut["values"]["gain"] - 0.5) < 4 * cut["standard_errors"]["gain"]
-    mine = tuning.identify(str(folder / "gap.csv"), "gain", model="own:model", noise=False, starts=1, use_all=True)
+    mine = tuning.identify(("own:model", str(folder / "gap.csv")), "gain", noise=False, starts=1, use_all=True)
     assert any("a gap: 40 rows" in said for said in mine.sentences())
 
 
