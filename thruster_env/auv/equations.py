@@ -72,8 +72,10 @@ class Memory(NamedTuple):
     reckoned_piece: Any
 
 
-def next_piece(numbers, first, count, piece, x, y, z):
+def next_piece(arguments, results, numbers):
     """The piece of a path that a position has got to, from the one that it was at; as `paths.Path.piece`."""
+    first, count, piece = arguments[0], arguments[1], arguments[2]
+    x, y, z = arguments[3], arguments[4], arguments[5]
     last, piece = int(count) // PIECE - 1, int(piece)
     at = int(first) + PIECE * piece
     while piece < last:
@@ -82,13 +84,13 @@ def next_piece(numbers, first, count, piece, x, y, z):
             break
         piece += 1
         at += PIECE
-    return float(piece)
+    results[0] = piece
 
 
 def off_path(pieces: Any, piece: Any, x, y, z) -> tuple[tuple, Any]:
     """Distance to starboard of the path and below it, cosine and sine of its course; and the piece reached."""
     if isinstance(pieces, Table):
-        piece = pieces.call(next_piece, pieces.count, piece, x, y, z)
+        (piece,) = pieces.call(next_piece, 1, pieces.count, piece, x, y, z)
         x_0, y_0, z_0, ahead, aside, below = (pieces[PIECE * piece + float(i)] for i in range(PIECE - 1))
     else:
         x_0, y_0, z_0, ahead, aside, below = pieces[: PIECE - 1]

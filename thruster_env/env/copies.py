@@ -47,16 +47,19 @@ class PlantCopies:
             count: number of copies.
         """
         self.page_of, self.plant, self.task, self.count = page_of, plant, task, count
-        self._find_machine_code()
-        self.memory = new_memory(count, self.programs.rows, self._lanes)
+        rows = self._find_machine_code()
+        self.memory = new_memory(count, rows, self._lanes)
 
-    def _find_machine_code(self) -> None:
+    def _find_machine_code(self) -> int:
+        """Find the programs and their machine code; return the rows of a copy."""
         page, parameters = self.page_of(self.plant, self.task)
         shape = shape_of(parameters)
-        self.parameters, self.numbers, self.programs = parameters, packed(parameters), programs_of(page, shape)
-        self.report_rows, self.reported = self.programs.report, self.programs.reported
-        self.commands, self.lines = self.programs.action, self.programs.lines
+        programs = programs_of(page, shape)
+        self.parameters, self.numbers = parameters, packed(parameters)
+        self.report_rows, self.reported = programs.report, programs.reported
+        self.commands, self.lines = programs.action, programs.lines
         self.advance, self._advance_in_parts = machine_code_of(page, shape, self.count == 1, is_interpreting())
+        return programs.rows
 
     @property
     def _lanes(self) -> int:

@@ -101,9 +101,9 @@ def observation_of(values: list[float]) -> np.ndarray:
     return np.array(values, dtype=np.float32)
 
 
-def observations_of(report: np.ndarray, observed: list[int]) -> np.ndarray:
+def observations_of(report: np.ndarray, observed: list[int], dtype: Any = np.float32) -> np.ndarray:
     """The same of N copies, (N, d), from rows of their report (reported, N)."""
-    observations = np.empty((report.shape[1], len(observed)), dtype=np.float32)
+    observations = np.empty((report.shape[1], len(observed)), dtype=dtype)
     with np.errstate(over="ignore"):  # beyond 3.4e38 lies infinity
         for i, row in enumerate(observed):
             observations[:, i] = report[row]
@@ -165,6 +165,7 @@ class PlantEnv(gym.Env):
 
     Attributes:
         inputs: the quantities of the p entries of an action.
+        observation_type: dtype of observations.
         plant: the plant; it has `dt`, its sample time [s].
         task: the reward and the end of episodes, if these are a value.
     """
@@ -173,6 +174,7 @@ class PlantEnv(gym.Env):
     render_overlay: Callable[[], Any] | None = None  # a filter wrapper's hook: what it shows beside the truth
 
     inputs: tuple[Quantity, ...]
+    observation_type: ClassVar[type] = np.float32
     plant: Any
     task: Any = None
     _renderer: PlantRenderer | None = None
@@ -265,7 +267,7 @@ class PlantEnv(gym.Env):
         self._one_input = len(self.inputs) == 1
         self.action_space = action_space
         shape = (len(rows.observed),)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=shape, dtype=np.float32)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=shape, dtype=self.observation_type)
         self._out = np.zeros((self._copies.reported, 1, 1))
         self._observation_buffer = np.zeros(1, dtype=np.float32)
         self._set_views()
@@ -276,7 +278,7 @@ class PlantEnv(gym.Env):
         self._advance: Callable = copies.advance
         self._memory = copies.memory
         self._arguments = (0, 1, self._memory, copies.numbers, copies.lines, self._out, False)
-        self._command = self._memory[0, copies.commands[0] : copies.commands[-1] + 1, 0]
+        self._command = self._memory[0, copies.commands.start : copies.commands.stop, 0]
         self._report = self._out.reshape(-1)
         self._outcome = self._report[REWARD : TERMINATED + 1]
         self._views, self._info = views_of(self._report, self._rows), info_maker(self._rows)
@@ -346,6 +348,8 @@ class PlantEnv(gym.Env):
         return self._observation(), reward, terminated > 0.0, False, self._info(self._report, self._views)
 
     def _observation(self) -> np.ndarray:
+        if self.observation_type is np.float64:
+            return self._report[self._observed]
         if self._single:
             reading = self._report.item(self._readings)
             if -FLOAT32_ENDS < reading < FLOAT32_ENDS:
@@ -394,6 +398,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
             raise ValueError(f"render_mode must be None in a vector env, but got {arguments['render_mode']!r}")
         env = self.single_env(**arguments)
         self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
+        self.single = env  # for what it offers
         self.plant, self.task, self._rows = env.plant, env.task, env.report_rows
         self.inputs = env.inputs
         self._observed = self._rows.observed
@@ -435,7 +440,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
         report = self._copies.report()
         which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         self._restart(which, report, numbers)
-        return observations_of(report, self._observed), self._info(report, mask)
+        return observations_of(report, self._observed, self.single.observation_type), self._info(report, mask)
 
     def step(self, actions):
         """Apply one action per copy, (num_envs, p), or (num_envs,) if p is 1, for one sample time.
@@ -456,7 +461,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
             rewards = rewards.copy()
             ends = self._endings(report)
             self._restart(np.flatnonzero(self._done), report)
-        observations = observations_of(report, self._observed)
+        observations = observations_of(report, self._observed, self.single.observation_type)
         return observations, rewards, terminated, truncated, self._info(report) | ends
 
     def _restart(self, which: np.ndarray, report: np.ndarray, numbers: np.ndarray | None = None) -> None:
@@ -470,7 +475,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
 
     def _endings(self, report: np.ndarray) -> dict[str, Any]:
         done = self._done.copy()
-        observations = observations_of(report, self._observed)
+        observations = observations_of(report, self._observed, self.single.observation_type)
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(done):
             final[i] = observations[i]

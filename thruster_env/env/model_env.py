@@ -1,4 +1,4 @@
-"""`ModelEnv`: a Gymnasium env whose plant is a state-space model."""
+"""`ModelEnv`, a Gymnasium env whose plant is a state-space model, and its vector form."""
 
 from __future__ import annotations
 
@@ -11,25 +11,234 @@ from typing import Any, ClassVar, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.core.checks import positive, short_repr
-from thruster_env.core.checks import seed as checked_seed
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, is_interpreting
-from thruster_env.core.streams import GROUP, draw_key
-from thruster_env.env.commands import some_numbers
-from thruster_env.model.shape import padded
-from thruster_env.model.simulate import truth_steps_of
+from thruster_env.core.checks import one_of, positive, short_repr
+from thruster_env.core.compiled import function_fingerprint
+from thruster_env.core.sources import is_array, tuple_of, written_out
+from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS
+from thruster_env.effects.effects import SPACING, Context, Effect, Moment, Registry, chain_of, run_chain
+from thruster_env.effects.effects import dropping_channels as losing
+from thruster_env.effects.sensors import SENSOR_EFFECTS, Reading
+from thruster_env.effects.signals import ConstantSignal, GaussMarkov, Gusts, RecordedSignal, Sinusoid
+from thruster_env.env.copies import clipped, correlated, root_of
+from thruster_env.env.env import PlantEnv, PlantVectorEnv
+from thruster_env.env.page import Page
+from thruster_env.graphs.graphs import Graph
+from thruster_env.graphs.programs import Place, values_of
+from thruster_env.graphs.values import traceable
+from thruster_env.model.quantities import Quantity
+from thruster_env.model.shape import Functions, Shape, constants_are_array
 from thruster_env.model.state_space import StateSpaceModel
 
+DISTURBANCES = Registry(
+    "disturbances",
+    {
+        "constant": ConstantSignal,
+        "sinusoid": Sinusoid,
+        "gauss-markov": GaussMarkov,
+        "gusts": Gusts,
+        "recorded": RecordedSignal,
+    },
+)
+Part = tuple[Callable, tuple[int, ...], Any]  # a function, the sizes of its arguments, the form of its constants
+MOST_OPERATIONS = 20_000  # of a traced f or h; a larger one is called
 
-class ModelEnv(gym.Env):
+
+class ModelPlant(NamedTuple):
+    """A state-space model as the plant of an env; `ModelEnv` has the words for its parts."""
+
+    truth: StateSpaceModel
+    dt: float  # 1 if it is unknown
+    low: np.ndarray
+    high: np.ndarray
+    sensors: dict[str, tuple[Effect, ...]]
+    disturbances: dict[str, tuple[Effect, ...]]
+
+
+class ModelTask(NamedTuple):
+    """The reward and the end of an episode; None for 0 and never."""
+
+    reward: Callable | None
+    ends: Callable | None
+
+
+class Parameters(NamedTuple):
+    """The numbers that a step reads."""
+
+    dt: float
+    constants: Any
+    table: Any  # the same where f or h is called, else None
+    low: Any
+    high: Any
+    prior_mean: Any
+    prior_root: Any
+    q_root: Any
+    r_root: Any
+    effects: Any  # parameters of the effects by chain
+
+
+def _vector(values: Sequence) -> Any:
+    """A vector in the form that a model's functions take."""
+    return np.array(values, dtype=object) if is_array(len(values)) else tuple(values)
+
+
+def _constants(values: Sequence, form: type | int) -> Any:
+    if constants_are_array(form):
+        return np.array(values, dtype=object)
+    return tuple(values) if isinstance(form, int) else form(*values)
+
+
+@lru_cache(maxsize=64)
+def _is_traceable(function: Callable, sizes: tuple[int, ...], form: type | int) -> bool:
+    """Whether a function of vectors and constants can be traced, and its graph has its values.
+
+    A function that checks the types of its arguments may treat Numbers differently from floats.
+    """
+    graph, ends = Graph(MOST_OPERATIONS), np.cumsum(sizes)
+    points = np.array([size * np.sin(phase + np.arange(ends[-1])) for size, phase in ((0.1, 0.5), (1.0, 2.5))])
+    points[:, ends[-2] :] = 0.1 + abs(points[:, ends[-2] :])  # constants
+    numbers = [graph.given(Place("numbers", k)) for k in range(ends[-1])]
+
+    def result(values: Sequence, function: Callable) -> list:
+        *vectors, c = (list(values[end - size : end]) for end, size in zip(ends, sizes, strict=True))
+        values = function(*map(_vector, vectors), _constants(c, form))
+        return np.ravel(np.array(values, dtype=object)).tolist()
+
+    try:
+        traced_numbers = [graph.number(leaf) for leaf in result(numbers, traceable(function))]
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            values = values_of(traced_numbers, points.T)
+            expected = np.array([result(point.tolist(), function) for point in points], dtype=np.float64).T
+    except Exception:  # whatever a user's function raises if it gets Numbers
+        return False
+    finite = np.isfinite(expected).all(axis=0)
+    return bool(finite.any() and np.allclose(values[:, finite], expected[:, finite], rtol=1e-9, atol=1e-9))
+
+
+def _called(function: Callable, sizes: tuple[int, ...], form: type | int, count: int) -> Callable:
+    """The function of a table of constants and vectors, called for each copy: work(given, found, numbers)."""
+    lines, at = ["first = int(given[0])"], 1
+    for i, size in enumerate(sizes[:-1]):
+        entries = tuple_of(f"given[{at + k}]" for k in range(size))
+        lines.append(f"v{i} = given[{at}:{at + size}]" if is_array(size) else f"v{i} = {entries}")
+        at += size
+    values = [f"numbers[first + {k}]" for k in range(sizes[-1])]
+    if constants_are_array(form):
+        lines.append(f"c = numbers[first : first + {sizes[-1]}]")
+    else:
+        lines.append(f"c = {tuple_of(values)}" if isinstance(form, int) else f"c = Constants({', '.join(values)})")
+    lines.append(f"y = function({', '.join(f'v{i}' for i in range(len(sizes) - 1))}, c)")
+    lines += [f"found[{k}] = y[{k}]" for k in range(count)]
+    name = f"call_{function_fingerprint(function, within=__name__)[:24]}"  # numba keeps one function of equal code
+    return written_out(name, "given, found, numbers", *lines, "None", function=function, Constants=form)
+
+
+@lru_cache(maxsize=64)
+def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, task: ModelTask) -> Page:
+    """The page of a model: its f and h, traced or called, its noise, disturbances and task."""
+    n, m, form = shape.n, shape.m, shape.form
+    of_f, of_h = _parts(functions, shape)
+    f_is_traceable, h_is_traceable = _is_traceable(*of_f), _is_traceable(*of_h)
+    (f, _, _), (h, _, _), call_f, call_h = of_f, of_h, _called(*of_f, n), _called(*of_h, m)
+    kinds_of = dict(kinds)
+
+    def entries(result: Any) -> tuple:
+        return tuple(np.ravel(np.array(result, dtype=object)))
+
+    def evaluated(is_traceable: bool, function: Callable, call: Callable, count: int, p: Any, *vectors) -> tuple:
+        if not is_traceable:
+            return tuple(p.table.call(call, count, *(entry for vector in vectors for entry in vector)))
+        return entries(traceable(function)(*map(_vector, vectors), _constants(p.constants, form)))
+
+    def act(name: str, p: Parameters, value: Any, effects: dict | None, t: Moment) -> tuple[Any, dict]:
+        last = None if effects is None else effects[name]
+        value, memory = run_chain(kinds_of[name], p.effects[name], value, last, t)
+        return value, {name: memory}
+
+    def disturbed(p: Parameters, u: Sequence, effects: dict | None, t: Moment) -> tuple[tuple, dict]:
+        """The inputs with their disturbances."""
+        parts = [act(f"input {i}", p, value, effects, t) for i, value in enumerate(u)]
+        return tuple(value for value, _ in parts), {k: v for _, memory in parts for k, v in memory.items()}
+
+    def observed(p: Parameters, x: tuple, u: tuple, effects: dict | None, memories: dict, t: Moment) -> tuple:
+        z = evaluated(h_is_traceable, h, call_h, m, p, x)
+        noise, readings = correlated(p.r_root, t.draws.normals(MEASUREMENT, m)), list[Reading]()
+        for i in range(m):
+            reading, memory = act(f"sensor {i}", p, Reading(z[i] + noise[i], 1.0), effects, t._replace(state=x))
+            readings, memories = [*readings, reading], memories | memory
+        ends = traceable(task.ends)(x) if task.ends and not t.begin else 0.0
+        report = {
+            "reward": traceable(task.reward)(x, u) if task.reward and not t.begin else 0.0,
+            "terminated": ends,
+            "time": t.step * p.dt,
+            "state": x,
+            "measurement": tuple(reading.z for reading in readings),
+            "valid": tuple(reading.valid for reading in readings),
+        }
+        return (x, memories), report
+
+    def begin(p: Parameters, t: Moment) -> tuple[Any, dict]:
+        noise = correlated(p.prior_root, t.draws.normals(INITIAL, n))
+        x = tuple(mean + w for mean, w in zip(p.prior_mean, noise, strict=True))
+        u, memories = disturbed(p, (0.0,) * shape.inputs, None, t)
+        return observed(p, x, u, None, memories, t)
+
+    def step(p: Parameters, memory: Any, action: tuple, t: Moment) -> tuple[Any, dict]:
+        x, effects = memory
+        bounds = zip(action, p.low, p.high, strict=True)
+        u = tuple(clipped(value, low, high) for value, low, high in bounds)
+        v, memories = disturbed(p, u, effects, t._replace(state=x))
+
+        def body(x: tuple, inputs: tuple) -> tuple:
+            return evaluated(f_is_traceable, f, call_f, n, p, x, inputs)
+
+        noise = correlated(p.q_root, t.draws.normals(PROCESS, n))
+        x = tuple(a + w for a, w in zip(t.repeat(substeps, body, x, v), noise, strict=True))
+        return observed(p, x, u, effects, memories, t)
+
+    return Page(begin, step, shape.inputs)
+
+
+def _parts(functions: Functions, shape: Shape) -> tuple[Part, Part]:
+    """The functions f and h, the sizes of their arguments and the form of the constants."""
+    n, p, c = shape.n, shape.inputs, shape.constants
+    return (functions.transition, (n, p, c), shape.form), (functions.observe, (n, c), shape.form)
+
+
+def page_of(plant: ModelPlant, task: ModelTask) -> tuple[Page, Parameters]:
+    """The page of a model with a task, and its parameters."""
+    truth, context = plant.truth, Context(plant.dt)
+    signals = [plant.disturbances.get(quantity.symbol, ()) for quantity in truth.input_quantities]
+    effects = [plant.sensors.get(quantity.symbol, ()) for quantity in truth.measurements]
+    chains = {f"input {i}": chain_of(chain, context, i * SPACING) for i, chain in enumerate(signals)}
+    first = len(signals)
+    chains |= {f"sensor {i}": chain_of(chain, context, (first + i) * SPACING) for i, chain in enumerate(effects)}
+    is_traced = all(_is_traceable(*part) for part in _parts(truth.functions, truth.shape))
+    parameters = Parameters(
+        plant.dt,
+        tuple(truth.constants),
+        None if is_traced else np.array([*truth.constants, 0.0], dtype=np.float64),  # never without numbers
+        tuple(plant.low),
+        tuple(plant.high),
+        tuple(truth.prior_mean),
+        root_of(truth.prior_cov),
+        root_of(truth.process_noise_cov),
+        root_of(truth.measurement_noise_cov),
+        {name: parameters for name, (_, parameters) in chains.items()},
+    )
+    kinds = tuple((name, kinds) for name, (kinds, _) in chains.items())
+    return model_page(truth.functions, truth.shape, truth.substeps, kinds, task), parameters
+
+
+class ModelEnv(PlantEnv):
     """A state-space model as an env: the action is its input, the observation its measurement.
 
-        x_{k+1} = f(x_k, u_k) + w,  w ~ N(0, Q);   z_k = h(x_k) + v,  v ~ N(0, R)
+        x_{k+1} = f(x_k, u_k + d_k) + w,  w ~ N(0, Q);   z_k = sensors(h(x_k) + v),  v ~ N(0, R)
 
     The first episode after `reset(seed=s)` is the trajectory that `thruster_env.model.simulate.simulate` draws
     for the key of seed s under the same inputs, and the data of seed s in a tuning problem of the same model.
-    `info` holds "state" (n,) and "measurement" (m,) in float64. The reward is 0 and episodes do not end; use
-    `gymnasium.wrappers.TimeLimit` to end them.
+    `info` holds "state" (n,) and "measurement" (m,) in float64, "time" [s] if dt is known, and "measurement_valid"
+    (m,) if a measurement may be missing. `ModelVectorEnv` is the same for many copies at once.
 
     Args:
         truth: the model that generates states and measurements.
@@ -37,15 +246,21 @@ class ModelEnv(gym.Env):
             one from changes by name; the truth if None.
         low: smallest input, one number or p, in the units of the inputs.
         high: largest input, one number or p.
-        dt: sample time [s], compared with that of tuned files; None if unknown. It has no other effect:
-            covariances are per step and do not scale with dt.
+        dt: sample time [s], compared with that of tuned files, and that of signals; None if unknown. Covariances
+            are per step and do not scale with dt.
+        sensors: lists of sensor effects by the symbol of a measurement, such as
+            {"p": [{"name": "outliers", "std": 1.0}]}; see `thruster_env.effects.sensors`.
+        disturbances: lists of signals by the symbol of an input, to which they add; see DISTURBANCES.
+        reward: `reward(x, u)` after a step, of tuples; 0 if None. It is a function of numbers, as f is.
+        ends: `ends(x)`, a condition for the end of an episode; never if None.
 
     Raises:
-        ValueError: if the truth is not a model, or bounds or dt are wrong.
+        ValueError: if the truth is not a model, or another argument is wrong.
     """
 
-    metadata = {"render_modes": []}
-    action_space: gym.spaces.Box
+    metadata: dict[str, Any] = {"render_modes": []}
+    observation_type = np.float64
+    page_of = staticmethod(page_of)
 
     def __init__(
         self,
@@ -55,6 +270,10 @@ class ModelEnv(gym.Env):
         low=-np.inf,
         high=np.inf,
         dt: float | None = None,
+        sensors: Mapping | None = None,
+        disturbances: Mapping | None = None,
+        reward: Callable | None = None,
+        ends: Callable | None = None,
     ):
         """Make spaces and memory; see the class for the arguments."""
         if not isinstance(truth, StateSpaceModel):
@@ -62,29 +281,39 @@ class ModelEnv(gym.Env):
         self.truth, self.dt = truth, None if dt is None else positive("dt", dt)
         assumed = truth if assumed is None else assumed
         self.state_space_model = partial(with_noise, assumed) if isinstance(assumed, StateSpaceModel) else assumed
-        self.action_space = gym.spaces.Box(*_bounds(low, high, truth.inputs), dtype=np.float64)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (truth.m,), np.float64)
-        self._numbers, self._key, self._step = truth.numbers, np.zeros(2), 0
-        self._x, self._z, self._u = np.zeros(truth.n), np.zeros(truth.m), np.zeros(truth.inputs)
+        low, high = _bounds(low, high, truth.inputs)
+        self.inputs, self.task = truth.input_quantities, ModelTask(reward, ends)
+        effects = _chains("sensors", sensors, truth.measurements, SENSOR_EFFECTS)
+        signals = _chains("disturbances", disturbances, truth.input_quantities, DISTURBANCES)
+        self.plant = ModelPlant(truth, self.dt or 1.0, low, high, effects, signals)
+        info = ("state", "measurement") + ("time",) * (self.dt is not None)
+        chains = {quantity.symbol: effects.get(quantity.symbol, ()) for quantity in truth.measurements}
+        self._set_up(gym.spaces.Box(low, high, dtype=np.float64), info, (), losing(chains))
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Draw a key from the env's generator, and by it an initial state and a first measurement."""
-        super().reset(seed=checked_seed(seed))
-        self._key, self._step = draw_key(self.np_random), 0
-        return self._propagated()
 
-    def step(self, action):
-        """Apply an input (p,), clipped to its bounds, for one step; ValueError for one that is not p numbers."""
-        inputs = some_numbers(action, self.truth.input_quantities)
-        self._u[:] = np.clip(inputs, self.action_space.low, self.action_space.high)
-        self._step += 1
-        observation, info = self._propagated()
-        return observation, 0.0, False, False, info
+def _chains(
+    name: str, effects: Mapping | None, quantities: Sequence[Quantity], registry: Registry
+) -> dict[str, tuple[Effect, ...]]:
+    """Effects by the symbol of a quantity."""
+    symbols = tuple(quantity.symbol for quantity in quantities)
+    return {
+        one_of(f"a name in {name}", symbol, symbols): registry.make(chain)
+        for symbol, chain in (effects or {}).items()
+    }
 
-    def _propagated(self) -> tuple[np.ndarray, dict]:
-        move = _mover(*truth_steps_of(self.truth), max(self.truth.n, self.truth.m), is_interpreting())
-        move(self._x, self._z, self._u, self._step, self._key, self._numbers)
-        return self._z.copy(), {"state": self._x.copy(), "measurement": self._z.copy()}
+
+class ModelVectorEnv(PlantVectorEnv):
+    """Many copies of a model in one compiled step; arguments are those of `PlantVectorEnv` and of `ModelEnv`.
+
+    A problem's or an env's model becomes one by `ModelVectorEnv(8192, truth=model, low=-5.0, high=5.0)`.
+    """
+
+    single_env: ClassVar[type[ModelEnv]] = ModelEnv
+
+    def state_space_model(self, **changes) -> StateSpaceModel:
+        """The model that filters assume, with changes."""
+        single: Any = self.single
+        return single.state_space_model(**changes)
 
 
 def with_noise(
@@ -111,25 +340,6 @@ def _bounds(low, high, count: int) -> tuple[np.ndarray, np.ndarray]:
     if not (low <= high).all():
         raise ValueError(f"low and high must be one number or {count}, low at most high, but they are not")
     return low, high
-
-
-@lru_cache(maxsize=64)
-def _mover(
-    begin: Callable, advance: Callable, measure: Callable, largest: int, interpreting: bool
-) -> CompiledOrPython:
-    fingerprint = function_fingerprint(begin, advance, measure, within=__name__)
-    room = padded(largest, GROUP)
-
-    def move(x, z, u, step, key, numbers):
-        fingerprint  # noqa: B018 - part of the cache's key
-        draws = np.zeros(room)
-        if step == 0:
-            begin(x, draws, key[0], key[1], numbers)
-        else:
-            advance(x, u, draws, step, key[0], key[1], numbers)
-        measure(z, x, draws, step, key[0], key[1], numbers)
-
-    return CompiledOrPython(move)
 
 
 # The interface of a plant's env or vector env for filters: its model, and checks of tuned files.

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.core.compiled import inlined
-from thruster_env.core.sources import written_out
+from thruster_env.core.compiled import function_fingerprint, inlined
 from thruster_env.graphs.branches import on_every_side
 from thruster_env.graphs.graphs import Number, called, where
 from thruster_env.graphs.programs import CALLED, READ_NUMBERS
@@ -55,23 +54,26 @@ class Table:
         index = where(index > 0.0, where(index < last, index, last), 0.0)
         return self.first.graph.make("table", self.first + index)
 
-    def call(self, function: Callable, *numbers: Number) -> Number:
-        """function(numbers, first, *numbers) of the array, compiled as it is, for what takes a loop."""
-        name = f"{function.__module__}.{function.__qualname__}"
+    def call(self, work: Callable, count: int, *numbers: Any) -> list[Number]:
+        """The `count` results of work(arguments, results, numbers), compiled as it is and called for each copy.
+
+        Its arguments are the table's place in `numbers` and the numbers given here.
+        """
+        name = f"{work.__name__}_{function_fingerprint(work, within=__name__)[:24]}"
         if name not in CALLED:
-            CALLED[name] = _of_arrays(function, len(numbers))
+            CALLED[name] = inlined(work)
             READ_NUMBERS.add(name)
-        return called(name, 1, self.first, *map(self.first.graph.number, numbers))[0]
+        return called(name, count, self.first, *map(self.first.graph.number, numbers))
 
 
-def _of_arrays(function: Callable, count: int) -> Callable:
-    call = f"function(numbers, {', '.join(f'given[{i}]' for i in range(count + 1))})"
-    lines = f"found[0] = {call}", "None"
-    return inlined(written_out("work", "given, found, numbers", *lines, function=inlined(function)))
+def _of_objects(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype == object
 
 
 def leaves(value: Any) -> list:
     """The numbers of a value, in order."""
+    if _of_objects(value):
+        return leaves(value.ravel().tolist())
     if isinstance(value, dict):
         return [leaf for part in value.values() for leaf in leaves(part)]
     if isinstance(value, (tuple, list)):
@@ -135,6 +137,7 @@ def traceable(function: Callable) -> Callable:
 
         def entries() -> np.ndarray:
             result = copy(*arguments)
+            result = tuple(result.ravel().tolist()) if isinstance(result, np.ndarray) else result
             shapes.append(shape_of(result))
             entries = np.empty(len(leaves(result)), dtype=object)
             entries[:] = [graph.number(leaf) for leaf in leaves(result)]

@@ -11,8 +11,9 @@ from filters import EstimateState
 from tests.models import lonely_model, plane_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
-from thruster_env.env.model_env import ModelEnv
+from thruster_env.env.model_env import ModelEnv, ModelVectorEnv
 from thruster_env.model.simulate import simulate
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.experiments import range_bearing
 
 
@@ -26,8 +27,9 @@ def test_an_episode_is_what_is_simulated_for_its_seed():
     model, inputs = plane_model(), np.array([[[0.5], [-1.0], [2.0]]])
     truth, env = simulate(model, episode_keys([7]), inputs), ModelEnv(model, low=-3.0, high=3.0)
     found = [env.reset(seed=7)[1], *(env.step(u)[4] for u in inputs[0])]
-    np.testing.assert_array_equal([info["state"] for info in found], truth.states[0])
-    np.testing.assert_array_equal([info["measurement"] for info in found], truth.measurements[0])
+    close = {"rtol": 1e-13, "atol": 1e-14}  # sums of the same terms in another order
+    np.testing.assert_allclose([info["state"] for info in found], truth.states[0], **close)
+    np.testing.assert_allclose([info["measurement"] for info in found], truth.measurements[0], **close)
     env.reset(seed=7)
     np.testing.assert_array_equal(env.step([9.0])[4]["state"], (env.reset(seed=7), env.step([3.0])[4]["state"])[1])
 
@@ -68,5 +70,83 @@ def test_a_wrong_argument_is_refused(arguments, rule):
 def test_a_wrong_action_is_refused():
     env = ModelEnv(plane_model())
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="an action must be 1 numbers and not NaN"):
+    with pytest.raises(ValueError, match="an action must be one .* and not NaN"):
         env.step([np.nan])
+
+
+def deciding(x, u, c):
+    steps = 0.0
+    while steps < x[0]:  # cannot be traced
+        steps += 1.0
+    return (0.9 * x[0] + u[0] - 0.1 * steps,)
+
+
+def linear(x, u, c):
+    return (0.9 * x[0] + u[0],)
+
+
+def level(x, c):
+    return (x[0],)
+
+
+def reward(x, u):
+    return -(x[0] * x[0]) - 0.1 * u[0] * u[0]
+
+
+def ends(x):
+    return abs(x[0]) > 4.0
+
+
+def one_state(transition):
+    return StateSpaceModel(
+        transition=transition,
+        observe=level,
+        process_noise_cov=[0.04],
+        measurement_noise_cov=[0.01],
+        prior_mean=[1.0],
+        prior_cov=[1.0],
+        inputs=1,
+        states=[("level", "h", "m")],
+        input_quantities=[("flow", "q", "m/s")],
+        measurements=[("pressure", "p", "m")],
+    )
+
+
+@pytest.mark.parametrize("transition", [linear, deciding])
+def test_a_model_that_can_only_be_called_is_simulated_too(transition):
+    model, inputs = one_state(transition), np.array([[[0.5], [-1.0], [2.0]]])
+    truth, env = simulate(model, episode_keys([7]), inputs), ModelEnv(model)
+    found = [env.reset(seed=7)[1], *(env.step(u)[4] for u in inputs[0])]
+    np.testing.assert_allclose([info["state"] for info in found], truth.states[0], rtol=1e-13)
+
+
+def test_copies_are_single_envs_with_all_disturbances_and_a_task():
+    arguments = {
+        "truth": one_state(linear),
+        "low": -2.0,
+        "high": 2.0,
+        "dt": 0.1,
+        "sensors": {"p": [{"name": "outliers", "std": 1.0, "probability": 0.3}, {"name": "dropout"}]},
+        "disturbances": {"q": [{"name": "constant", "value": 0.25}]},
+        "reward": reward,
+        "ends": ends,
+    }
+    copies, envs = ModelVectorEnv(3, **arguments), [ModelEnv(**arguments) for _ in range(3)]
+    rows = copies.reset(seed=4)[0]
+    for i, env in enumerate(envs):
+        np.testing.assert_allclose(env.reset(seed=4 + i)[0], rows[i], rtol=1e-12)
+    for k in range(15):
+        before = [env.unwrapped._report[env.report_rows.info["state"]].copy() for env in envs]
+        rows, rewards, ended, _, infos = copies.step(np.full((3, 1), 3.0))
+        for i, env in enumerate(envs):
+            observation, reward_, end, _, info = env.step([3.0])
+            assert rows.dtype == observation.dtype == np.float64
+            np.testing.assert_allclose(rows[i], observation, rtol=1e-12)
+            assert (rewards[i], ended[i]) == (pytest.approx(reward_), end)
+            assert reward_ == pytest.approx(reward(info["state"], [2.0])) and end == ends(info["state"])
+            noise = info["state"] - (0.9 * before[i] + 2.25)  # clipped, then disturbed
+            assert abs(noise) < 1.0 and infos["measurement_valid"][i] == info["measurement_valid"]
+        if ended.any():
+            assert k > 0
+            break
+    assert copies.state_space_model().n == 1
