@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import asdict, dataclass, replace
+from inspect import signature
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -46,7 +47,7 @@ from tuning.api.markers import (
     Seed,
     TunedArgument,
 )
-from tuning.api.read_logs import recorded_runs
+from tuning.api.read_logs import read_logs, recorded_runs
 from tuning.logs.read import as_tuned
 
 if TYPE_CHECKING:
@@ -320,6 +321,8 @@ def estimate(
     Raises:
         ValueError: states the rule and the value.
     """
+    for name in numbers.keys() & signature(read_logs).parameters.keys():
+        raise ValueError(f"{name} must be given to tuning.read_logs, whose runs estimate takes, not to estimate")
     runs = recorded_runs(log)
     if isinstance(runs.files, str | Path) and str(runs.files).endswith(".json") and tuned is not None:
         runs, tuned = replace(runs, files=tuned), runs.files  # the other way round

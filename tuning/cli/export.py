@@ -10,6 +10,7 @@ import typer
 from filters.c.programs import programs_of, single_error
 from filters.c.project import write_project
 from thruster_env.core.checks import one_of
+from tuning.api.estimate import monitor_for
 from tuning.cli.options import (
     OUTPUT,
     CodeOption,
@@ -17,7 +18,6 @@ from tuning.cli.options import (
     LogModelOption,
     MonitorOption,
     TunedPresetOption,
-    asked_monitor,
 )
 from tuning.cli.output import announce_compilation, check_targets, emit
 from tuning.evaluation.tuned import read_tuned
@@ -57,7 +57,7 @@ def command(
     Example: thruster export out/ekf-mismatch-seed0.json --out boat
     """
     one_of("a language", language, LANGUAGES)
-    watch = asked_monitor(monitor, file)
+    watch = monitor_for(monitor, file)
     check_targets((out / "README.md",), json, read=(file,))
     choice, source, seed = read_tuned(file, [*map(find_problem, problem or []), *problems_in(file, model, preset)])
     filter_ = choice.filter(source)

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from filters.monitoring.monitor import Monitor, monitor_of, tuned_monitor
 from filters.registry import FILTERS
 from filters.starts import STARTS
 from thruster_env.core.checks import any_case, short_repr
@@ -25,19 +24,10 @@ from thruster_env.logs.findings import OUTLIERS
 from thruster_env.logs.recorders.bags import STAMPS
 from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.parameters import PRESETS
+from tuning.api.markers import FILTER, INPUT, LEARNING, OUTPUT, RUNS  # noqa: F401 - for commands
 
 if TYPE_CHECKING:
     from tuning.problems.problem import Problem
-
-# Panels, in the order in which commands declare their options.
-INPUT, FILTER, SEARCH, LEARNING, RUNS, OUTPUT = "Input", "Filter", "Search", "Learning", "Runs", "Output"
-
-
-def one_file(argument: Path | None, option: Path | None) -> Path | None:
-    """The tuned file, given as an argument or by --tuned; ValueError if both are."""
-    if argument is not None and option is not None:
-        raise ValueError(f"a tuned file must be one, but got {argument} and --tuned {option}")
-    return argument or option
 
 
 def spelt(choices: Iterable[str]) -> Callable:
@@ -129,7 +119,6 @@ ColumnOption = Annotated[
         rich_help_panel=INPUT,
     ),
 ]
-TUNED = "tuned"  # of --monitor
 MonitorOption = Annotated[
     str | None,
     typer.Option(
@@ -157,18 +146,6 @@ LogModelOption = Annotated[
         rich_help_panel=INPUT,
     ),
 ]
-
-
-def asked_monitor(argument: str | None, tuned: Path | None) -> Monitor | None:
-    """The monitor of --monitor: steps between false alarms, or that of the tuned file."""
-    if argument != TUNED:
-        try:
-            return monitor_of(None if argument is None else float(argument))
-        except ValueError as error:
-            raise ValueError(f"--monitor must be steps, or {TUNED!r}, but got {argument}: {error}") from None
-    if tuned is None:
-        raise ValueError(f"--monitor {TUNED} must come with a tuned file, but got none")
-    return tuned_monitor(tuned)
 
 
 def with_groups(command: Callable) -> Callable:

@@ -82,7 +82,7 @@ def test_an_estimate_does_not_praise_a_stuck_sensor(folder, thruster, as_json): 
     assert "a gap: 40 rows (4 s) are missing" in said and "predicts with the last input held" in said
     clean = as_json("estimate", "whole.csv", *MODEL)
     assert clean["findings"] == [] and "mend" not in " ".join(clean["sentences"])
-    mine = tuning.estimate(str(folder / "stuck.csv"), model="own:model")
+    mine = tuning.estimate(("own:model", str(folder / "stuck.csv")))
     assert mine.sentences() == data["sentences"] and mine.log.findings[0].kind == "stuck"
     assert "is stuck at" in mine._repr_html_()
 
@@ -180,11 +180,11 @@ def test_estimate_tells_of_alarms(folder, thruster, as_json):  # noqa: F811
     assert "Alarms:" in shown and "- z: " in shown and "false alarms expected if the model is right" in shown
     assert "No alarm in" in thruster("estimate", "whole.csv", *MODEL, "--monitor", "1e9").stdout
     for wrong, rule in (
-        (("--isolate",), "--isolate must come with --monitor STEPS"),
+        (("--isolate",), "isolate (--isolate) must come with monitor (--monitor STEPS)"),
         (("--monitor", "1000", "--isolate"), "can be isolated among two or more, but the filter has one"),
         (("--monitor", "3"), "steps_between must be from 100 to 1e12, but got 3"),
-        (("--monitor", "often"), "--monitor must be steps, or 'tuned', but got often"),
-        (("--monitor", "tuned"), "--monitor tuned must come with a tuned file, but got none"),
+        (("--monitor", "often"), "monitor (--monitor) must be steps, or 'tuned', but got often"),
+        (("--monitor", "tuned"), "monitor (--monitor) tuned must come with a tuned file, but got none"),
         (("--no-grid",), "set_dt needs a model with a constant dt"),
     ):
         done = thruster("estimate", "whole.csv", *MODEL, *wrong)
