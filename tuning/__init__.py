@@ -1,5 +1,6 @@
 """Tune state estimators and evaluate the gain: problems, studies, held-out evaluation, identification.
 
+    fit         the model, Q and R of one column of numbers
     tune        find a filter's Q, R and other parameters, and evaluate them on held-out seeds
     evaluate    a filter, tuned or not, and its baselines, on seeds that no study saw
     compare     several filters on the same seeds, with paired intervals
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from tuning.api.estimate import estimate
     from tuning.api.evaluate import evaluate
     from tuning.api.explore import explore
+    from tuning.api.fit import fit
     from tuning.api.identify import identify
     from tuning.api.problems import find_problem
     from tuning.api.read_logs import read_logs
@@ -44,6 +46,7 @@ __all__ = [
     "evaluate",
     "explore",
     "find_problem",
+    "fit",
     "identify",
     "read_logs",
     "report",

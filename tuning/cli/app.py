@@ -19,6 +19,7 @@ from tuning.cli.main import PrintedWhole
 PANELS = {
     "First steps": ("demo", "inspect", "simulate", "filters", "new"),
     "Tune and evaluate a filter": (
+        "fit",
         "tune",
         "explore",
         "methods",
@@ -34,7 +35,7 @@ PANELS = {
 }
 VERBS = {
     "tune": "study",
-    **{name: name for name in ("compare", "evaluate", "estimate", "identify")},
+    **{name: name for name in ("fit", "compare", "evaluate", "estimate", "identify")},
 }  # functions, and their files in tuning.api
 COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
 MARKUP: Final = "markdown"

@@ -351,6 +351,7 @@ def climb(
     *,
     fixed: np.ndarray | None = None,
     iterations: int = ITERATIONS,
+    enough: float = ENOUGH,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[np.ndarray, Evaluation], None] = lambda at, evaluation: None,
 ) -> Ascent:
@@ -366,6 +367,7 @@ def climb(
         high: the largest ones.
         fixed: which parameters are held, (p,) bool.
         iterations: largest number of iterations.
+        enough: predicted rise in log-likelihood below which the search ends.
         stop: called before each iteration; True ends the search.
         progress: called with coordinates and evaluation after each rise.
 
@@ -392,7 +394,7 @@ def climb(
             step *= min(1.0, LONGEST / max(np.abs(step).max(), 1e-300))
             trial = np.clip(at + step, low, high)
             promised = here.gradient @ (trial - at) * 0.5
-            if promised < ENOUGH or damping > 1e10:
+            if promised < enough or damping > 1e10:
                 return Ascent(at, here, number, True)
             next_one = evaluate(trial)
             rise = next_one.value - here.value if _usable(next_one) else -np.inf
@@ -402,7 +404,7 @@ def climb(
             if stop():
                 return Ascent(at, here, number, False)
         damping = damping / 5.0 if rise > 0.5 * promised else damping
-        quiet = quiet + 1 if rise < 20 * ENOUGH else 0
+        quiet = quiet + 1 if rise < 20 * enough else 0
         at, here = trial, next_one
         if quiet > 3:
             return Ascent(at, here, number + 1, True)

@@ -11,11 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import gymnasium as gym
 import numpy as np
-from optuna.distributions import FloatDistribution, IntDistribution
 
 from filters.consistency.time_constants import Run
 from thruster_env.core.checks import at_least, finite, short_repr
@@ -23,6 +22,9 @@ from thruster_env.model.quantities import Quantities
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems import data as seeds
 from tuning.problems.data import Data, runs_of
+
+if TYPE_CHECKING:
+    from optuna.distributions import FloatDistribution, IntDistribution
 
 PART = 0.1  # fraction of its range that is the unit of a parameter on a linear scale
 BOUND = "the posterior Cramér-Rao bound"  # what a scale is, in words
@@ -127,9 +129,11 @@ class Parameter:
     @property
     def distribution(self) -> FloatDistribution | IntDistribution:
         """The range as Optuna takes it."""
+        from optuna import distributions  # which takes half a second, and only studies need
+
         if self.integer:
-            return IntDistribution(int(self.low), int(self.high), log=self.log)
-        return FloatDistribution(self.low, self.high, log=self.log)
+            return distributions.IntDistribution(int(self.low), int(self.high), log=self.log)
+        return distributions.FloatDistribution(self.low, self.high, log=self.log)
 
     def get(self, choice) -> float | None:
         """The number in a choice, None if it does not have it."""

@@ -26,6 +26,7 @@ WIDTH = "100"
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*[a-zA-Z_/(])")
 STEPS = {  # in this order, in one folder: what a command writes, the next ones read
     "simulate": ["simulate --out run{}.csv --steps 120 --seed {}".format(*[n] * 2) for n in (1, 2, 3)],
+    "fit": ["fit run1.csv --column measured_thrust_N --model constant --code fit.md", "fit run1.csv"],
     "tune": [
         "tune --filter ekf --problem nominal --trials 2 --out tuned.json --study both --seed 1",
         "tune --filter ekf --log run1.csv --log run2.csv --blocks 3 --trials 1 --study logs --out logs.json",

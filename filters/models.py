@@ -1,0 +1,431 @@
+"""Models by name for a column of numbers: a level, a velocity, an oscillation, and sums of them.
+
+A `Signal` is linear, in continuous time, and driven by white noise:
+
+    dx/dt = A x + w,  E[w(t) w(s)'] = S delta(t - s);   z = C x + offset + v,  v ~ N(0, R)
+
+so each gives a model for any sample time, whose Q has the structure of the physics: a white-noise acceleration
+moves position and velocity together. Each has one to three numbers that mean something, with a range that follows
+from the data's spread and times (`Scales`), so nobody has to guess where a search begins.
+
+Sources: Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation, sections 6.2
+(kinematic models) and 8.2 (Singer's); Harvey (1989), Forecasting, Structural Time Series Models and the Kalman
+Filter, sections 2.3 (local levels and trends, cycles); van Loan (1978) for Q.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.gaussian.kalman import KalmanFilter
+from thruster_env.core.checks import one_of, positive, short_repr
+from thruster_env.model.affine import AffineModel, affine_model
+from thruster_env.model.continuous import noise_of_densities
+from thruster_env.model.quantities import Quantity
+
+WIDE = 100.0  # spreads of the data in the prior's deviation: a start that knows nothing
+
+
+class Scales(NamedTuple):
+    """What the data say about the size of a model's numbers."""
+
+    spread: float  # standard deviation of the values
+    roughness: (
+        float  # the most that noise can be: the least deviation of differences of any order, for white noise
+    )
+    dt: float  # [s]
+    duration: float  # [s]
+    frequency: float  # of the highest peak of the spectrum [Hz]
+
+
+class Free(NamedTuple):
+    """A number of a named model that data may determine."""
+
+    name: str
+    meaning: str
+    unit: str  # U is the data's unit
+    range: Callable[[Scales], tuple[float, float]]
+    starts: int = 1  # how many values of the range a search begins from, at equal ratios
+    start: Callable[[Scales], float] | None = None  # the value of a single one; the middle of the range if None
+
+    def values(self, scales: Scales) -> list[float]:
+        """Values from which a search begins."""
+        low, high = self.range(scales)
+        if self.start is not None:
+            return [min(max(self.start(scales), low), high)]
+        return np.geomspace(low, high, self.starts + 2)[1:-1].tolist()
+
+
+class Signal(NamedTuple):
+    """A linear signal in continuous time: A, S, C, and the symbols of its states with their units."""
+
+    slope: np.ndarray  # A, (n, n)
+    densities: np.ndarray  # S, (n, n)
+    output: np.ndarray  # C, (n,)
+    states: tuple[tuple[str, str], ...]  # symbol, and unit with U for the data's
+    orders: tuple[int, ...]  # how often each state is differentiated by time: U/s^order
+
+    def transition(self, dt: float) -> np.ndarray:
+        """F = e^(A dt), (n, n)."""
+        from scipy.linalg import expm
+
+        return expm(self.slope * dt)
+
+    def noise(self, dt: float) -> np.ndarray:
+        """Q of a step of dt [s], (n, n), by van Loan."""
+        return noise_of_densities(self.densities, self.slope, dt)
+
+
+class NamedModel(NamedTuple):
+    """A model that everybody knows: what it is, its free numbers, and the signal for their values."""
+
+    name: str
+    about: str
+    free: tuple[Free, ...]
+    signal: Callable[..., Signal]  # of the free numbers by name
+    about_mean: bool = False  # whether the signal varies about the mean of the data
+
+
+def _density(name: str, meaning: str, power: int) -> Free:
+    """The density of white noise that drives a state: U^2/s^power.
+
+    The range is from a noise that moves the output by 1e-5 of its spread over the whole record, to one that moves
+    it by 100 spreads in each step.
+    """
+
+    def ends(s: Scales) -> tuple[float, float]:
+        return 1e-10 * s.spread**2 / s.duration**power, 1e4 * s.spread**2 / s.dt**power
+
+    return Free(name, meaning, f"U^2/s^{power}" if power > 1 else "U^2/s", ends, starts=9)
+
+
+def _std(name: str, meaning: str) -> Free:
+    return Free(name, meaning, "U", lambda s: (1e-4 * s.spread, 1e3 * s.spread), start=lambda s: s.spread)
+
+
+TIME_CONSTANT = Free(
+    "time_constant",
+    "time in which the signal forgets its past",
+    "s",
+    lambda s: (s.dt / 5.0, 10.0 * s.duration),
+    starts=5,
+)
+FREQUENCY = Free(
+    "frequency",
+    "natural frequency",
+    "Hz",
+    lambda s: (0.5 / s.duration, 0.5 / s.dt),
+    start=lambda s: s.frequency,
+)
+DAMPING = Free("damping", "damping ratio", "", lambda s: (1e-4, 2.0), starts=3)
+
+
+def _integrators(count: int, densities: tuple[float, ...], symbols: tuple[str, ...]) -> Signal:
+    """A chain x_1' = x_2, x_2' = x_3, ..., of which the first is measured."""
+    units = ("U", "U/s", "U/s^2")
+    states = tuple(zip(symbols, units[:count], strict=True))
+    return Signal(np.eye(count, k=1), np.diag(densities), np.eye(count)[0], states, tuple(range(count)))
+
+
+def constant(drift: float) -> Signal:
+    """A level that drifts as a random walk: the local level model.
+
+        dx/dt = w,  Q = drift dt
+
+    Args:
+        drift: density of the white noise [U^2/s].
+    """
+    return _integrators(1, (drift,), ("level",))
+
+
+def constant_velocity(acceleration: float) -> Signal:
+    """A position whose velocity changes by white-noise acceleration.
+
+        Q = acceleration [[dt^3/3, dt^2/2], [dt^2/2, dt]]
+
+    Args:
+        acceleration: density of the white acceleration [U^2/s^3].
+    """
+    return _integrators(2, (0.0, acceleration), ("position", "velocity"))
+
+
+def constant_acceleration(jerk: float) -> Signal:
+    """A position whose acceleration changes by white-noise jerk.
+
+    Args:
+        jerk: density of the white jerk [U^2/s^5].
+    """
+    return _integrators(3, (0.0, 0.0, jerk), ("position", "velocity", "acceleration"))
+
+
+def local_trend(drift: float, trend_drift: float) -> Signal:
+    """A level and its trend, each with noise: the local linear trend.
+
+    Args:
+        drift: density of the level's noise [U^2/s].
+        trend_drift: density of the trend's noise [U^2/s^3].
+    """
+    return _integrators(2, (drift, trend_drift), ("level", "trend"))
+
+
+def ornstein_uhlenbeck(time_constant: float, std: float) -> Signal:
+    """A deviation that returns to the mean: exponentially correlated noise.
+
+        dx/dt = -x/T + w,  S = 2 std^2/T
+
+    Args:
+        time_constant: T [s].
+        std: stationary standard deviation [U].
+    """
+    return Signal(
+        np.array([[-1.0 / time_constant]]),
+        np.array([[2.0 * std**2 / time_constant]]),
+        np.ones(1),
+        (("deviation", "U"),),
+        (0,),
+    )
+
+
+def singer(time_constant: float, acceleration_std: float) -> Signal:
+    """A position whose acceleration is exponentially correlated: a target that manoeuvres.
+
+        da/dt = -a/T + w,  S = 2 std^2/T
+
+    Args:
+        time_constant: T of a manoeuvre [s].
+        acceleration_std: stationary standard deviation of the acceleration [U/s^2].
+    """
+    slope = np.eye(3, k=1)
+    slope[2, 2] = -1.0 / time_constant
+    chain = _integrators(
+        3, (0.0, 0.0, 2.0 * acceleration_std**2 / time_constant), ("position", "velocity", "acceleration")
+    )
+    return chain._replace(slope=slope)
+
+
+def oscillator(frequency: float, damping: float, std: float) -> Signal:
+    """A damped oscillation about the mean that white noise excites.
+
+        x'' = -2 zeta w_0 x' - w_0^2 x + w,  w_0 = 2 pi frequency,  S = 4 zeta w_0^3 std^2
+
+    The second state is x'/w_0, so both have the unit of the data.
+
+    Args:
+        frequency: natural frequency [Hz].
+        damping: zeta.
+        std: stationary standard deviation [U].
+    """
+    w = 2.0 * math.pi * frequency
+    return Signal(
+        np.array([[0.0, w], [-w, -2.0 * damping * w]]),
+        np.diag([0.0, 4.0 * damping * w * std**2]),
+        np.array([1.0, 0.0]),
+        (("oscillation", "U"), ("quadrature", "U")),
+        (0, 0),
+    )
+
+
+NAMED = {
+    model.name: model
+    for model in (
+        NamedModel(
+            "constant", "a level that drifts", (_density("drift", "density of the level's drift", 1),), constant
+        ),
+        NamedModel(
+            "constant-velocity",
+            "a position with a velocity",
+            (_density("acceleration", "density of the white acceleration", 3),),
+            constant_velocity,
+        ),
+        NamedModel(
+            "constant-acceleration",
+            "a position with velocity and acceleration",
+            (_density("jerk", "density of the white jerk", 5),),
+            constant_acceleration,
+        ),
+        NamedModel(
+            "ornstein-uhlenbeck",
+            "deviations that return to the mean",
+            (TIME_CONSTANT, _std("std", "standard deviation of the signal")),
+            ornstein_uhlenbeck,
+            about_mean=True,
+        ),
+        NamedModel(
+            "local-trend",
+            "a level and its trend, each with noise",
+            (
+                _density("drift", "density of the level's drift", 1),
+                _density("trend_drift", "density of the trend's drift", 3),
+            ),
+            local_trend,
+        ),
+        NamedModel(
+            "singer",
+            "a position whose acceleration is correlated",
+            (
+                TIME_CONSTANT,
+                Free(
+                    "acceleration_std",
+                    "standard deviation of the acceleration",
+                    "U/s^2",
+                    lambda s: (1e-5 * s.spread / s.duration**2, 1e2 * s.spread / s.dt**2),
+                    starts=9,
+                ),
+            ),
+            singer,
+        ),
+        NamedModel(
+            "oscillator",
+            "a damped oscillation about the mean",
+            (FREQUENCY, DAMPING, _std("std", "standard deviation of the oscillation")),
+            oscillator,
+            about_mean=True,
+        ),
+    )
+}
+
+
+class Sum(NamedTuple):
+    """A named model, or a sum of several, with the names of its free numbers."""
+
+    name: str
+    parts: tuple[NamedModel, ...]
+
+    @property
+    def free(self) -> tuple[Free, ...]:
+        """The free numbers of all parts; a name that several parts have carries its part's."""
+        names = [number.name for part in self.parts for number in part.free]
+        return tuple(
+            number._replace(name=_unique(part.name, number.name, names))
+            for part in self.parts
+            for number in part.free
+        )
+
+    @property
+    def about_mean(self) -> bool:
+        """Whether the signal varies about the mean of the data: no part has a level of its own."""
+        return all(part.about_mean for part in self.parts)
+
+    def signal(self, values: Mapping[str, float]) -> Signal:
+        """The signal for values of the free numbers by name."""
+        names, signals, remaining = [number.name for number in self.free], [], list(self.free)
+        if set(values) != set(names):
+            raise ValueError(f"{self.name} takes {', '.join(names)}, but got {short_repr(list(values))}")
+        for part in self.parts:
+            mine, remaining = remaining[: len(part.free)], remaining[len(part.free) :]
+            arguments = {
+                number.name: positive(free.name, values[free.name])
+                for number, free in zip(part.free, mine, strict=True)
+            }
+            signals.append(part.signal(**arguments))
+        return signals[0] if len(signals) == 1 else _added(signals)
+
+    def model(
+        self,
+        values: Mapping[str, float],
+        noise: float,
+        dt: float,
+        *,
+        first: float = 0.0,
+        spread: float = 1.0,
+        offset: float = 0.0,
+        quantity: Quantity = Quantity("measurement", "z"),  # noqa: B008 - a value that nothing changes
+    ) -> AffineModel:
+        """The model of a step of dt.
+
+        Args:
+            values: of the free numbers.
+            noise: R, the variance of the measurement noise [U^2].
+            dt: sample time [s].
+            first: the first measurement, where the filter begins.
+            spread: of the data [U]; the prior is a hundred times as wide, and as fast as that within a step.
+            offset: the mean of the data, about which the signal varies.
+            quantity: name, symbol and unit of the measurement.
+        """
+        signal, unit = self.signal(values), quantity.unit
+        n, orders = len(signal.output), np.array(signal.orders)
+        level = int(np.argmax(signal.output))
+        names = [symbol for symbol, _ in signal.states]
+        return affine_model(
+            a=signal.transition(positive("dt", dt)),
+            b=np.zeros((n, 0)),
+            c=signal.output[None],
+            process_noise_cov=signal.noise(dt),
+            measurement_noise_cov=[noise],
+            prior_mean=np.eye(n)[level] * (first - offset),
+            prior_cov=(WIDE * spread / dt**orders) ** 2,
+            measurement_offset=[offset],
+            states=[
+                Quantity(symbol, symbol, in_unit(text, unit))
+                for symbol, (_, text) in zip(_numbered(names), signal.states, strict=True)
+            ],
+            input_quantities=[],
+            measurements=[quantity],
+        )
+
+
+def named_model(name: str) -> Sum:
+    """A model by name, such as "constant-velocity", or a sum, such as "constant + oscillator".
+
+    Raises:
+        ValueError: for an unknown name; the message has the known ones.
+    """
+    parts = tuple(NAMED[one_of("a model", part.strip().lower(), tuple(NAMED))] for part in name.split("+"))
+    if sum(not part.about_mean for part in parts) > 1:
+        rule = "a sum must have at most one part with a level, since data determine the sum of two levels alone"
+        raise ValueError(f"{rule}, but got {name!r}")
+    return Sum(" + ".join(part.name for part in parts), parts)
+
+
+def kalman_filter(name: str, dt: float, noise: float, **values: float) -> KalmanFilter:
+    """The Kalman filter of a named model, for data whose numbers are known.
+
+        filter_ = filters.kalman_filter("constant-velocity", dt=0.1, noise=0.25, acceleration=0.04)
+
+    Args:
+        name: of the model (`named_model`).
+        dt: sample time [s].
+        noise: R, the variance of the measurement noise.
+        **values: the model's numbers.
+
+    Raises:
+        ValueError: for an unknown name or number.
+    """
+    return KalmanFilter(model=named_model(name).model(values, noise, dt))
+
+
+def in_unit(text: str, unit: str) -> str:
+    """A unit with U replaced by the data's; empty for a pure number."""
+    if not unit:
+        text = text.replace("U^2/", "1/").replace("U/", "1/")
+        return "" if text in ("U", "U^2") else text
+    powered = f"({unit})" if set(unit) & set("/ *^") else unit
+    return text.replace("U^2", f"{powered}^2").replace("U", unit)
+
+
+def _unique(part: str, name: str, names: list[str]) -> str:
+    return f"{part.replace('-', '_')}_{name}" if names.count(name) > 1 else name
+
+
+def _numbered(names: list[str]) -> list[str]:
+    """Symbols, with a number where several states have the same."""
+    return [
+        f"{name}_{names[: i + 1].count(name)}" if names.count(name) > 1 else name for i, name in enumerate(names)
+    ]
+
+
+def _added(signals: list[Signal]) -> Signal:
+    """The sum of signals, side by side."""
+    from scipy.linalg import block_diag
+
+    return Signal(
+        block_diag(*(signal.slope for signal in signals)),
+        block_diag(*(signal.densities for signal in signals)),
+        np.concatenate([signal.output for signal in signals]),
+        tuple(state for signal in signals for state in signal.states),
+        tuple(order for signal in signals for order in signal.orders),
+    )

@@ -1,0 +1,250 @@
+"""Q and R of a column of numbers: closed forms, Durbin and Koopman's Nile, code that runs, and clear refusals."""
+
+import ctypes
+import math
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+import filters
+import tuning
+from filters.models import NAMED, Scales, named_model
+from tuning.series.column import column_of
+from tuning.series.paste import LANGUAGES
+
+NILE = """
+1120 1160 963 1210 1160 1160 813 1230 1370 1140 995 935 1110 994 1020 960 1180 799 958 1140 1100 1210 1150
+1250 1260 1220 1030 1100 774 840 874 694 940 833 701 916 692 1020 1050 969 831 726 456 824 702 1120 1100 832
+764 821 768 845 864 862 698 845 744 796 1040 759 781 865 845 944 984 897 822 1010 771 676 649 846 812 742 801
+1040 860 874 848 890 744 749 838 1050 918 986 797 923 975 815 1020 906 901 1170 912 746 919 718 714 740
+"""
+NUMBERS = {
+    "constant": {"drift": 0.3},
+    "constant-velocity": {"acceleration": 0.7},
+    "constant-acceleration": {"jerk": 0.2},
+    "ornstein-uhlenbeck": {"time_constant": 2.0, "std": 1.5},
+    "local-trend": {"drift": 0.3, "trend_drift": 0.1},
+    "singer": {"time_constant": 3.0, "acceleration_std": 0.4},
+    "oscillator": {"frequency": 0.3, "damping": 0.1, "std": 1.5},
+}
+
+
+def simulated(name, rows, dt=0.1, noise=0.2, seed=0, **numbers):
+    """Numbers drawn from a named model, without its code for Q: by many small steps of the rates."""
+    signal, parts = named_model(name).signal(numbers or NUMBERS[name]), 40
+    rng = np.random.default_rng(seed)
+    step, root = (
+        np.eye(len(signal.output)) + signal.slope * dt / parts,
+        np.sqrt(np.diag(signal.densities) * dt / parts),
+    )
+    x, z = np.zeros(len(root)), np.empty(rows)
+    for k in range(rows):
+        z[k] = signal.output @ x + math.sqrt(noise) * rng.normal()
+        for _ in range(parts):
+            x = step @ x + root * rng.normal(size=len(root))
+    return z
+
+
+@pytest.fixture(scope="module")
+def nile():
+    return tuning.fit(np.array(NILE.split(), dtype=float), model="constant")
+
+
+@pytest.fixture(scope="module")
+def position():
+    return tuning.fit(simulated("constant-velocity", 600) + 40.0, 0.1, model="constant-velocity")
+
+
+def test_the_nile_has_the_variances_of_durbin_and_koopman(nile):
+    """Durbin, Koopman (2012), section 2.10.3: 1469.1 and 15098.5."""
+    drift, noise = nile.numbers
+    assert drift.value == pytest.approx(1469.1, rel=1e-3) and nile.r == pytest.approx(15098.5, rel=1e-4)
+    assert nile.q[0, 0] == drift.value and drift.low < 1469.1 < drift.high and noise.unit == ""
+    assert nile.gain[0] == pytest.approx(0.267, abs=1e-3)  # section 2.11
+    assert nile.memory == pytest.approx(-1.0 / math.log(1.0 - nile.gain[0]), rel=1e-9)
+    assert not nile.is_wrong and "white" in nile.sentences()[-1]
+
+
+def test_process_noise_has_the_structure_of_the_physics():
+    dt, acceleration, jerk = 0.3, 0.7, 0.2
+    q = named_model("constant-velocity").signal({"acceleration": acceleration}).noise(dt)
+    expected = acceleration * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    np.testing.assert_allclose(q, expected, rtol=1e-12)
+    q = named_model("constant-acceleration").signal({"jerk": jerk}).noise(dt)
+    powers = [[dt**5 / 20, dt**4 / 8, dt**3 / 6], [dt**4 / 8, dt**3 / 3, dt**2 / 2], [dt**3 / 6, dt**2 / 2, dt]]
+    np.testing.assert_allclose(q, jerk * np.array(powers), rtol=1e-12)
+    signal = named_model("ornstein-uhlenbeck").signal({"time_constant": 2.0, "std": 1.5})
+    decay = math.exp(-dt / 2.0)
+    np.testing.assert_allclose(signal.transition(dt), [[decay]], rtol=1e-12)
+    np.testing.assert_allclose(signal.noise(dt), [[1.5**2 * (1.0 - decay**2)]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("damping", [0.01, 0.5, 1.0, 1.7])
+def test_an_oscillation_keeps_its_deviation_and_frequency(damping):
+    signal = named_model("oscillator").signal({"frequency": 0.3, "damping": damping, "std": 1.5})
+    f, q = signal.transition(0.4), signal.noise(0.4)
+    np.testing.assert_allclose(f @ (2.25 * np.eye(2)) @ f.T + q, 2.25 * np.eye(2), atol=1e-12)  # Lyapunov
+    if damping < 1.0:
+        turn = abs(np.angle(np.linalg.eigvals(f)[0])) / 0.4
+        assert turn == pytest.approx(2.0 * math.pi * 0.3 * math.sqrt(1.0 - damping**2), rel=1e-9)
+
+
+def test_a_sum_has_the_parts_side_by_side():
+    total = named_model("constant-velocity + oscillator")
+    assert [number.name for number in total.free] == ["acceleration", "frequency", "damping", "std"]
+    model = total.model({**NUMBERS["constant-velocity"], **NUMBERS["oscillator"]}, 0.2, 0.1)
+    f, _, _, c, _ = model.matrices()
+    np.testing.assert_array_equal(f[:2, 2:], 0.0)
+    np.testing.assert_array_equal(c, [[1.0, 0.0, 1.0, 0.0]])
+    twice = named_model("oscillator + oscillator")
+    assert len({number.name for number in twice.free}) == 3  # of equal parts the data know no order
+    with pytest.raises(ValueError, match="at most one part with a level"):
+        named_model("constant + constant-velocity")
+    with pytest.raises(ValueError, match="a model must be one of"):
+        named_model("constant-speed")
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_intervals_hold_the_numbers_that_made_the_data(name):
+    """Fixed seeds, of which the intervals hold all numbers: a wrong power of dt or a factor 2 is far outside."""
+    fit = tuning.fit(simulated(name, 800, seed=3), 0.1, model=name)
+    for number in fit.numbers:
+        value = {**NUMBERS[name], "R": 0.2}[number.name]
+        low, high = (  # wider by half, in logarithms: these are 95 % intervals of 17 numbers
+            number.value * (end / number.value) ** 1.5 for end in (number.low, number.high)
+        )
+        assert low < value < high, (number, value)
+
+
+def test_the_unit_of_time_scales_the_numbers_and_moves_no_estimate(position):
+    z = position.column.values
+    slower = tuning.fit(z, 100.0, model="constant-velocity")  # a thousand times
+    assert slower.numbers[0].value == pytest.approx(position.numbers[0].value / 1e9, rel=1e-4)
+    assert slower.r == pytest.approx(position.r, rel=1e-4)
+    assert slower.memory == pytest.approx(1e3 * position.memory, rel=1e-4)
+    scaled = tuning.fit(1e3 * z, 0.1, model="constant-velocity")
+    assert scaled.r == pytest.approx(1e6 * position.r, rel=1e-4)
+    np.testing.assert_allclose(scaled.gain, position.gain, rtol=1e-4)
+
+
+def test_the_right_model_is_chosen():
+    fit = tuning.fit(simulated("constant-velocity", 600, noise=0.05), 0.1)
+    assert fit.name == "constant-velocity" and len(fit.candidates) == 6
+    assert tuning.fit(simulated("constant", 600, noise=0.05), 0.1).name == "constant"
+    text = str(fit)
+    assert text.index("Model: constant-velocity") < text.index("acceleration") < text.index("Steady-state gain")
+    assert "local-trend" in text
+
+
+def test_what_no_model_fits_is_said_before_any_number():
+    rng = np.random.default_rng(1)
+    z = np.sin(np.arange(800) * 0.9) + 0.01 * rng.normal(size=800)
+    fit = tuning.fit(z, 0.1, model="constant")
+    assert fit.is_wrong
+    text = str(fit)
+    assert text.index("No model that was tried fits") < text.index("Model:") < text.index("R =")
+
+
+def test_noise_is_found_on_a_record_that_goes_far():
+    """A position that accelerates leaves its noise far behind: R is a trillionth of the spread's square."""
+    z = simulated("constant-acceleration", 2000, noise=0.2, seed=5, jerk=10.0)
+    fit = tuning.fit(z, 0.1, model="constant-acceleration")
+    assert fit.column.scales.spread**2 > 1e9 and fit.r == pytest.approx(0.2, rel=0.15)
+
+
+def test_missing_numbers_and_gaps_are_rows_without_a_number(position):
+    z = position.column.values.copy()
+    times = 0.1 * np.arange(len(z))
+    lost = np.random.default_rng(2).uniform(size=len(z)) < 0.1
+    lost[0] = False
+    z[lost] = np.nan
+    by_nan = tuning.fit(z, 0.1, model="constant-velocity")
+    by_gap = tuning.fit(z[~lost], times=times[~lost], model="constant-velocity")
+    assert by_nan.r == pytest.approx(by_gap.r, rel=1e-9) and by_nan.r == pytest.approx(position.r, rel=0.2)
+    assert f"{int(lost.sum())} missing" in str(by_nan)
+
+
+def test_the_filter_is_the_one_of_the_estimates(position):
+    belief_path = filters.run(position.filter, None, np.zeros((1, 599, 0)), position.column.values[None, :, None])
+    np.testing.assert_array_equal(belief_path.means, position.estimates.means)
+    settled = position.estimates
+    gain = settled.means[0, -1] - position.model.matrices()[0] @ settled.means[0, -2]
+    np.testing.assert_allclose(gain / settled.innovations[0, -1, 0], position.gain, rtol=1e-9)
+
+
+def test_lines_for_python_make_the_same_filter(position):
+    names = {}
+    exec(position.code("python"), names)
+    np.testing.assert_allclose(names["filter_"].model.numbers, position.filter.model.numbers, rtol=1e-11)
+    with pytest.raises(ValueError, match="a language must be one of"):
+        position.code("cobol")
+    assert set(LANGUAGES) == {"python", "filterpy", "pykalman", "matlab", "arduino"}
+
+
+def test_lines_for_filterpy_give_the_same_estimates(position):
+    pytest.importorskip("filterpy.kalman")
+    setup, step = position.code("filterpy").split("# the first")
+    names = {}
+    exec(setup, names)
+    kf, z = names["kf"], position.column.values
+    kf.update(z[0])
+    for k in range(1, 50):
+        exec(step.split("\n", 1)[1], {"kf": kf, "z": z[k]})
+        np.testing.assert_allclose(kf.x[:, 0], position.estimates.means[0, k], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="the lines of C need a compiler")
+def test_lines_for_a_controller_are_the_filter_once_it_has_settled(position, tmp_path):
+    source = tmp_path / "filter.c"
+    source.write_text(position.code("arduino") + "\nfloat state(int i) { return i ? x2 : x1; }\n")
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", str(tmp_path / "filter.so"), str(source)], check=True)
+    library = ctypes.CDLL(str(tmp_path / "filter.so"))
+    library.filter.argtypes, library.state.restype = [ctypes.c_float], ctypes.c_float
+    for z in position.column.values:
+        library.filter(z)
+    state = [library.state(0), library.state(1)]
+    np.testing.assert_allclose(state, position.estimates.means[0, -1], rtol=2e-3)
+
+
+def test_an_index_of_dates_and_a_file_are_the_same_numbers(position, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    z = position.column.values
+    index = pandas.date_range("2026-01-01", periods=len(z), freq="100ms")
+    of_series = column_of(pandas.Series(z, index=index, name="depth [m]"))
+    file = tmp_path / "depth.csv"
+    file.write_text("t,depth [m]\n" + "".join(f"{0.1 * k:.1f},{float(value)!r}\n" for k, value in enumerate(z)))
+    of_file = column_of(file)
+    for column in (of_series, of_file):
+        np.testing.assert_array_equal(column.values, z)
+        assert column.dt == pytest.approx(0.1) and column.quantity[:3] == ("depth", "depth", "m")
+    assert column_of(list(z)).dt == 1.0 and column_of([*z[:30], None]).measured.sum() == 30
+
+
+@pytest.mark.parametrize(
+    ("z", "options", "message"),
+    [
+        ([1.0] * 30, {}, "must vary"),
+        ([1.0, 2.0], {}, "at least 20 numbers"),
+        ([math.nan] * 50, {}, "at least 20 numbers, but has 0"),
+        (["a"] * 30, {}, "z must be numbers"),
+        (np.zeros((30, 2)), {}, "one column of numbers"),
+        (np.arange(30.0), {"times": np.arange(30.0)[::-1]}, "times must increase"),
+        (np.arange(30.0), {"model": "constant-speed"}, "a model must be one of"),
+        (np.arange(30.0), {"dt": -1.0}, "dt must be positive"),
+        ({"t": np.arange(30.0), "a": np.arange(30.0), "b": np.arange(30.0)}, {}, "one column of numbers beside"),
+    ],
+)
+def test_wrong_numbers_are_refused_in_one_line(z, options, message):
+    with pytest.raises(ValueError, match=message) as error:
+        tuning.fit(z, **options)
+    assert "\n" not in str(error.value)
+
+
+def test_every_start_lies_in_its_range():
+    sizes = (1e-6, 1e-7, 1e-3, 10.0, 80.0), (5e4, 1e2, 3600.0, 1e8, 1e-4), (1.0, 0.5, 1.0, 30.0, 0.5)
+    for scales in (Scales(*size) for size in sizes):
+        for number in (number for model in NAMED.values() for number in model.free):
+            low, high = number.range(scales)
+            assert 0.0 < low < high < math.inf and all(low <= value <= high for value in number.values(scales))

@@ -1,0 +1,78 @@
+"""`tuning.fit` and `thruster fit`: which model, Q and R a column of numbers has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from thruster_env.core.files import check_target, save_figure, write_whole
+from thruster_env.logs.write import check_picture
+from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, Argument, Option, Progress, PythonOnly
+from tuning.api.progress import console_for
+from tuning.series.answer import SeriesFit
+from tuning.series.column import column_of
+from tuning.series.fit import AUTO, CANDIDATES, choose
+from tuning.series.paste import LANGUAGES
+
+
+def fit(
+    z: Annotated[Any, Argument(INPUT, ("--log",), "FILE", str, file=READ)],
+    dt: Annotated[float | None, Option(INPUT)] = None,
+    *,
+    times: Annotated[Any, PythonOnly()] = None,
+    column: Annotated[str | None, Option(INPUT, metavar="HEADER")] = None,
+    model: Annotated[str, Option(INPUT)] = AUTO,
+    picture: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
+    code: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
+    progress: Progress = None,
+) -> SeriesFit:
+    """Find the model, Q and R of one column of numbers by maximum likelihood.
+
+    Each model is a plant that everybody knows, driven by white noise: constant, constant-velocity,
+    constant-acceleration, local-trend, ornstein-uhlenbeck, singer or oscillator. Of the models that predict unseen
+    blocks of the record as well as the best one, the simplest is chosen. If innovations are correlated, the first
+    line says that no model fits.
+
+        fit = tuning.fit(z, dt=0.1)
+        print(fit)
+        filter_ = fit.filter
+        print(fit.code("arduino"))
+
+    Example: thruster fit acc.csv
+
+    Example: thruster fit acc.csv --model constant-velocity --picture acc.png --code acc.md
+
+    Args:
+        z: a log with one column of numbers, and times. In Python also an array or list, a pandas Series or table,
+            whose index may have times or dates; NaN or None where a number is missing.
+        dt: sample time [s], where there are no times; 1 by default.
+        times: of an array's numbers [s], (K,).
+        column: header of the numbers, where there are several.
+        model: name of a model, or a sum such as "constant-velocity + oscillator"; auto tries the small ones.
+        picture: also draw the data, the estimate with its band, and the innovations: .png, .svg or .pdf.
+        code: also write the filter as lines to paste, for Python, FilterPy, pykalman, MATLAB, a controller: .md.
+        progress: whether to show progress; by default only in terminals and notebooks.
+
+    Returns:
+        `SeriesFit`: `filter`, `model`, `q`, `r`, `gain`, `numbers` with intervals, `sentences()`, `to_frame()`,
+        `plot()`, `code(language)`.
+
+    Raises:
+        ValueError: for fewer than 20 numbers, numbers that do not vary, times that go back, or an unknown model.
+    """
+    if picture is not None:
+        check_picture(picture, "--picture")
+        check_target(picture)
+    if code is not None:
+        if Path(code).suffix != ".md":
+            raise ValueError(f"code (--code) must be a file that ends in .md, but got {str(code)!r}")
+        check_target(code)
+    data = column_of(z, dt, times=times, column=column)
+    names = CANDIDATES if model == AUTO else (model,)
+    with console_for(progress).status("fitting ...") as status:
+        fitted = SeriesFit(data, *choose(data, names, lambda name: status.update(f"fitting {name} ...")))
+    if picture is not None:
+        save_figure(fitted.plot(), picture)
+    if code is not None:
+        write_whole(code, "\n".join(f"## {name}\n\n```\n{fitted.code(name)}\n```\n" for name in LANGUAGES))
+    return fitted

@@ -1,0 +1,7 @@
+"""Q and R of one column of numbers, in one line: `tuning.fit_series`.
+
+column   the numbers and their times, read as logs are
+fit      named models by maximum likelihood, with intervals, and the choice among them
+answer   what is found, on half a page, with a picture
+paste    the filter as lines of other packages and of a controller
+"""

@@ -1,0 +1,255 @@
+"""What is found in a column of numbers: the model, Q and R with intervals, what they mean, and a picture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import RenderableType
+from rich.text import Text
+
+from filters.bounds import steady_state
+from filters.consistency.nees import LAGS, Whiteness, whiteness
+from filters.engine.batch import Estimates
+from filters.gaussian.kalman import KalmanFilter
+from thruster_env.core.text_tables import plain_text, table
+from thruster_env.model.affine import AffineModel
+from tuning.api.display import frame, html
+from tuning.series.column import Column
+from tuning.series.fit import Fitted, Number, behind, filtered, model_of
+from tuning.series.paste import lines_of
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+WHITE = 0.001  # probability from which innovations count as white
+LARGE = 0.05  # correlation of innovations that matters
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SeriesFit:
+    """The model of a column of numbers, its Q and R, and what they mean.
+
+    Attributes:
+        column: the numbers on their grid.
+        chosen: the chosen candidate.
+        candidates: all that were tried, best first.
+        numbers: the model's free numbers and R, with 95 % intervals.
+    """
+
+    column: Column
+    chosen: Fitted
+    candidates: tuple[Fitted, ...]
+    numbers: tuple[Number, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the model."""
+        return self.chosen.sum.name
+
+    @cached_property
+    def model(self) -> AffineModel:
+        """The model with its numbers."""
+        return model_of(self.chosen.sum, self.column, self.chosen.values)
+
+    @property
+    def filter(self) -> KalmanFilter:
+        """The Kalman filter, ready to use."""
+        return KalmanFilter(model=self.model)
+
+    @property
+    def q(self) -> np.ndarray:
+        """Q per step, (n, n)."""
+        return self.model.process_noise_cov
+
+    @property
+    def r(self) -> float:
+        """R."""
+        return float(self.model.measurement_noise_cov[0, 0])
+
+    @cached_property
+    def gain(self) -> np.ndarray:
+        """The steady-state gain, (n,), of x + K (z - C x)."""
+        a, _, _, c, _ = self.model.matrices()
+        return steady_state(a, c, self.q, self.model.measurement_noise_cov)[1][:, 0]
+
+    @property
+    def memory(self) -> float:
+        """Time in which the filter forgets an error of its state but for 1/e [s]."""
+        a, _, _, c, _ = self.model.matrices()
+        slowest = np.abs(np.linalg.eigvals(a - np.outer(self.gain, c @ a))).max()
+        return math.inf if slowest >= 1.0 else -self.column.dt / math.log(max(slowest, 1e-300))
+
+    @cached_property
+    def estimates(self) -> Estimates:
+        """The filter on the data."""
+        return filtered(self.model, self.column)
+
+    @cached_property
+    def whiteness(self) -> Whiteness:
+        """Whether the innovations are white."""
+        present = self.column.measured & (np.cumsum(self.column.measured) > self.model.n)
+        lags = min(LAGS, len(self.column.values) // 4)
+        return whiteness(
+            self.estimates.innovations, self.estimates.innovation_covs, present[None, :, None], lags=lags
+        )
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether innovations are correlated so much that the model misses something in the data."""
+        correlations = np.abs(self.whiteness.correlations[:, 0, 0])
+        return self.whiteness.p_value < WHITE and float(correlations.max()) > LARGE
+
+    def sentences(self) -> list[str]:
+        """What a reader has to know, most important first."""
+        white, sentences = self.whiteness, []
+        correlations = white.correlations[:, 0, 0]
+        lag = int(np.argmax(np.abs(correlations)))
+        if self.is_wrong:
+            sentences.append(
+                f"No model that was tried fits: innovations are correlated ({correlations[lag]:.2f} at a lag of "
+                f"{(lag + 1) * self.column.dt:.3g} s), so Q and R make up for what the model misses."
+            )
+        sentences += [
+            f"The data do not determine {number.name}: {number.low:.3g} to {number.high:.3g} are as likely."
+            for number in self.numbers
+            if not number.determined
+        ]
+        if not self.is_wrong:
+            sentences.append(f"The innovations are white (p = {white.p_value:.2g}).")
+        return [*sentences, *self.column.remarks]
+
+    def to_frame(self) -> pandas.DataFrame:
+        """A row per number: meaning, unit, value, and the ends of its 95 % interval."""
+        columns = [*zip(*(number for number in self.numbers), strict=True)]
+        names = "number", "meaning", "value", "low", "high", "unit", "determined"
+        return frame(dict(zip(names, columns, strict=True)), "number")
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it as plain data, for JSON."""
+        f, _, _, h, offset = self.model.matrices()
+        return {
+            "model": self.name,
+            "rows": len(self.column.values),
+            "measured": int(self.column.measured.sum()),
+            "dt": self.column.dt,
+            "numbers": {number.name: number._asdict() for number in self.numbers},
+            "F": f,
+            "H": h,
+            "Q": self.q,
+            "R": self.r,
+            "offset": float(offset[0]),
+            "gain": self.gain,
+            "forgets_in": self.memory,
+            "white": {"p": self.whiteness.p_value, "wrong_model": self.is_wrong},
+            "candidates": [
+                {"model": name, "behind": loss, "standard_error": error} for name, loss, error in self._standings()
+            ],
+            "sentences": self.sentences(),
+        }
+
+    def tables(self) -> list[RenderableType]:
+        """Half a page for the terminal: the model, its numbers with intervals, and what they mean."""
+        column, first = self.column, []
+        count = int(column.measured.sum())
+        missing = len(column.values) - count
+        heading = f"{column.quantity.short_label}: {count} numbers, one each {column.dt:.4g} s"
+        sentences = self.sentences()
+        if self.is_wrong:
+            first, sentences = [sentences[0]], sentences[1:]
+        rows = [
+            (
+                number.name,
+                f"{number.value:.4g}",
+                f"{number.low:.3g}",
+                f"{number.high:.3g}",
+                number.unit,
+                number.meaning,
+            )
+            for number in self.numbers
+        ]
+        about = " plus ".join(part.about for part in self.chosen.sum.parts)
+        numbers = table(
+            f"Model: {self.name}, {about}", ["", "value", "95 % from", "to", "unit", ""], rows, words=True
+        )
+        lines = [
+            f"Q per step = {_matrix(self.q)}",
+            f"R = {self.r:.6g}",
+            f"Steady-state gain = {_matrix(self.gain)}: the filter forgets in {self.memory:.3g} s",
+        ]
+        rivals = [
+            f"{name} {-loss:.1f} +- {error:.1f}" for name, loss, error in self._standings() if name != self.name
+        ]
+        if rivals:
+            sentences.append(f"Log-likelihood of unseen blocks less the best model's: {', '.join(rivals)}.")
+        heading = f"{heading}, {missing} missing" if missing else heading
+        return [
+            *(Text(line) for line in (heading, *first, "")),
+            numbers,
+            *(Text(line) for line in (*lines, *sentences)),
+        ]
+
+    def _standings(self) -> list[tuple[str, float, float]]:
+        """Of each candidate, best first: by how much it is behind the best, and the standard error of that."""
+        best = self.candidates[0]
+        return [(fitted.sum.name, *behind(fitted, best)) for fitted in self.candidates]
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{number.name} {number.value:.4g}" for number in self.numbers)
+        return f"SeriesFit({self.name}: {values})"
+
+    def __str__(self) -> str:
+        return plain_text(self.tables())
+
+    def _repr_html_(self) -> str:
+        rows = [
+            [name, f"{value:.4g}", f"{low:.3g}", f"{high:.3g}", unit]
+            for name, _, value, low, high, unit, _ in self.numbers
+        ]
+        columns = ["", "value", "95 % from", "to", "unit"]
+        return html(f"Model: {self.name}", columns, rows, " ".join(self.sentences()))
+
+    def plot(self) -> Figure:
+        """The data with the estimate and its 95 % band, and the normalised innovations."""
+        from matplotlib.figure import Figure
+
+        quantity, column = self.column.quantity, self.column
+        times = column.dt * np.arange(len(column.values))
+        a, _, _, c, d = self.model.matrices()
+        means = self.estimates.means[0] @ c[0] + d[0]
+        deviations = np.sqrt(np.einsum("i,kij,j->k", c[0], self.estimates.covs[0], c[0]))
+        normalised = self.estimates.innovations[0, :, 0] / np.sqrt(self.estimates.innovation_covs[0, :, 0, 0])
+        figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+        top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
+        top.plot(times, column.values, ".", markersize=2.5, color="0.6", label="measured")
+        top.plot(times, means, color="C0", linewidth=1.2, label=f"estimate, {self.name}")
+        top.fill_between(
+            times, means - 1.96 * deviations, means + 1.96 * deviations, color="C0", alpha=0.25, label="95 % band"
+        )
+        inside = column.values[column.measured]
+        margin = 0.1 * np.ptp(inside)
+        top.set_ylim(inside.min() - margin, inside.max() + margin)
+        top.set_ylabel(quantity.short_label)
+        top.legend(loc="best", frameon=False, fontsize="small")
+        bottom.plot(times, normalised, ".", markersize=2.5, color="0.4")
+        bottom.axhspan(-1.96, 1.96, color="C0", alpha=0.15)
+        bottom.set_ylabel("innovation\n[standard deviations]")
+        bottom.set_xlabel("time [s]")
+        return figure
+
+    def code(self, language: str = "python") -> str:
+        """Lines to paste: "python" (ours), "filterpy", "pykalman", "matlab" or "arduino".
+
+        Raises:
+            ValueError: for another language.
+        """
+        return lines_of(language, self.model, self.gain)
+
+
+def _matrix(values: np.ndarray) -> str:
+    """Numbers as Python writes them, to six digits."""
+    return np.array2string(np.asarray(values), precision=6, separator=", ", prefix="Q per step = ")

@@ -1,0 +1,295 @@
+"""Named models of a column of numbers by maximum likelihood, with intervals, and the choice among them.
+
+What counts are the innovations of a Kalman filter that begins without a prior. The record is cut into blocks: each
+candidate is fitted once without the even ones and once without the odd ones, and compared by the likelihood of the
+blocks that it did not see. Of the candidates that are not significantly worse than the best, the simplest is
+chosen. An interval has the values at which the likelihood, with all other numbers at their likeliest, is within
+e^-1.92 of its maximum.
+
+Sources: Harvey (1989), Forecasting, Structural Time Series Models and the Kalman Filter, section 3.4; Durbin and
+Koopman (2012), Time Series Analysis by State Space Methods, sections 5.2 and 7.2, for starts without a prior;
+Pawitan (2001), In All Likelihood, section 2.6, for intervals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import chi2
+
+from filters.engine.batch import Estimates, run
+from filters.gaussian.kalman import KalmanFilter
+from filters.models import Scales, Sum, in_unit, named_model
+from filters.starts import Starts
+from thruster_env.core.streams import filter_keys
+from thruster_env.model.affine import AffineModel
+from thruster_env.model.state_space import StateSpaceModel
+from tuning.identification.objective import Ascent, Objective, climb
+from tuning.problems.data import Data
+from tuning.problems.problem import Coordinates, Parameter, squared
+from tuning.series.column import Column
+
+AUTO = "auto"
+CANDIDATES = (
+    "constant",
+    "constant-velocity",
+    "ornstein-uhlenbeck",
+    "local-trend",
+    "constant-acceleration",
+    "oscillator",
+)
+BLOCKS = 20  # of the record, of which half are unseen at a time
+TIE = 2.0  # standard errors by which a candidate may be behind the best one
+MOST_ROWS = 20_000  # on which models are compared
+RUN = 4096  # rows of a run, into which a long record is cut: runs are filtered side by side
+R = "R"
+R_ENDS = 1e-6, 1e1  # range of R, in squares of the roughness
+SHARES = 0.01, 0.2, 0.9  # R from which searches begin, in squares of the roughness
+SEARCHES = 3
+EXACT = 1e-8  # predicted rise of the log-likelihood at which the last search ends
+NOISE = "variance of the measurement noise"
+FALL = 0.5 * float(chi2.ppf(0.95, 1))  # of the log-likelihood at the ends of a 95 % interval
+FAR = 100.0  # root of a fall where the filter has no likelihood
+PRECISION = 0.01  # of an interval's end, in coordinates
+
+
+class Fitted(NamedTuple):
+    """A candidate's maximum of the likelihood."""
+
+    sum: Sum
+    objective: Objective
+    ascent: Ascent
+    rivals: tuple[Ascent, ...]  # maxima to which searches led from elsewhere, perhaps the same one
+    held_out: np.ndarray  # (blocks,), log-likelihoods of blocks that it was not fitted on
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Values of the free numbers, and R."""
+        return self.objective.coordinates.named(self.ascent.at)
+
+    @property
+    def order(self) -> tuple[int, int]:
+        """How simple it is: free numbers, then states."""
+        return len(self.sum.free), self.objective.model_at(self.ascent.at).n
+
+
+class Number(NamedTuple):
+    """A number of the model with its 95 % interval."""
+
+    name: str
+    meaning: str
+    value: float
+    low: float
+    high: float
+    unit: str
+    determined: bool  # False where an end of the interval is an end of the range
+
+
+class Choice(NamedTuple):
+    """The chosen model, all candidates, best first, and the chosen one's numbers."""
+
+    chosen: Fitted
+    candidates: tuple[Fitted, ...]
+    numbers: tuple[Number, ...]
+
+
+def choose(column: Column, names: Sequence[str], progress: Callable[[str], None] = lambda name: None) -> Choice:
+    """Fit named models and choose one: the simplest of those that are not significantly worse than the best.
+
+    A record of more than `MOST_ROWS` rows is compared on its middle; the numbers are those of all rows.
+
+    Args:
+        column: the numbers.
+        names: of the models, as `filters.models.named_model` takes them.
+        progress: called with each name before it is fitted.
+
+    Raises:
+        ValueError: for an unknown model, or one that has no likelihood.
+    """
+    part, fitted = column.middle(MOST_ROWS), []
+    for name in names:
+        progress(name)
+        fitted.append(_fit(named_model(name), part, prove=len(names) > 1))
+    ranked = tuple(sorted(fitted, key=lambda candidate: -candidate.held_out.sum()))
+    tied = [candidate for candidate in ranked if _ties(candidate, ranked[0])]
+    chosen = min(tied, key=lambda candidate: candidate.order)
+    if part is not column:
+        progress(f"{chosen.sum.name} on all rows")
+        chosen = _on_all(chosen, column)
+    return Choice(chosen, ranked, _numbers(chosen))
+
+
+def model_of(candidate: Sum, column: Column, values: Mapping[str, float]) -> AffineModel:
+    """The model of a column for values of a candidate's free numbers and R."""
+    return candidate.model(
+        {name: value for name, value in values.items() if name != R},
+        values[R],
+        column.dt,
+        first=column.first,
+        spread=column.scales.spread,
+        offset=column.mean if candidate.about_mean else 0.0,
+        quantity=column.quantity,
+    )
+
+
+def _runs(column: Column, hidden: np.ndarray | None) -> np.ndarray:
+    """The numbers as runs (B, K) of equal length, NaN at the end of the last one and where they are hidden."""
+    values = column.values if hidden is None else np.where(hidden, np.nan, column.values)
+    count = max(1, round(len(values) / RUN))
+    padded = np.full(count * -(-len(values) // count), np.nan)
+    padded[: len(values)] = values
+    return padded.reshape(count, -1)
+
+
+def _objective(candidate: Sum, column: Column, hidden: np.ndarray | None = None) -> Objective:
+    """The log-likelihood of the record, whose runs begin without a prior: their first rows do not count."""
+    scales, unit, runs = column.scales, column.quantity.unit, _runs(column, hidden)
+    free = [
+        Parameter(number.name, low, high, in_unit(number.unit, unit), default=number.values(scales)[0])
+        for number in candidate.free
+        for low, high in [number.range(scales)]
+    ]
+    low, high = (factor * scales.roughness**2 for factor in R_ENDS)
+    free.append(Parameter(R, low, high, squared(unit), default=SHARES[1] * scales.roughness**2))
+
+    def make(**values: float) -> AffineModel:
+        return model_of(candidate, column, values)
+
+    model, count = make(**{parameter.name: parameter.start for parameter in free}), len(runs)
+    measured = ~np.isnan(runs)
+    begins = np.where(measured.any(axis=1), runs[np.arange(count), measured.argmax(axis=1)], 0.0)
+    _, _, _, output, offset = model.matrices()
+    means = np.tile(model.prior_mean, (count, 1))
+    means[:, int(output[0].argmax())] = begins - offset
+    leads = np.array([np.searchsorted(rows, model.n) + 1 for rows in measured.cumsum(axis=1)])
+    starts = Starts(np.ones(count, dtype=bool), means, np.tile(model.prior_cov, (count, 1, 1)), leads)
+    inputs = np.zeros((count, runs.shape[1] - 1, 0))
+    data = Data(tuple(range(count)), inputs, runs[:, :, None], filter_keys(range(count)))
+    return Objective(data, make, Coordinates(free), filter="kf", starts=starts)
+
+
+def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
+    """The candidate with the likeliest numbers, and its likelihood on blocks that it was not fitted on."""
+    objective = _objective(candidate, column)
+    bounds = objective.coordinates.low, objective.coordinates.high
+    ascents = [climb(objective, at, *bounds) for at in _starts(objective, candidate, column.scales)]
+    ascent = climb(objective, max(ascents, key=lambda end: end.found.value).at, *bounds, enough=EXACT)
+    if not math.isfinite(ascent.found.value):
+        raise ValueError(f"{candidate.name} must have a likelihood on the data, but has none from any start")
+    if not prove:
+        return Fitted(candidate, objective, ascent, tuple(ascents), np.zeros(BLOCKS))
+    blocks = np.arange(len(column.values)) * BLOCKS // len(column.values)
+    held_out = np.empty(BLOCKS)
+    for fold in range(2):
+        hidden = blocks % 2 == fold
+        trained = climb(_objective(candidate, column, hidden), ascent.at, *bounds)
+        held_out[fold::2] = _by_blocks(objective, trained.at, column, blocks)[fold::2]
+    return Fitted(candidate, objective, ascent, tuple(ascents), held_out)
+
+
+def _on_all(chosen: Fitted, column: Column) -> Fitted:
+    """A candidate that was fitted on a part of the record, on the whole of it."""
+    objective = _objective(chosen.sum, column)
+    coordinates = objective.coordinates
+    begin = np.clip(coordinates.of(list(chosen.values.values())), coordinates.low, coordinates.high)
+    ascent = climb(objective, begin, coordinates.low, coordinates.high)
+    return chosen._replace(objective=objective, ascent=ascent, rivals=())
+
+
+def _by_blocks(objective: Objective, at: np.ndarray, column: Column, blocks: np.ndarray) -> np.ndarray:
+    """Log-likelihood of each block of the record, filtered from its beginning, (BLOCKS,)."""
+    model = objective.model_at(at)
+    estimates = filtered(model, column)
+    v, s = estimates.innovations[0, :, 0], estimates.innovation_covs[0, :, 0, 0]
+    terms = -0.5 * (np.log(2.0 * math.pi * s) + v**2 / s)
+    counted = column.measured & (np.cumsum(column.measured) > model.n)
+    return np.bincount(blocks[counted], weights=terms[counted], minlength=BLOCKS)
+
+
+def filtered(model: StateSpaceModel, column: Column) -> Estimates:
+    """The estimates of the Kalman filter on a column."""
+    inputs = np.zeros((1, len(column.values) - 1, 0))
+    return run(KalmanFilter(model=model), filter_keys([0]), inputs, column.values[None, :, None])
+
+
+def _starts(objective: Objective, candidate: Sum, scales: Scales) -> list[np.ndarray]:
+    """Points from which searches begin, of all combinations of values and shares of noise in the roughness.
+
+    They are the likeliest ones that differ in the first number: a likelihood may have several maxima along it.
+    """
+    first, *further = (number.values(scales) for number in candidate.free)
+    noise = [share * scales.roughness**2 for share in SHARES]
+    best = []
+    for value in first:
+        points = [objective.coordinates.of(point) for point in product([value], *further, noise)]
+        best.append(max(points, key=objective.value))
+    return sorted(best, key=objective.value)[-SEARCHES:]
+
+
+def behind(candidate: Fitted, best: Fitted) -> tuple[float, float]:
+    """How much lower a candidate's likelihood on unseen blocks is, and the standard error of that."""
+    differences = best.held_out - candidate.held_out
+    return float(differences.sum()), float(np.std(differences, ddof=1) * math.sqrt(len(differences)))
+
+
+def _ties(candidate: Fitted, best: Fitted) -> bool:
+    loss, error = behind(candidate, best)
+    return loss <= TIE * error
+
+
+def _numbers(fitted: Fitted) -> tuple[Number, ...]:
+    """Values with intervals by the profile of the likelihood."""
+    coordinates, best = fitted.objective.coordinates, fitted.ascent
+    meanings = {number.name: number.meaning for number in fitted.sum.free}
+    ends = np.array(
+        [
+            [_end(fitted, index, limits[index]) for index in range(len(best.at))]
+            for limits in (coordinates.low, coordinates.high)
+        ]
+    )
+    inside = (ends[0] > coordinates.low) & (ends[1] < coordinates.high)
+    values, low, high = (coordinates.values(at) for at in (best.at, *ends))
+    rows = zip(coordinates.free, values.tolist(), low.tolist(), high.tolist(), inside.tolist(), strict=True)
+    return tuple(
+        Number(number.name, meanings.get(number.name, NOISE), value, least, most, number.unit, known)
+        for number, value, least, most, known in rows
+    )
+
+
+def _end(fitted: Fitted, index: int, limit: float) -> float:
+    """The coordinate towards `limit` from which on the profile has fallen by `FALL`, or the limit.
+
+    The search begins from the outermost maximum that is as likely: a profile may have several.
+    """
+    objective, best = fitted.objective, fitted.ascent
+    coordinates, fixed = objective.coordinates, np.arange(len(best.at)) == index
+    likely = [best, *(rival for rival in fitted.rivals if best.found.value - rival.found.value < FALL)]
+    outermost = min(likely, key=lambda maximum: abs(limit - maximum.at[index]))
+    first, at = float(outermost.at[index]), outermost.at
+
+    @cache
+    def beyond(coordinate: float) -> float:
+        """The root of the fall, nearly linear in the coordinate, less that of `FALL`."""
+        nonlocal at
+        start = np.where(fixed, coordinate, at)
+        profile = climb(objective, start, coordinates.low, coordinates.high, fixed=fixed, iterations=15)
+        fall = best.found.value - profile.found.value
+        if not math.isfinite(fall):
+            return FAR
+        at = profile.at
+        return math.sqrt(max(fall, 0.0)) - math.sqrt(FALL)
+
+    variance = float(np.linalg.pinv(best.found.information)[index, index])
+    reach, outer = float(np.clip(2.0 * math.sqrt(max(variance, 0.0)), 0.01, 3.0)), first
+    while outer != limit and beyond(outer) < 0.0:
+        inner, outer = outer, min(first + reach, limit) if limit > first else max(first - reach, limit)
+        if beyond(outer) > 0.0:
+            return float(brentq(beyond, inner, outer, xtol=PRECISION))
+        reach *= 2.0
+    return outer

@@ -1,0 +1,156 @@
+"""A Kalman filter as lines to paste: ours, FilterPy, pykalman, MATLAB, and a loop for a controller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from thruster_env.core.checks import one_of
+from thruster_env.model.affine import AffineModel
+
+
+def lines_of(language: str, model: AffineModel, gain: np.ndarray) -> str:
+    """The filter of a model without inputs and with one measurement as lines of a language.
+
+    Args:
+        language: a key of `LANGUAGES`.
+        model: F, H, Q, R, the first state and its covariance; the measurement's offset is subtracted from z.
+        gain: K (n,), the steady-state gain.
+
+    Raises:
+        ValueError: for another language.
+    """
+    return LANGUAGES[one_of("a language", language, tuple(LANGUAGES))](model, gain)
+
+
+def _python(model: AffineModel, gain: np.ndarray) -> str:
+    a, _, _, c, d = model.matrices()
+    return f"""import numpy as np
+import filters
+
+filter_ = filters.make_filter("kf", filters.affine_model(
+    a={_rows(a)},
+    b=np.zeros(({model.n}, 0)),
+    c={_rows(c)},
+    process_noise_cov={_rows(model.process_noise_cov)},
+    measurement_noise_cov={_rows(model.measurement_noise_cov)},
+    prior_mean={_numbers(model.prior_mean)},
+    prior_cov={_rows(model.prior_cov)},
+    measurement_offset={_numbers(d)},
+))"""
+
+
+def _filterpy(model: AffineModel, gain: np.ndarray) -> str:
+    a, _, _, c, d = model.matrices()
+    return f"""import numpy as np
+from filterpy.kalman import KalmanFilter
+
+kf = KalmanFilter(dim_x={model.n}, dim_z=1)
+kf.F = np.array({_rows(a)})
+kf.H = np.array({_rows(c)})
+kf.Q = np.array({_rows(model.process_noise_cov)})
+kf.R = np.array({_rows(model.measurement_noise_cov)})
+kf.x = np.array([{_numbers(model.prior_mean)}]).T
+kf.P = np.array({_rows(model.prior_cov)})
+# the first measurement updates the state at once: kf.update(z[0]{_less(d)}), then for each further one
+kf.predict()
+kf.update(z{_less(d)})"""
+
+
+def _pykalman(model: AffineModel, gain: np.ndarray) -> str:
+    a, _, _, c, d = model.matrices()
+    return f"""from pykalman import KalmanFilter
+
+kf = KalmanFilter(
+    transition_matrices={_rows(a)},
+    observation_matrices={_rows(c)},
+    transition_covariance={_rows(model.process_noise_cov)},
+    observation_covariance={_rows(model.measurement_noise_cov)},
+    observation_offsets={_numbers(d)},
+    initial_state_mean={_numbers(model.prior_mean)},
+    initial_state_covariance={_rows(model.prior_cov)},
+)
+means, covs = kf.filter(z)"""
+
+
+def _matlab(model: AffineModel, gain: np.ndarray) -> str:
+    a, _, _, c, d = model.matrices()
+    return f"""F = {_matlab_rows(a)};
+H = {_matlab_rows(c)};
+Q = {_matlab_rows(model.process_noise_cov)};
+R = {_matlab_rows(model.measurement_noise_cov)};
+x = {_matlab_rows(model.prior_mean[:, None])};
+P = {_matlab_rows(model.prior_cov)};
+for k = 1:numel(z)
+    if k > 1
+        x = F*x;
+        P = F*P*F' + Q;
+    end
+    if ~isnan(z(k))
+        S = H*P*H' + R;
+        K = P*H'/S;
+        x = x + K*(z(k) - H*x{_less(d)});
+        P = (eye({model.n}) - K*H)*P*(eye({model.n}) - K*H)' + K*R*K';
+    end
+end"""
+
+
+def _arduino(model: AffineModel, gain: np.ndarray) -> str:
+    a, _, _, c, d = model.matrices()
+    names = [f"x{i + 1}" for i in range(model.n)]
+    predicted = [_products(row, names) for row in a]
+    measured = _products(c[0], [f"p{i + 1}" for i in range(model.n)], float(d[0]))
+    state = ", ".join(f"{name} = {_c(value)}" for name, value in zip(names, model.prior_mean, strict=True))
+    lines = ["// steady-state Kalman filter: call once each sample with the measurement z", f"float {state};"]
+    lines.append("void filter(float z) {")
+    lines += [f"  float p{i + 1} = {terms};" for i, terms in enumerate(predicted)]
+    lines.append(f"  float v = z - ({measured});")
+    lines += [f"  {name} = p{i + 1} + {_c(k)} * v;" for i, (name, k) in enumerate(zip(names, gain, strict=True))]
+    return "\n".join([*lines, "}"])
+
+
+LANGUAGES: dict[str, Callable[[AffineModel, np.ndarray], str]] = {
+    "python": _python,
+    "filterpy": _filterpy,
+    "pykalman": _pykalman,
+    "matlab": _matlab,
+    "arduino": _arduino,
+}
+
+
+def _number(value: float) -> str:
+    return f"{float(value):.12g}"
+
+
+def _numbers(values: np.ndarray) -> str:
+    return f"[{', '.join(map(_number, values))}]"
+
+
+def _rows(matrix: np.ndarray) -> str:
+    return f"[{', '.join(map(_numbers, matrix))}]"
+
+
+def _matlab_rows(matrix: np.ndarray) -> str:
+    return f"[{'; '.join(' '.join(map(_number, row)) for row in matrix)}]"
+
+
+def _less(offset: np.ndarray) -> str:
+    """The subtraction of an offset, or nothing for zero."""
+    return "" if offset[0] == 0.0 else f" - {_number(offset[0])}"
+
+
+def _c(value: float) -> str:
+    """A number in C, single precision."""
+    text = f"{float(value):.8g}"
+    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
+
+
+def _products(row: np.ndarray, names: list[str], offset: float = 0.0) -> str:
+    """A sum of products without those of zero."""
+    terms = [
+        name if value == 1.0 else f"{_c(value)} * {name}"
+        for value, name in zip(row, names, strict=True)
+        if value != 0.0
+    ]
+    return " + ".join(terms + ([_c(offset)] if offset else [])) or "0.0f"
