@@ -368,6 +368,11 @@ class Sum(NamedTuple):
         )
 
 
+def is_named(name: str) -> bool:
+    """Whether a text is the name of a model, or a sum of such names."""
+    return all(part.strip().lower() in NAMED for part in name.split("+"))
+
+
 def named_model(name: str) -> Sum:
     """A model by name, such as "constant-velocity", or a sum, such as "constant + oscillator".
 

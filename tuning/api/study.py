@@ -19,6 +19,7 @@ from thruster_env.core.checks import short_repr
 from thruster_env.core.text_tables import plain_text
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.display import about, drawn, frame, html, number
+from tuning.api.fit import fit
 from tuning.api.held_out import HeldOut
 from tuning.api.markers import (
     FILTER,
@@ -36,6 +37,7 @@ from tuning.api.markers import (
 )
 from tuning.api.problems import problems_of
 from tuning.api.progress import console_for
+from tuning.api.read_logs import RecordedRuns
 from tuning.api.run import Tuning, aim_of, name_of, run_tuning, sampler_of, with_budget
 from tuning.evaluation.tuned import check_keepable
 from tuning.evaluation.worth import tuning_effect
@@ -48,6 +50,7 @@ from tuning.search.plan import Plan
 from tuning.search.space import Choice, untuned_choice
 from tuning.search.storage import storage_text
 from tuning.search.trials import is_consistent
+from tuning.series.column import column_alone
 
 if TYPE_CHECKING:
     import pandas
@@ -356,7 +359,8 @@ def tune(
     --full-q (and --full-r) to mse or log-score. `thruster methods` lists all methods.
 
     With --log the study uses recorded runs, cut into blocks of which every third is held out. It minimises the
-    negative log-likelihood of the innovations, unless the logs contain the true states.
+    negative log-likelihood of the innovations, unless the logs contain the true states. A log with one column of
+    numbers and no thruster is fitted by `thruster fit`.
 
     Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100
 
@@ -393,12 +397,18 @@ def tune(
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
-        `Study`: `filter`, `choice`, `held_out`, `save(path)`, `to_frame()`, `plot_history()`, `plot_errors()`.
+        `Study`: `filter`, `choice`, `held_out`, `save(path)`, `to_frame()`, `plot_history()`, `plot_errors()`;
+        of a log with one column of numbers what `tuning.fit` returns.
 
     Raises:
         ValueError: states the rule and the value.
         KeyboardInterrupt: after Ctrl-C before any trial is complete, or during the held-out evaluation.
     """
+    if isinstance(problem, RecordedRuns) and (column := column_alone(problem.files, problem.reading)) is not None:
+        if isinstance(out, str | Path):
+            rule = "out (--out) must be left out for a log with one column of numbers, which has no tuned file"
+            raise ValueError(f"{rule} (thruster fit), but got {short_repr(str(out))}")
+        return fit(column, **problem.reading, progress=progress)  # type: ignore[return-value]  # its own result
     if not isinstance(filter, str):
         raise ValueError(
             f"filter must be a name or 'module:object', by which trials keep it, but got {short_repr(filter)}"

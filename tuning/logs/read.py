@@ -10,6 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from filters.models import is_named
 from filters.tuned_file import check_preset_file, read_tuned_file, tune_options
 from thruster_env.core.checks import finite, short_repr
 from thruster_env.core.modules import is_code, object_named
@@ -184,7 +185,8 @@ def model_of_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any
         )
     if not logs_package().is_preset(model):
         rule = "a model must be an object, 'module:object' or a thruster's preset"
-        raise ValueError(f"{rule}, but got {short_repr(model)}")
+        way_out = " (thruster fit takes models of one column of numbers by name)" if is_named(str(model)) else ""
+        raise ValueError(f"{rule}, but got {short_repr(model)}{way_out}")
     return logs, None, model
 
 

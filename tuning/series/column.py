@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,8 +80,8 @@ def column_of(z: Any, dt: float | None = None, *, times: Any = None, column: str
     Raises:
         ValueError: states the rule and the value.
     """
-    source: Any = z if isinstance(z, str | PathLike | Mapping) or hasattr(z, "columns") else _as_columns(z, times)
-    is_file = isinstance(source, str | PathLike)
+    source: Any = z if isinstance(z, str | Path | Mapping) or hasattr(z, "columns") else _as_columns(z, times)
+    is_file = isinstance(source, str | Path)
     recorded = is_file and format_of(source) is not None
     if recorded:
         if column is None:
@@ -108,6 +108,24 @@ def _check_numbers(header: str, values: np.ndarray) -> None:
     count = int(np.count_nonzero(~np.isnan(values)))
     if count < LEAST_ROWS:
         raise ValueError(f"{header} must have at least {LEAST_ROWS} numbers, but has {count}")
+
+
+def column_alone(files: Any, reading: Mapping[str, Any]) -> str | Path | None:
+    """The file of a log that has one column of numbers beside its times, if nothing but dt is said of it.
+
+    Args:
+        files: of recorded runs.
+        reading: options by which they are read.
+    """
+    several = isinstance(files, list | tuple)
+    file = files[0] if several and len(files) == 1 else files
+    if not isinstance(file, str | Path) or not set(reading) <= {"dt"} or format_of(file) is not None:
+        return None
+    try:
+        _headers(read_table(file), None)
+    except ValueError:  # several columns, or none: whoever reads the log says what is wrong
+        return None
+    return file
 
 
 def _as_columns(z: Any, times: Any) -> Mapping[str, Any]:
