@@ -10,14 +10,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.engine.belief import Kernels, memory_places, own_place, row_access
+from filters.engine.belief import Kernels, filter_offset, memory_offsets, row_access
 from filters.filter import Filter
 from filters.pages.kernels import nothing_to_summarise
 from thruster_env.core.angles import wrapped
 from thruster_env.core.checks import at_least, positive, short_repr
 from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import Source, vector_reader, vector_writer, zeros_of
-from thruster_env.model.shape import Functions, Shape, constants_reader, innovation_of, number_places
+from thruster_env.model.shape import Functions, Shape, constants_reader, innovation_of, number_offsets
 
 INTERVALS = 100  # on either side, that are searched for a sign change
 HALVINGS = 60  # of an interval; also the steps of the golden section, which each shorten it to 0.618
@@ -103,10 +103,10 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     Extras: the open loop's state (n,), the output of the low-pass filter, and 1 once that has a value.
     """
     n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
-    layout, source, first_parameter = memory_places(n, m), number_places(n, m), own_place(shape)
-    substeps_place, step_place, likelihood_place = source.substeps, layout.step, layout.log_likelihood
-    smooth_place, known_place = layout.extras + n, layout.extras + n + 1
-    reach_place, share_place = first_parameter, first_parameter + 1
+    layout, source, first_parameter = memory_offsets(n, m), number_offsets(n, m), filter_offset(shape)
+    substeps_offset, step_offset, likelihood_offset = source.substeps, layout.step, layout.log_likelihood
+    smooth_offset, known_offset = layout.extras + n, layout.extras + n + 1
+    reach_offset, share_offset = first_parameter, first_parameter + 1
     read_open, store_open = vector_reader(n, layout.extras), vector_writer(n, layout.extras)
     (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     prior_mean, control = vector_reader(n, source.prior_mean), vector_reader(shape.inputs)
@@ -124,15 +124,15 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     @inlined
     def estimate(row, numbers):
         x = read_open(row)
-        if inverts and row[known_place] > 0.0:
-            x = solve(x, row[smooth_place], constants(numbers), numbers[reach_place])
+        if inverts and row[known_offset] > 0.0:
+            x = solve(x, row[smooth_offset], constants(numbers), numbers[reach_offset])
         store_mean(row, x)
 
     @inlined
     def start(memory, numbers, size):
         row, _, _ = memory
         store_open(row, prior_mean(numbers))
-        row[smooth_place] = row[known_place] = 0.0
+        row[smooth_offset] = row[known_offset] = 0.0
         estimate(row, numbers)
         store_cov(row, no_cov())
 
@@ -140,22 +140,22 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         x, v, c = read_open(row), control(u), constants(numbers)
-        for _ in range(int(numbers[substeps_place])):
+        for _ in range(int(numbers[substeps_offset])):
             x = transition(x, v, c)
         store_open(row, x)
         estimate(row, numbers)
-        row[step_place] += 1.0
+        row[step_offset] += 1.0
 
     @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
         store_innovation(row, difference(measured(z), observe(read_mean(row), constants(numbers))))
         store_s(row, no_s())
-        row[likelihood_place] = 0.0
+        row[likelihood_offset] = 0.0
         if inverts and z[channel] == z[channel]:
-            share = numbers[share_place] * row[known_place]
-            row[smooth_place] = blend(row[smooth_place], z[channel], share)
-            row[known_place] = 1.0
+            share = numbers[share_offset] * row[known_offset]
+            row[smooth_offset] = blend(row[smooth_offset], z[channel], share)
+            row[known_offset] = 1.0
             estimate(row, numbers)
 
     return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, extras=n + 2)
@@ -217,9 +217,9 @@ class Inversion(OpenLoop):
 
     def __post_init__(self):
         model = self.model
-        i = place_of("inverted", self.inverted, model.n)
+        i = index_of("inverted", self.inverted, model.n)
         object.__setattr__(self, "inverted", i)
-        object.__setattr__(self, "channel", place_of("channel", self.channel, model.m))
+        object.__setattr__(self, "channel", index_of("channel", self.channel, model.m))
         if self.reach is not None:
             reach = self.reach
         elif model.state_low is not None and model.state_high is not None:
@@ -274,7 +274,7 @@ class LowPass(Inversion):
         return self._numbers(math.exp(-1.0 / self.time_constant))
 
 
-def place_of(name: str, value, count: int) -> int:
+def index_of(name: str, value, count: int) -> int:
     """Return an index as 0 ... count - 1, negative ones counted from the end; raise ValueError beyond."""
     index = at_least(name, value, -count)
     if index >= count:
@@ -282,8 +282,8 @@ def place_of(name: str, value, count: int) -> int:
     return index % count
 
 
-def places_of(name: str, indices, count: int) -> tuple[int, ...]:
+def indices_of(name: str, indices, count: int) -> tuple[int, ...]:
     """Return a list of indices as 0 ... count - 1, in order, each once; raise ValueError for anything else."""
     if not isinstance(indices, Sequence | np.ndarray) or isinstance(indices, str):
         raise ValueError(f"{name} must be a list of indices, but got {short_repr(indices)}")
-    return tuple(sorted({place_of(name, index, count) for index in indices}))
+    return tuple(sorted({index_of(name, index, count) for index in indices}))

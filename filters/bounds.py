@@ -25,7 +25,7 @@ from thruster_env.model.shape import (
     Functions,
     Shape,
     constants_reader,
-    number_places,
+    number_offsets,
     observation_slopes,
     padded,
     transition_slopes,
@@ -338,8 +338,8 @@ def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
     (begin, _, _), disturb = truth_steps(functions, shape), noise_step(n, m)
     state, store_state = vector_reader(n), vector_writer(n)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
-    scales = vector_reader(n, number_places(n, m).scales)
-    substeps, room = number_places(n, m).substeps, padded(max(n, m), GROUP)
+    scales = vector_reader(n, number_offsets(n, m).scales)
+    substeps, room = number_offsets(n, m).substeps, padded(max(n, m), GROUP)
     times, identity = multiplier(n, n, n), matrix_reader(n, n)
     read_weight_n, read_weight_m = matrix_reader(n, n), matrix_reader(m, m)
     quadratic_n, quadratic_m = quadratic_form(n, n), quadratic_form(m, n)

@@ -54,7 +54,7 @@ class Filter:
 
     @property
     def own_parameters(self) -> tuple[float, ...]:
-        """The filter's own parameters, packed behind the model's: from `belief.own_place` on."""
+        """The filter's own parameters, packed behind the model's: from `belief.filter_offset` on."""
         return ()
 
     @property

@@ -16,7 +16,7 @@ from filters.gaussian.multiple_models import MultipleModelFilter
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import as_floats
 from thruster_env.core.sources import as_value
-from thruster_env.model.shape import number_places, observation_slopes, transition_slopes
+from thruster_env.model.shape import number_offsets, observation_slopes, transition_slopes
 from thruster_env.model.state_space import StateSpaceModel
 
 Flaw = tuple[np.ndarray, str]  # which states, (n,) bool, and the cause
@@ -228,7 +228,7 @@ def _model_of_numbers(model: StateSpaceModel, numbers: np.ndarray | None) -> Sta
     """The model with the Q, R and constants that a session was set to."""
     if numbers is None or np.array_equal(numbers[: len(model.numbers)], model.numbers):
         return model
-    at, n, m, form = number_places(model.n, model.m), model.n, model.m, type(model.constants)
+    at, n, m, form = number_offsets(model.n, model.m), model.n, model.m, type(model.constants)
     constants = numbers[at.constants : at.constants + model.shape.constants].tolist()
     changes: dict[str, Any] = {
         "process_noise_cov": numbers[at.q : at.q + n * n].reshape(n, n),
@@ -327,7 +327,7 @@ class Starts(NamedTuple):
 
     def numbers(self, model: StateSpaceModel) -> np.ndarray:
         """The row of numbers of each trajectory's model, (B, count): the model's with other priors."""
-        rows, layout, n = np.tile(model.numbers, (len(self.free), 1)), number_places(model.n, model.m), model.n
+        rows, layout, n = np.tile(model.numbers, (len(self.free), 1)), number_offsets(model.n, model.m), model.n
         rows[self.free, layout.prior_mean : layout.prior_mean + n] = self.means[self.free]
         rows[self.free, layout.prior_cov : layout.prior_cov + n * n] = self.covs[self.free].reshape(-1, n * n)
         return rows

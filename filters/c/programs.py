@@ -14,7 +14,7 @@ from filters.algebra.matrices import Matrix, evaluate
 from filters.algebra.operations import factor, quotient
 from filters.algebra.points import dot
 from filters.engine.batch import run
-from filters.engine.belief import memory_places
+from filters.engine.belief import memory_offsets
 from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
 from filters.filter import Filter
 from filters.pages.kernels import MembersMemory, numbers_of, stages_of
@@ -204,7 +204,7 @@ def programs_of(filter_: Filter) -> FilterPrograms:
 def _row_programs(paged: FilterWithPage) -> FilterPrograms:
     model, page, numbers = paged.kernel_model, paged.written_page, paged.numbers
     shape = model.shape
-    layout, memory = memory_places(shape.n, shape.m), RowMemory(shape, page)
+    layout, memory = memory_offsets(shape.n, shape.m), RowMemory(shape, page)
     equations = Equations(model.functions, memory, constants_move=False, trace=True)
     stages = [stage.of_rows for stage in stages_of(page, memory, equations)]
     extras = {name: matrix.shape for name, matrix in memory.extras.items()}
@@ -235,7 +235,7 @@ def _member_programs(paged: EnsembleFilter) -> FilterPrograms:
     shape, memory = model.shape, MembersMemory(model.shape, page)
     stages = stages_of_members(page, memory, Equations(model.functions, memory, constants_move=False, trace=True))
     outputs = {target: matrix for name in stages for target, matrix in stages[name].stores[0]}
-    layout = memory_places(shape.n, shape.m)
+    layout = memory_offsets(shape.n, shape.m)
     v, s = (outputs[Place("rows", at)] for at in (layout.innovation, layout.innovation_cov))
     stages["update"].values[Place("rows", NIS)] = _nis(v, s)
     extras = {name: matrix.shape for name, matrix in memory.extras.items()}
@@ -294,7 +294,7 @@ def _where(
 ) -> Callable[[Place], Place]:
     """The function from a place to its expression in C: in the filter, in X, or in the argument u or z."""
     n, m = shape.n, shape.m
-    layout = memory_places(n, m)
+    layout = memory_offsets(n, m)
     parts = [
         (NIS, (), "filter->nis"),
         (layout.mean, (n,), mean),

@@ -37,7 +37,7 @@ from thruster_env.model.shape import (
     Functions,
     Shape,
     constants_reader,
-    number_places,
+    number_offsets,
     observation_slopes,
     starts_of,
     transition_slopes,
@@ -67,7 +67,7 @@ class Memory(NumbersMemory):
     """
 
     def __init__(self, shape: Shape, page: Page):
-        n, m, layout = shape.n, shape.m, number_places(shape.n, shape.m)
+        n, m, layout = shape.n, shape.m, number_offsets(shape.n, shape.m)
         tail = layout.constants + shape.constants
         self.tail, self.predicted_tail = tail, tail + m + 2
         own_at = self.predicted_tail + m + 2
@@ -307,7 +307,7 @@ def _accumulator(
     inputs_count, channels, informative = memory.shape.inputs, memory.shape.m, wanted.information
     first_true, true_states = memory.true, memory.shape.n if wanted.of_truth else 0
     nan = np.nan
-    substeps = number_places(memory.shape.n, memory.shape.m).substeps
+    substeps = number_offsets(memory.shape.n, memory.shape.m).substeps
 
     def accumulate(
         inputs,

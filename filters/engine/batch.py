@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from filters.engine.belief import Kernels, memory_places, vector_like
+from filters.engine.belief import Kernels, memory_offsets, vector_like
 from filters.engine.compile import (
     PREDICT,
     START,
@@ -205,7 +205,7 @@ class Beliefs:
         """Allocate the memory of `count` beliefs; `start` comes next."""
         self._filter = filter_
         self._kernels, self._size, self._numbers = filter_.kernels(), filter_.size, filter_.numbers
-        self._places = memory_places(self._kernels.n, self._kernels.m)
+        self._places = memory_offsets(self._kernels.n, self._kernels.m)
         row, table, _ = self._own = new_memory(self._kernels, self._size)
         self._rows = np.zeros((count, len(row)))
         self._tables = np.zeros((count, self._kernels.kept_rows, table.shape[1]))

@@ -39,7 +39,7 @@ from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, i
 from thruster_env.core.sources import Source, matrix_reader, matrix_writer, vector_reader, vector_writer
 from thruster_env.core.streams import truncated_normal
 from thruster_env.model.quantities import Bound
-from thruster_env.model.shape import Shape, number_places, starts_of
+from thruster_env.model.shape import Shape, number_offsets, starts_of
 
 
 class Belief(NamedTuple):
@@ -91,7 +91,7 @@ class Kernels(NamedTuple):
     `row` is laid out by `filters.engine.belief`, `numbers` by `thruster_env.model.shape`; `table` is
     (table_rows, padded size), its first n rows the members, without columns for filters without an ensemble;
     `draws` has room for `draws_per_member` normals a member. Besides mean and covariance a belief keeps the first
-    `kept_rows` rows of the table and `extras` values of the row, from `memory_places(n, m).extras` on; then come
+    `kept_rows` rows of the table and `extras` values of the row, from `memory_offsets(n, m).extras` on; then come
     `scratch` values that it does not keep.
 
     `vectors`, if there are any, are four functions (rows, given, numbers) for eight beliefs side by side: the
@@ -121,7 +121,7 @@ class Kernels(NamedTuple):
 # Layout of the memory of a filter.
 
 
-class MemoryPlaces(NamedTuple):
+class MemoryOffsets(NamedTuple):
     """Offsets of the parts of a filter's row, for n states and m measurements."""
 
     mean: int  # (n,)
@@ -138,9 +138,9 @@ class MemoryPlaces(NamedTuple):
 
 
 @cache
-def memory_places(n: int, m: int) -> MemoryPlaces:
+def memory_offsets(n: int, m: int) -> MemoryOffsets:
     """Offsets in the row of a filter."""
-    return MemoryPlaces(*starts_of(n, n * n, 1, 1, 1, 1, m, m * m, 1, n * m))
+    return MemoryOffsets(*starts_of(n, n * n, 1, 1, 1, 1, m, m * m, 1, n * m))
 
 
 @lru_cache(maxsize=64)
@@ -155,7 +155,7 @@ def row_access(shape: Shape) -> tuple[tuple[Callable, Callable], ...]:
         `write(row, value)` of the innovation (m,) and its covariance (m, m).
     """
     n, m = shape.n, shape.m
-    layout = memory_places(n, m)
+    layout = memory_offsets(n, m)
     return (
         (vector_reader(n, layout.mean), matrix_reader(n, n, layout.cov)),
         (angle_writer(layout.mean, shape.state_angles), matrix_writer(n, n, layout.cov)),
@@ -163,9 +163,9 @@ def row_access(shape: Shape) -> tuple[tuple[Callable, Callable], ...]:
     )
 
 
-def own_place(shape: Shape) -> int:
+def filter_offset(shape: Shape) -> int:
     """Offset of the filter's own parameters in the packed row, behind those of its model."""
-    return number_places(shape.n, shape.m).constants + shape.constants
+    return number_offsets(shape.n, shape.m).constants + shape.constants
 
 
 # Checks of the arguments of filters: beliefs, keys, inputs and measurements.
@@ -316,7 +316,7 @@ def row_magnitude(n: int, m: int) -> Callable:
     A negative variance, which rounding may leave in a covariance of very unequal numbers, counts as a number
     beyond LARGEST, and so does NaN.
     """
-    layout = memory_places(n, m)
+    layout = memory_offsets(n, m)
     beyond = 10 * LARGEST
     variances = [layout.cov + i * (n + 1) for i in range(n)]
     source = Source("magnitude", "row", work=layout.gain)
@@ -336,8 +336,8 @@ def row_magnitude(n: int, m: int) -> Callable:
 def restart_if_lost(kernels: Kernels) -> Callable:
     """Return `restart(memory, numbers, size)`: replace a diverged belief by the prior, and count the restart."""
     n, m, start, summarise = kernels.n, kernels.m, kernels.start, kernels.summarise
-    layout, r_place = memory_places(n, m), number_places(n, m).r
-    innovation, s_place, log_likelihood = layout.innovation, layout.innovation_cov, layout.log_likelihood
+    layout, r_offset = memory_offsets(n, m), number_offsets(n, m).r
+    innovation, s_offset, log_likelihood = layout.innovation, layout.innovation_cov, layout.log_likelihood
     divergences, magnitude = layout.divergences, row_magnitude(n, m)
 
     @inlined
@@ -351,7 +351,7 @@ def restart_if_lost(kernels: Kernels) -> Callable:
             for i in range(m):
                 row[innovation + i] = 0.0
             for i in range(m * m):
-                row[s_place + i] = numbers[r_place + i]
+                row[s_offset + i] = numbers[r_offset + i]
 
     return restart
 
@@ -368,7 +368,7 @@ def bounded_kernels(kernels: Kernels, bounds: tuple[Bound, ...], bounded_by: str
 
     Its unconstrained mean (n,) and covariance (n, n) are the last of `Belief.extras`.
     """
-    n, layout = kernels.n, memory_places(kernels.n, kernels.m)
+    n, layout = kernels.n, memory_offsets(kernels.n, kernels.m)
     mean, free = layout.mean, layout.extras + kernels.extras + kernels.scratch
     size = n + n * n  # mean and covariance are neighbours
     plain_start, plain_predict, plain_update = kernels.start, kernels.predict, kernels.update

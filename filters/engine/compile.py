@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from filters.engine.belief import LARGEST, Kernels, memory_places, restart_if_lost
+from filters.engine.belief import LARGEST, Kernels, memory_offsets, restart_if_lost
 from thruster_env.core.compiled import CompiledOrPython, direct, function_fingerprint, is_interpreting
 from thruster_env.core.streams import GROUP
-from thruster_env.model.shape import LANES, number_places, padded
+from thruster_env.model.shape import LANES, number_offsets, padded
 
 if TYPE_CHECKING:
     from thruster_env.graphs.machine_code import Code
@@ -35,10 +35,10 @@ def build_side_by_side(kernels: Kernels) -> Callable:
     """
     n, m, start = kernels.n, kernels.m, kernels.start
     begin, advance, finish, update = kernels.vectors
-    layout, source, width, groups = memory_places(n, m), number_places(n, m), LANES, GROUPS
+    layout, source, width, groups = memory_offsets(n, m), number_offsets(n, m), LANES, GROUPS
     mean, cov, innovation, s = layout.mean, layout.cov, layout.innovation, layout.innovation_cov
     divergences, log_likelihood, substeps = layout.divergences, layout.log_likelihood, source.substeps
-    q_place, r_place, checked = source.q, source.r, layout.gain
+    q_offset, r_offset, checked = source.q, source.r, layout.gain
     length, restart = row_length(kernels), restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, begin, advance, finish, update, within=__name__)
 
@@ -65,7 +65,7 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                                 us[g, i * width + j] = inputs[b + min(g * width + j, count - 1), k - 1, i]
                     if qs.shape[0] > 0:
                         for i in range(qs.shape[1]):
-                            numbers[q_place + i] = qs[k - 1, i]
+                            numbers[q_offset + i] = qs[k - 1, i]
                     for g in range(used):
                         begin(rows[g], us[g], numbers)
                     for _ in range(int(numbers[substeps])):
@@ -75,7 +75,7 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                         finish(rows[g], us[g], numbers)
                 if rs.shape[0] > 0:
                     for i in range(rs.shape[1]):
-                        numbers[r_place + i] = rs[k, i]
+                        numbers[r_offset + i] = rs[k, i]
                 for g in range(used):
                     for j in range(width):
                         for i in range(m):
@@ -128,7 +128,7 @@ REFUSED = -1  # the result for an input that is not finite or an infinite measur
 def build_operation(kernels: Kernels) -> Callable:
     """`operation` as a Python function."""
     start, predict, update, summarise = kernels.start, kernels.predict, kernels.update, kernels.summarise
-    layout, m = memory_places(kernels.n, kernels.m), kernels.m
+    layout, m = memory_offsets(kernels.n, kernels.m), kernels.m
     step, divergences = layout.step, layout.divergences
     restart = restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, predict, update, within=__name__)
@@ -161,11 +161,11 @@ def build_operation(kernels: Kernels) -> Callable:
 
 def _build_batch(kernels: Kernels) -> Callable:
     n, m, start, predict, update = kernels.n, kernels.m, kernels.start, kernels.predict, kernels.update
-    layout = memory_places(n, m)
+    layout = memory_offsets(n, m)
     mean, cov, innovation, s = layout.mean, layout.cov, layout.innovation, layout.innovation_cov
     key_0, key_1, step, divergences = layout.key_0, layout.key_1, layout.step, layout.divergences
     log_likelihood = layout.log_likelihood
-    q_place, r_place = number_places(n, m).q, number_places(n, m).r
+    q_offset, r_offset = number_offsets(n, m).q, number_offsets(n, m).r
     restart = restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, predict, update, within=__name__)
 
@@ -188,13 +188,13 @@ def _build_batch(kernels: Kernels) -> Callable:
                         u[i] = inputs[b, k - 1, i]
                     if qs.shape[0] > 0:
                         for i in range(qs.shape[1]):
-                            numbers[q_place + i] = qs[k - 1, i]
+                            numbers[q_offset + i] = qs[k - 1, i]
                     predict(memory, u, numbers, size)
                 for i in range(m):
                     z[i] = measurements[b, k, i]
                 if rs.shape[0] > 0:
                     for i in range(rs.shape[1]):
-                        numbers[r_place + i] = rs[k, i]
+                        numbers[r_offset + i] = rs[k, i]
                 update(memory, z, numbers, size)
                 restart(memory, numbers, size)
                 for i in range(n):
@@ -280,7 +280,7 @@ def _code_side_by_side(kernels: Kernels) -> Code | None:
 
 def row_length(kernels: Kernels) -> int:
     """Length of the row of a belief."""
-    return memory_places(kernels.n, kernels.m).extras + kernels.extras + kernels.scratch
+    return memory_offsets(kernels.n, kernels.m).extras + kernels.extras + kernels.scratch
 
 
 def new_memory(kernels: Kernels, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -16,15 +16,15 @@ from filters.engine.belief import (
     LostBelief,
     check_belief,
     checked_key,
-    memory_places,
-    own_place,
+    filter_offset,
+    memory_offsets,
     vector_like,
 )
 from filters.engine.compile import PREDICT, REFUSED, START, UPDATE, new_memory, operation_on
 from thruster_env.core.checks import covariance, finite, positive
 from thruster_env.logs.log import sample_time_place
 from thruster_env.model.continuous import same_dt
-from thruster_env.model.shape import number_places, with_root
+from thruster_env.model.shape import number_offsets, with_root
 
 if TYPE_CHECKING:
     from filters.filter import Filter
@@ -67,10 +67,10 @@ class Session:
         self._filter = filter_
         kernels, model, size = filter_.kernels(), filter_.kernel_model, filter_.size
         n, m = kernels.n, kernels.m
-        layout = memory_places(n, m)
+        layout = memory_offsets(n, m)
         self._name, self._kernels = filter_.name, kernels
         self._numbers, self._size, self._places = filter_.numbers, size, layout
-        self._kept_rows, self._noise_places = kernels.kept_rows, number_places(n, m)
+        self._kept_rows, self._noise_places = kernels.kept_rows, number_offsets(n, m)
         self._memory = new_memory(kernels, size)
         self._row, self._table, _ = self._memory
         self._extras = self._row[layout.extras : layout.extras + kernels.extras]
@@ -182,7 +182,7 @@ class Session:
 
     def set_parameter(self, name: str, value: float) -> None:
         """Use another value of one of the filter's parameters from now on; ValueError for one that it lacks."""
-        offset, names = own_place(self._filter.kernel_model.shape), []
+        offset, names = filter_offset(self._filter.kernel_model.shape), []
         page = getattr(self._filter, "written_page", None)
         for known, shape in () if page is None else page.own:
             if known == name and not shape:

@@ -19,7 +19,7 @@ from filters.algebra.members import mean
 from filters.algebra.operations import mask_missing, present, uncorrelated, wrap
 from filters.algebra.points import root
 from filters.algebra.roots import forward_quotient
-from filters.engine.belief import Kernels, memory_places, own_place
+from filters.engine.belief import Kernels, filter_offset, memory_offsets
 from filters.ensembles.ensemble import compare, expect
 from filters.ensembles.stochastic import DeterministicUpdateFilter, LocalisedFilter, with_rotation
 from filters.pages.kernels import MembersMemory, Stage, extras_size, members_kernels, stored
@@ -128,13 +128,13 @@ def with_unit_noise(page: Page, memory: MembersMemory, model) -> dict[str, Stage
     y, M = expect(model, memory.x, memory.z), root(uncorrelated(measured, model.R))
     v = mask_missing(measured, wrap(memory.z - mean(y), model.measurement_angles))
     rows = input_matrix(Place("table", n), (m,), member=True, like=memory.x)
-    target = memory.read("rows", scratch_place(page, memory.shape), m)
+    target = memory.read("rows", scratch_offset(page, memory.shape), m)
     return {"update": stored((forward_quotient(M, y - mean(y)), forward_quotient(M, v)), (rows, target))}
 
 
-def scratch_place(page: Page, shape: Shape) -> int:
+def scratch_offset(page: Page, shape: Shape) -> int:
     """The offset of scratch in a filter's row, after the extras of a page."""
-    return memory_places(shape.n, shape.m).extras + extras_size(page, shape)
+    return memory_offsets(shape.n, shape.m).extras + extras_size(page, shape)
 
 
 @lru_cache(maxsize=64)
@@ -146,9 +146,9 @@ def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: C
     """
     plain, n, m = members_kernels(page, functions, shape), shape.n, shape.m
     look, rows, _ = works_of(page, functions, shape, with_unit_noise, n + m)["update"]
-    tell, summarise, first = plain.update, plain.summarise, scratch_place(page, shape)
+    tell, summarise, first = plain.update, plain.summarise, scratch_offset(page, shape)
     serial, move = moves_of is not None, gaussian_moves if moves_of is None else moves_of
-    offsets = page.parameter_offsets(own_place(shape))
+    offsets = page.parameter_offsets(filter_offset(shape))
     taper, relaxation, tail = offsets["taper"], offsets["relaxation"], offsets["tail"]
 
     @inlined

@@ -18,7 +18,7 @@ from typing import ClassVar, NamedTuple
 from filters.algebra.matrices import input_matrix
 from filters.algebra.members import covariance, mean, on_branch
 from filters.algebra.operations import divide, geometric_mean, mask_missing, present, wrap
-from filters.engine.belief import Kernels, memory_places, own_place
+from filters.engine.belief import Kernels, filter_offset, memory_offsets
 from filters.ensembles.by_parts import relax_row, row_moments, stretch_row
 from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, expect, propagate
 from filters.pages.kernels import MembersMemory, Stage, stored
@@ -29,7 +29,7 @@ from thruster_env.core.checks import at_least
 from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from thruster_env.graphs.programs import Place
-from thruster_env.model.shape import Functions, Shape, number_places
+from thruster_env.model.shape import Functions, Shape, number_offsets
 
 MOST_ITERATIONS = 20  # which programs repeat without a loop
 LONGEST_WINDOW = 1000  # steps
@@ -67,7 +67,7 @@ class WindowPlaces(NamedTuple):
 def window_places(shape: Shape, length: int) -> WindowPlaces:
     """Layout of a window of `length` steps."""
     n, m, rows = shape.n, shape.m, shape.n * (length + 1)
-    iterate, first = n + rows, memory_places(n, m).extras
+    iterate, first = n + rows, memory_offsets(n, m).extras
     slopes, v = iterate + rows, first + 1 + length * (shape.inputs + shape.constants)
     return WindowPlaces(n, iterate, slopes, slopes + m, slopes + 2 * m, first, first + 1, v + m + m * m, v, v + m)
 
@@ -78,7 +78,7 @@ def window_stages(length: int) -> Callable:
 
     def stages(page: Page, memory: MembersMemory, model) -> dict[str, Stage]:
         m, z, layout = memory.shape.m, memory.z, window_places(memory.shape, length)
-        row = memory_places(memory.shape.n, m)
+        row = memory_offsets(memory.shape.n, m)
         Y, B = (
             input_matrix(Place("table", at), (m,), member=True, like=memory.x)
             for at in (layout.slopes, layout.pull)
@@ -141,18 +141,18 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     works = works_of(page, functions, shape, window_stages(length), at.scratch)
     names = "start", "propagate", "draw", "add_process_noise", "summarise", "update", "again"
     begin, propagate, draw, add_process_noise, moments_of, look, again = (works[name].work for name in names)
-    row_places, substeps = memory_places(n, m), number_places(n, m).substeps
-    step_place, key_0, key_1 = row_places.step, row_places.key_0, row_places.key_1
-    offsets = page.parameter_offsets(own_place(shape))
+    row_offsets, substeps = memory_offsets(n, m), number_offsets(n, m).substeps
+    step_offset, key_0, key_1 = row_offsets.step, row_offsets.key_0, row_offsets.key_1
+    offsets = page.parameter_offsets(filter_offset(shape))
     inflation, relaxation, rows = offsets["inflation"], offsets["relaxation"], n * (length + 1)
-    window, iterate, slopes, pulls, _, steps, inputs, then_place, _, _ = at
-    constants, constants_place = shape.constants, number_places(n, m).constants
-    count, size_of_step = own_place(shape) + page.own_size, p + shape.constants
+    window, iterate, slopes, pulls, _, steps, inputs, then_offset, _, _ = at
+    constants, constants_offset = shape.constants, number_offsets(n, m).constants
+    count, size_of_step = filter_offset(shape) + page.own_size, p + shape.constants
 
     @inlined
     def start(memory, numbers, size):
         row, table, draws = memory
-        fill_normals(draws, n * table.shape[1], row[step_place], FILTER_PRIOR, row[key_0], row[key_1])
+        fill_normals(draws, n * table.shape[1], row[step_offset], FILTER_PRIOR, row[key_0], row[key_1])
         begin(row, numbers, numbers, table, draws, size)
         for k in range(1 + length * size_of_step):
             row[steps + k] = 0.0
@@ -165,12 +165,12 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     def move(memory, source, k, numbers, size):
         """Propagate the members by step k of the window that begins at row `source`: start, then noise."""
         row, table, draws = memory
-        first, then, width = inputs + k * size_of_step, row[then_place : then_place + count], table.shape[1]
+        first, then, width = inputs + k * size_of_step, row[then_offset : then_offset + count], table.shape[1]
         u = row[first : first + p]
         for i in range(count):
             then[i] = numbers[i]
         for i in range(constants):
-            then[constants_place + i] = row[first + p + i]
+            then[constants_offset + i] = row[first + p + i]
         for i in range(n):
             for j in range(width):
                 draws[i * width + j] = table[source + (k + 1) * n + i, j]
@@ -202,7 +202,7 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
         for i in range(p):
             row[first + i] = u[i]
         for i in range(constants):
-            row[first + p + i] = numbers[constants_place + i]
+            row[first + p + i] = numbers[constants_offset + i]
         copy_rows(table, iterate, window + (k + 1) * n, n)
         row[steps] += 1.0
         if numbers[inflation] != 1.0:
@@ -212,8 +212,8 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     @inlined
     def predict(memory, u, numbers, size):
         row, table, draws = memory
-        row[step_place] += 1.0
-        fill_normals(draws, n * table.shape[1], row[step_place], FILTER_PROCESS, row[key_0], row[key_1])
+        row[step_offset] += 1.0
+        fill_normals(draws, n * table.shape[1], row[step_offset], FILTER_PROCESS, row[key_0], row[key_1])
         draw(row, u, numbers, table, draws, size)
         full, k = row[steps] == length, 0
         if not full:

@@ -11,7 +11,7 @@ import numpy as np
 
 from filters.algebra.members import centred
 from filters.algebra.operations import divide
-from filters.engine.belief import Kernels, memory_places
+from filters.engine.belief import Kernels, memory_offsets
 from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, propagate
 from filters.pages.page import Page
 from thruster_env.core.checks import positive, switch
@@ -155,8 +155,8 @@ def rotator(n: int, m: int) -> Callable:
     condition estimators"; for ensembles: Sakov, Oke (2008), "Implications of the form of the ensemble
     transformation in the ensemble square root filters".
     """
-    layout = memory_places(n, m)
-    step_place, key_0, key_1 = layout.step, layout.key_0, layout.key_1
+    layout = memory_offsets(n, m)
+    step_offset, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
     @inlined
     def rotate(memory, size):
@@ -171,7 +171,7 @@ def rotator(n: int, m: int) -> Callable:
             if turn == 0:
                 for first in range(1, size - 1):
                     # One counter for each vector of each step.
-                    count = row[step_place] * size + first
+                    count = row[step_offset] * size + first
                     fill_normals(draws, size, count, FILTER_ROTATION, row[key_0], row[key_1])
                     norm = 0.0
                     for j in range(first, size):
@@ -179,7 +179,7 @@ def rotator(n: int, m: int) -> Callable:
                     # The reflection in v + |v| e takes the random vector v to the first axis e.
                     draws[first] += norm**0.5 if draws[first] >= 0.0 else -(norm**0.5)
                     reflect(table, n, first, size, draws)
-                fill_normals(draws, size, row[step_place] * size, FILTER_ROTATION, row[key_0], row[key_1])
+                fill_normals(draws, size, row[step_offset] * size, FILTER_ROTATION, row[key_0], row[key_1])
                 for j in range(1, size):
                     if draws[j] < 0.0:
                         for i in range(n):

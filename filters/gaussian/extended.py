@@ -16,7 +16,7 @@ from filters.algebra import roots
 from filters.algebra.operations import divide, eye, joseph, mask_missing, present, sym, uncorrelated, wrap
 from filters.algebra.points import density, log_density, root, square
 from filters.algebra.roots import factor_of, forward_quotient, hstack, part, triangle, vstack, zeros
-from filters.baselines import places_of
+from filters.baselines import indices_of
 from filters.pages.page import Page
 from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import at_least, between, one_of, positive, vector
@@ -297,7 +297,7 @@ class SchmidtKalmanFilter(PageFilter):
     considered: Any = ()
 
     def __post_init__(self):
-        considered = places_of("considered", self.considered, self.model.n)
+        considered = indices_of("considered", self.considered, self.model.n)
         object.__setattr__(self, "considered", considered)
 
     @cached_property

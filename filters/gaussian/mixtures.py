@@ -19,8 +19,8 @@ import numpy as np
 
 from filters.algebra.operations import choose, exceeds, present
 from filters.algebra.points import dot, log_density, outer
-from filters.baselines import place_of
-from filters.engine.belief import Belief, Kernels, memory_places, own_place
+from filters.baselines import index_of
+from filters.engine.belief import Belief, Kernels, filter_offset, memory_offsets
 from filters.filter import Filter
 from filters.gaussian import extended
 from filters.gaussian.extended import ExtendedKalmanFilter
@@ -37,7 +37,7 @@ from filters.pages.kernels import (
     works_of,
 )
 from filters.pages.page import Equations, PagedModel, RowMemory
-from thruster_env.core.angles import places_of, whole_turns, wrapped
+from thruster_env.core.angles import angle_indices, whole_turns, wrapped
 from thruster_env.core.checks import at_least, one_of, short_repr
 from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import Source, lower_pairs
@@ -99,7 +99,7 @@ def blender(
     blend = source.function()
     if not any(angles):
         return blend
-    align, angle_places = part_aligner(parts, x, angles), places_of(angles)
+    align, angle_places = part_aligner(parts, x, angles), angle_indices(angles)
 
     @inlined
     def blend_aligned(row, weights, target):
@@ -113,9 +113,9 @@ def blender(
 
 
 @cache
-def part_aligner(parts: Parts, x_place: int, angles: tuple[bool, ...]) -> Callable:
+def part_aligner(parts: Parts, x_offset: int, angles: tuple[bool, ...]) -> Callable:
     """Return `align(row, weights)`: put angles of the vector x of all parts on one branch, around their mean."""
-    (_, stride, count), angle_offsets = parts, places_of(angles, parts.first + x_place)
+    (_, stride, count), angle_offsets = parts, angle_indices(angles, parts.first + x_offset)
 
     @inlined
     def align(row, weights):
@@ -229,7 +229,7 @@ def mixture_kernels(
 
     Extras: mean, covariance, innovation, its covariance and log-likelihood of each part; then the weights.
     """
-    n, m, layout, prior = shape.n, shape.m, memory_places(shape.n, shape.m), prior_start(shape)
+    n, m, layout, prior = shape.n, shape.m, memory_offsets(shape.n, shape.m), prior_start(shape)
     belief, length, wide = n + n * n, prod(own_shape), max(shape.inputs, m)
     level = belief + m + m * m
     parts = Parts(layout.extras, level + 1, count)
@@ -262,8 +262,8 @@ def mixture_kernels(
         *(parts, m, belief, belief + m, shape.measurement_angles), between=page.between, wraps=False
     )
     weigh, of_belief = weigher(parts, level), page_kernels(ExtendedKalmanFilter.page, functions, shape)
-    step_place, innovation_place, likelihood_place = layout.step, layout.innovation, layout.log_likelihood
-    own_first, end, afresh = own_place(shape) + plain.own_size, memory.end, page.afresh
+    step_offset, innovation_offset, likelihood_offset = layout.step, layout.innovation, layout.log_likelihood
+    own_first, end, afresh = filter_offset(shape) + plain.own_size, memory.end, page.afresh
 
     @inlined
     def begin_afresh(row):
@@ -306,13 +306,13 @@ def mixture_kernels(
             begin_afresh(row)
         predict_each(row, u, numbers)
         of_states(row, weights, 0)
-        row[step_place] += 1.0
+        row[step_offset] += 1.0
 
     @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
         update_each(row, z, numbers)
-        of_innovations(row, weights, innovation_place)
+        of_innovations(row, weights, innovation_offset)
         density(row, z, numbers)
         of_states(row, weights, 0)
 
@@ -322,10 +322,10 @@ def mixture_kernels(
         begin(row, z, numbers)
         begin_afresh(row)
         update_each(row, z, numbers)
-        of_innovations(row, weights, innovation_place)
-        row[likelihood_place] = 0.0
+        of_innovations(row, weights, innovation_offset)
+        row[likelihood_offset] = 0.0
         if anything_measured(z):
-            row[likelihood_place] = weigh(row, weights)
+            row[likelihood_offset] = weigh(row, weights)
             of_states(row, weights, 0)
 
     works = (start_parts, predict, update) if page.predict else (start, of_belief.predict, split_and_update)
@@ -428,7 +428,7 @@ class GaussianSumFilter(MixtureFilter):
 
     def __post_init__(self):
         object.__setattr__(self, "parts", at_least("parts", self.parts, FEWEST_PARTS, MOST_PARTS))
-        object.__setattr__(self, "component", place_of("component", self.component, self.model.n))
+        object.__setattr__(self, "component", index_of("component", self.component, self.model.n))
 
     @cached_property
     def standard_split(self) -> tuple[np.ndarray, np.ndarray, float]:

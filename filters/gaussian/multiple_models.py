@@ -17,7 +17,7 @@ import numpy as np
 from filters.algebra.matrices import input_matrix
 from filters.algebra.points import dot
 from filters.augmented import embedded_model, places_within
-from filters.engine.belief import Belief, Kernels, memory_places, own_place, restart_if_lost
+from filters.engine.belief import Belief, Kernels, filter_offset, memory_offsets, restart_if_lost
 from filters.filter import Filter
 from filters.gaussian.absent import Absent, absent_states, completer
 from filters.gaussian.mixtures import Parts, blender, log_weigher, logarithm, nothing, parts_of
@@ -25,7 +25,7 @@ from filters.pages.kernels import anything_measured, nothing_to_summarise, store
 from thruster_env.core.checks import as_floats, between, one_of, positive, short_repr, vector
 from thruster_env.core.compiled import inlined
 from thruster_env.graphs.programs import Place
-from thruster_env.model.shape import Shape, number_places, starts_of
+from thruster_env.model.shape import Shape, number_offsets, starts_of
 from thruster_env.model.state_space import StateSpaceModel
 
 LOST = 700.0  # log-likelihood of a mode whose filter restarts: this much below the least of the other modes
@@ -53,7 +53,7 @@ def mode_kernels(
     the filters do not mix.
     """
     n, m, count, belief = shape.n, shape.m, len(modes), shape.n + shape.n**2
-    at, first_parameter = memory_places(n, m), own_place(shape)
+    at, first_parameter = memory_offsets(n, m), filter_offset(shape)
     first, stride = at.extras, at.extras + max(mode.kernels.extras + mode.kernels.scratch for mode in modes)
     parts, logs = Parts(first, stride, count), first + count * stride
     probabilities = logs + count  # scratch from here on
@@ -66,7 +66,7 @@ def mode_kernels(
         first_parameter + count + count * count + start for start in starts_of(*(mode.length for mode in modes))
     ]
     start_all, predict_all, update_all = _of_all(modes, parts, of_modes)
-    model = number_places(n, m)
+    model = number_offsets(n, m)
     priors = [(offset + model.prior_mean, offset + model.prior_cov) for offset in of_modes[:-1]]
     complete = completer(absent, parts, n, of_states, priors, completing)
     weigh = log_weigher(parts, level)

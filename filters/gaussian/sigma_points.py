@@ -12,7 +12,7 @@ from filters.algebra.matrices import operation
 from filters.algebra.operations import divide, mask_missing, of_best_gain, present, sym, uncorrelated, wrap
 from filters.algebra.points import first, log_density, on_circle, ones, outer, root, square, units, without_first
 from filters.algebra.roots import hstack, part, triangle, vstack, zeros
-from filters.baselines import place_of
+from filters.baselines import index_of
 from filters.gaussian.extended import initial_root, root_result
 from filters.pages.page import Page
 from filters.pages.page_filter import PageFilter
@@ -305,7 +305,7 @@ def _checked_premises(model: StateSpaceModel, premises: Any) -> tuple[int, ...]:
     if premises is None:
         premises = (0,) if n > MOST_STATES and isinstance(model, AffineModel) else range(n)  # all rules are alike
     try:
-        indices = tuple(place_of("premises", index, n) for index in premises)
+        indices = tuple(index_of("premises", index, n) for index in premises)
     except TypeError:
         indices = ()
     if not 1 <= len(indices) <= MOST_STATES or len(set(indices)) < len(indices):

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.engine.belief import Belief, Kernels, memory_places, own_place
+from filters.engine.belief import Belief, Kernels, filter_offset, memory_offsets
 from filters.filter import Filter
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.horizon.window import HUBER, LOSSES, kept_places, limits, scratch_places, window_works
@@ -22,7 +22,7 @@ from filters.pages.kernels import anything_measured, nothing_to_summarise, page_
 from thruster_env.core.checks import at_least, one_of, positive
 from thruster_env.core.compiled import inlined, not_inlined
 from thruster_env.model.quantities import Bound
-from thruster_env.model.shape import Functions, Shape, number_places
+from thruster_env.model.shape import Functions, Shape, number_offsets
 
 MOST_PASSES = 100  # besides `iterations`, until the right bounds hold
 HALVINGS = 6  # of a step that increases the cost, if bounds do not change
@@ -42,16 +42,16 @@ def horizon_kernels(
     results of each.
     """
     n, m, inputs = shape.n, shape.m, shape.inputs
-    layout, step_layout, at = memory_places(n, m), kept_places(shape), scratch_places(shape)
+    layout, step_layout, at = memory_offsets(n, m), kept_places(shape), scratch_places(shape)
     end, width, square = step_layout.end, at.end, n * n
     arrival = layout.extras + 1
     steps = arrival + n + square
-    numbers_place = steps + (room + 1) * end
+    numbers_offset = steps + (room + 1) * end
     mean, cov, number = layout.mean, layout.cov, layout.extras
-    sigma_place, horizon_place, iterations_place = (own_place(shape) + k for k in (1, 2, 3))
-    numbers_end, constants = iterations_place + 1, shape.constants
-    scratch, at_numbers = numbers_place + numbers_end, number_places(n, m)
-    q_place, r_place, constants_place = at_numbers.q, at_numbers.r, at_numbers.constants
+    sigma_offset, horizon_offset, iterations_offset = (filter_offset(shape) + k for k in (1, 2, 3))
+    numbers_end, constants = iterations_offset + 1, shape.constants
+    scratch, at_numbers = numbers_offset + numbers_end, number_offsets(n, m)
+    q_offset, r_offset, constants_offset = at_numbers.q, at_numbers.r, at_numbers.constants
     substeps = at_numbers.substeps
     works = window_works(functions, shape, loss)
     tell, centre, linearise, substep, disturb, move, correct, estimate, back_off, descend, find = works
@@ -71,21 +71,21 @@ def horizon_kernels(
     @inlined
     def keep_sight(row, numbers, step):
         first = steps + step * end
-        copy(row, first + step_layout.R, numbers, r_place, m * m)
-        copy(row, first + step_layout.seen_by, numbers, constants_place, constants)
+        copy(row, first + step_layout.R, numbers, r_offset, m * m)
+        copy(row, first + step_layout.seen_by, numbers, constants_offset, constants)
 
     @inlined
     def keep_motion(row, numbers, step):
         """Store Q, constants and the number of substeps of the motion to the next step."""
         first = steps + step * end
-        copy(row, first + step_layout.Q, numbers, q_place, square)
-        copy(row, first + step_layout.moved_by, numbers, constants_place, constants)
+        copy(row, first + step_layout.Q, numbers, q_offset, square)
+        copy(row, first + step_layout.moved_by, numbers, constants_offset, constants)
         row[first + step_layout.substeps] = numbers[substeps]
 
     @not_inlined
     def forwards(row, numbers, count, free):
         """The forward pass over the first `count` steps, without bounds if `free`; returns the cost of X."""
-        then = row[numbers_place : numbers_place + numbers_end]
+        then = row[numbers_offset : numbers_offset + numbers_end]
         copy(then, 0, numbers, 0, numbers_end)
         for i in range(n):
             row[scratch + at.d + i] = row[arrival + i]
@@ -98,21 +98,21 @@ def horizon_kernels(
             step = row[steps + j * end : steps + (j + 2) * end]
             for i in range(m):
                 rows[at.z + i] = step[step_layout.z + i] if step[step_layout.z + i] < math.inf else math.nan
-            copy(then, r_place, step, step_layout.R, m * m)
-            copy(then, constants_place, step, step_layout.seen_by, constants)
+            copy(then, r_offset, step, step_layout.R, m * m)
+            copy(then, constants_offset, step, step_layout.seen_by, constants)
             correct(rows, step, then)
             cost += rows[at.seen_cost]
             if not free:
                 hold_state(rows, step)
             if j < count - 1:
-                copy(then, q_place, step, step_layout.Q, square)
-                copy(then, constants_place, step, step_layout.moved_by, constants)
+                copy(then, q_offset, step, step_layout.Q, square)
+                copy(then, constants_offset, step, step_layout.moved_by, constants)
                 linearise(rows, step, then)
                 for _ in range(int(step[step_layout.substeps])):
                     substep(rows, step, then)
                 disturb(rows, step, then)
                 if not free:
-                    hold_disturbance(rows, step, numbers[sigma_place])
+                    hold_disturbance(rows, step, numbers[sigma_offset])
                 move(rows, step, then)
                 cost += rows[at.moved_cost]
         return cost
@@ -127,7 +127,7 @@ def horizon_kernels(
             if j < count - 1:
                 if limited:
                     find(rows, step, numbers)
-                    wrong = update_disturbance_set(rows, step, numbers[sigma_place], wrong, single)
+                    wrong = update_disturbance_set(rows, step, numbers[sigma_offset], wrong, single)
                 descend(rows, step, numbers)
             else:
                 for i in range(n):
@@ -186,7 +186,7 @@ def horizon_kernels(
     @inlined
     def add_step(row, numbers, count):
         begin_step(row, numbers, count)
-        if count == int(numbers[horizon_place]):
+        if count == int(numbers[horizon_offset]):
             leave_first(row, numbers, count + 1)
 
     @inlined
@@ -203,7 +203,7 @@ def horizon_kernels(
     def start(memory, numbers, size):
         row, _, _ = memory
         begin(memory, numbers, size)
-        for i in range(number, numbers_place):
+        for i in range(number, numbers_offset):
             row[i] = 0.0
         for i in range(n):
             row[arrival + i] = row[mean + i]
@@ -224,7 +224,7 @@ def horizon_kernels(
     def iterate(row, numbers, count):
         """Make passes until all iterations are done and the right bounds hold, then one without bounds, for P."""
         fewest, patience, settled, least, wrong = 1 << 30, PATIENCE, False, math.inf, 0
-        iterations = int(numbers[iterations_place])
+        iterations = int(numbers[iterations_offset])
         for k in range(iterations + more + 1):
             cost = forwards(row, numbers, count, settled)
             for _ in range(HALVINGS):
@@ -252,7 +252,7 @@ def horizon_kernels(
             keep_sight(row, numbers, int(row[number]) - 1)
         else:
             for i in range(constants):
-                fits = fits and row[newest + step_layout.seen_by + i] == numbers[constants_place + i]
+                fits = fits and row[newest + step_layout.seen_by + i] == numbers[constants_offset + i]
             if not fits:
                 repeat_step(row, numbers, int(row[number]))
                 newest = steps + (int(row[number]) - 1) * end
@@ -260,7 +260,7 @@ def horizon_kernels(
             if z[i] == z[i]:
                 row[newest + step_layout.z + i] = z[i]
                 for j in range(m):
-                    joint = numbers[r_place + i * m + j] if z[j] == z[j] else 0.0
+                    joint = numbers[r_offset + i * m + j] if z[j] == z[j] else 0.0
                     row[newest + step_layout.R + i * m + j] = row[newest + step_layout.R + j * m + i] = joint
 
     @inlined
@@ -280,7 +280,7 @@ def horizon_kernels(
 
     return Kernels(
         *(n, m, n, 0, start, predict, update, nothing_to_summarise),
-        extras=numbers_place - number,
+        extras=numbers_offset - number,
         scratch=numbers_end + (room + 1) * width,
     )
 

@@ -38,7 +38,7 @@ from filters.algebra.operations import (
 )
 from filters.algebra.points import dot
 from filters.algebra.roots import careful
-from filters.engine.belief import memory_places
+from filters.engine.belief import memory_offsets
 from filters.gaussian import extended
 from filters.pages.kernels import Stage, programs_of, stored
 from filters.pages.page import Equations, Page, RowMemory
@@ -185,7 +185,7 @@ def cost_of(v, cov):
 def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
     """The computations of the steps of a window, for a model's functions and sizes, and a loss."""
     n, m = shape.n, shape.m
-    step_layout, at, row = kept_places(shape), scratch_places(shape), memory_places(n, m)
+    step_layout, at, row = kept_places(shape), scratch_places(shape), memory_offsets(n, m)
     outputs = row.innovation, row.innovation_cov, row.log_likelihood
 
     def stages(memory: RowMemory, model: Equations) -> list[Stage]:

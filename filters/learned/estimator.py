@@ -21,7 +21,7 @@ from thruster_env.core.derivatives import jacobian
 from thruster_env.core.sources import matrix_writer, vector_reader, vector_writer
 from thruster_env.core.threads import one_thread
 from thruster_env.logs.log import AnyStepModel
-from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
+from thruster_env.model.shape import Functions, Shape, constants_reader, number_offsets
 from thruster_env.model.state_space import StateSpaceModel
 
 MOST = 10_000  # members, or hidden states
@@ -119,7 +119,7 @@ def _evaluations(functions: Functions, shape: Shape, interpreting: bool) -> tupl
     f_slopes = jacobian(f, by_f, n, n, "u, c", shape.state_angles)
     h_slopes = jacobian(h, by_h, m, n, "c", shape.measurement_angles)
     state, control, constants = vector_reader(n), vector_reader(shape.inputs), constants_reader(shape)
-    scales = vector_reader(n, number_places(n, m).scales)
+    scales = vector_reader(n, number_offsets(n, m).scales)
     store_state, store_measurement = vector_writer(n), vector_writer(m)
     store_f_slopes, store_h_slopes = matrix_writer(n, n), matrix_writer(m, n)
     fingerprint = function_fingerprint(f, f_slopes, h, h_slopes, within=__name__)

@@ -21,7 +21,7 @@ from filters.algebra.calls import arguments_of, calls_of
 from filters.algebra.matrices import Matrix, Operation, evaluate, in_order, input_matrix
 from filters.algebra.members import covariance, mean, on_branch
 from filters.algebra.operations import present, quotient, slopes_of, wrap
-from filters.engine.belief import Kernels, memory_places, own_place, row_access
+from filters.engine.belief import Kernels, filter_offset, memory_offsets, row_access
 from filters.pages.page import Equations, NumbersMemory, Page, PagedModel, RowMemory
 from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import matrix_reader, vector_reader
@@ -37,7 +37,7 @@ from thruster_env.graphs.programs import (
     cut,
     program_of,
 )
-from thruster_env.model.shape import LANES, Functions, Shape, constants_reader, number_places
+from thruster_env.model.shape import LANES, Functions, Shape, constants_reader, number_offsets
 from thruster_env.model.traced import MOST
 
 OF_PARAMETER = ("change", "move")  # arrays that differ between parameters
@@ -269,7 +269,7 @@ def as_tuple(results: Any) -> tuple:
 
 def stages_of(page: Page, memory: RowMemory, model: PagedModel) -> list[Stage]:
     """Stages of a page: the start; the representation, a substep and the end of a prediction; the update."""
-    layout, x, p = memory_places(memory.shape.n, memory.shape.m), memory.x, memory.P
+    layout, x, p = memory_offsets(memory.shape.n, memory.shape.m), memory.x, memory.P
     started = page.started(model)
     model.extras = memory.keep(started)
     begun = (x, p) if page.represent is None else as_tuple(page.represent(model, x, p))
@@ -291,8 +291,8 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     n, m = shape.n, shape.m
     memory, works, vectors = programs_of(page, functions, shape, partial(stages_of, page))
     start_extras, represent, advance, add_process_noise, correct = works
-    layout, extras_size = memory_places(n, m), sum(prod(matrix.shape) for matrix in memory.extras.values())
-    prior, step_place, substeps_place = prior_start(shape), layout.step, number_places(n, m).substeps
+    layout, extras_size = memory_offsets(n, m), sum(prod(matrix.shape) for matrix in memory.extras.values())
+    prior, step_offset, substeps_offset = prior_start(shape), layout.step, number_offsets(n, m).substeps
 
     @inlined
     def begin_belief(memory, numbers, size):
@@ -303,10 +303,10 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         represent(row, u, numbers)
-        for _ in range(int(numbers[substeps_place])):
+        for _ in range(int(numbers[substeps_offset])):
             advance(row, u, numbers)
         add_process_noise(row, u, numbers)
-        row[step_place] += 1.0
+        row[step_offset] += 1.0
 
     @inlined
     def update(memory, z, numbers, size):
@@ -324,7 +324,7 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
 def prior_start(shape: Shape) -> Callable:
     """Return `start(memory, numbers, size)`: mean and covariance are those of the prior."""
     n, m = shape.n, shape.m
-    source = number_places(n, m)
+    source = number_offsets(n, m)
     read_mean, read_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
     _, (store_mean, store_cov), _ = row_access(shape)
 
@@ -366,10 +366,10 @@ class MembersMemory(NumbersMemory):
     """
 
     def __init__(self, shape: Shape, page: Page):
-        row = memory_places(shape.n, shape.m)
+        row = memory_offsets(shape.n, shape.m)
         x = input_matrix(Place("table", 0), (shape.n,), member=True)
         p = input_matrix(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)
-        super().__init__(shape, page, x, p, own_place(shape))
+        super().__init__(shape, page, x, p, filter_offset(shape))
         self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
         self.ratio = self.ratio_in("given", 0)
         self.w, self.e = (
@@ -380,7 +380,7 @@ class MembersMemory(NumbersMemory):
 
 def member_stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str, Stage]:
     """Stages of a page by name: the start, a substep, the end of a step, the update, and the belief's moments."""
-    x, layout = memory.x, memory_places(memory.shape.n, memory.shape.m)
+    x, layout = memory.x, memory_offsets(memory.shape.n, memory.shape.m)
     outputs = layout.innovation, layout.innovation_cov, layout.log_likelihood
     prior = on_branch(model.prior_mean + model.prior_root @ memory.w, model.state_angles)
     started = page.started(model)
@@ -488,7 +488,7 @@ def analysis_of(page: Page, functions: Functions, shape: Shape) -> Callable:
 
 
 def _correction(work: Works, shape: Shape) -> Callable:
-    layout, m = memory_places(shape.n, shape.m), shape.m
+    layout, m = memory_offsets(shape.n, shape.m), shape.m
     correct, _, draws_noise = work
     step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
@@ -513,7 +513,7 @@ def extras_size(page: Page, shape: Shape) -> int:
 
 def predictor(works: dict[str, Works], shape: Shape) -> Callable:
     """Return `predict(memory, u, numbers, size)`: propagate members in all substeps, then add process noise."""
-    layout, substeps = memory_places(shape.n, shape.m), number_places(shape.n, shape.m).substeps
+    layout, substeps = memory_offsets(shape.n, shape.m), number_offsets(shape.n, shape.m).substeps
     advance, (add_process_noise, _, drawn) = works["propagate"].work, works["add_process_noise"]
     step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
@@ -533,7 +533,7 @@ def predictor(works: dict[str, Works], shape: Shape) -> Callable:
 def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     """Kernels of an ensemble's page for a model's functions and shape."""
     n, m, works = shape.n, shape.m, member_works_of(page, functions, shape)
-    draw_prior, moments_of, layout = works["start"].work, works["summarise"].work, memory_places(n, m)
+    draw_prior, moments_of, layout = works["start"].work, works["summarise"].work, memory_offsets(n, m)
     step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
     @inlined

@@ -36,7 +36,7 @@ import numpy as np
 
 from filters.algebra.matrices import Matrix, Operation, input_matrix, never, plus, through
 from filters.algebra.points import root
-from filters.engine.belief import memory_places, own_place
+from filters.engine.belief import filter_offset, memory_offsets
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.derivatives import RELATIVE_STEP, step_growth, step_of
 from thruster_env.core.sources import Source, entrywise, is_array, scaled_sum, tuple_of, vector_reader, written_out
@@ -45,7 +45,7 @@ from thruster_env.model.shape import (
     Functions,
     Shape,
     constants_are_array,
-    number_places,
+    number_offsets,
     observation_slopes,
     transition_slopes,
 )
@@ -111,7 +111,7 @@ class NumbersMemory:
 
     def __init__(self, shape: Shape, page: Page, x: Matrix, p: Matrix, first_parameter: int):
         n, m = shape.n, shape.m
-        layout, row = number_places(n, m), memory_places(n, m)
+        layout, row = number_offsets(n, m), memory_offsets(n, m)
         self.belief = Place("rows", row.mean), Place("rows", row.cov)
         self.outputs = tuple(Place("rows", at) for at in (row.innovation, row.innovation_cov, row.log_likelihood))
         self.shape, self.x, self.P = shape, x, p
@@ -162,10 +162,10 @@ class RowMemory(NumbersMemory):
 
     def __init__(self, shape: Shape, page: Page):
         """Take the sizes. Extras and other representations of the belief are laid out once they are known."""
-        row = memory_places(shape.n, shape.m)
+        row = memory_offsets(shape.n, shape.m)
         x = input_matrix(Place("rows", row.mean), (shape.n,))
         p = input_matrix(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)
-        super().__init__(shape, page, x, p, own_place(shape))
+        super().__init__(shape, page, x, p, filter_offset(shape))
         self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
         self.ratio = self.ratio_in("given", 0)
 

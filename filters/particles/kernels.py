@@ -42,7 +42,7 @@ from filters.algebra.points import (
     weighted_mean,
     weights,
 )
-from filters.engine.belief import Belief, Kernels, memory_places, own_place
+from filters.engine.belief import Belief, Kernels, filter_offset, memory_offsets
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.pages.kernels import MembersMemory, Stage, anything_measured, predictor, stored, with_extras
 from filters.pages.kernels import member_works_of as works_of
@@ -60,7 +60,7 @@ from thruster_env.core.streams import (
     uniform_block,
 )
 from thruster_env.graphs.programs import Place
-from thruster_env.model.shape import Functions, Shape, number_places
+from thruster_env.model.shape import Functions, Shape, number_offsets
 
 LOWEST = -1e300  # of logarithms of weights
 SCRATCH_ROWS = 3
@@ -77,7 +77,7 @@ class Layout:
     """
 
     def __init__(self, page: Page, memory: MembersMemory, model: PagedModel):
-        n, first = memory.shape.n, memory_places(memory.shape.n, memory.shape.m).extras
+        n, first = memory.shape.n, memory_offsets(memory.shape.n, memory.shape.m).extras
         self.x, self.logarithm = memory.x, input_matrix(Place("table", n), (), member=True, like=memory.x)
         self.size, self.extras = Place("rows", first), {}
         memory.end, rows = first + 1, n + 1
@@ -204,12 +204,12 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     n, m, memory = shape.n, shape.m, MembersMemory(shape, page)
     layout = Layout(page, memory, PagedModel(memory))
     works = works_of(page, functions, shape, stages_of, layout.rows + 1)
-    row_layout, source, scratch = memory_places(n, m), number_places(n, m), layout.rows + 1
+    row_layout, source, scratch = memory_offsets(n, m), number_offsets(n, m), layout.rows + 1
     step, key_0, key_1, likelihood = row_layout.step, row_layout.key_0, row_layout.key_1, row_layout.log_likelihood
     innovation, cov = row_layout.innovation, row_layout.innovation_cov
-    r_place, mean_place = source.r, row_layout.mean
-    logarithm, size_place = n, layout.size.at
-    threshold = page.parameter_offsets(own_place(shape)).get("resampling_threshold", 0)
+    r_offset, mean_offset = source.r, row_layout.mean
+    logarithm, size_offset = n, layout.size.at
+    threshold = page.parameter_offsets(filter_offset(shape)).get("resampling_threshold", 0)
     move = systematic_resampler(n + 1 if page.lookahead else layout.rows, layout.weight.at, scratch)
     (begin, _, drawn), (correct, _, proposed) = works["start"], works["update"]
     choose, moments, predict = works["choose"].work, works["summarise"].work, predictor(works, shape)
@@ -224,7 +224,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
         row, table, _ = memory
         for j in range(table.shape[1]):
             table[logarithm, j] = -math.log(size)
-        row[size_place] = size
+        row[size_offset] = size
 
     @inlined
     def start(memory, numbers, size):
@@ -260,7 +260,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     @inlined
     def predict_chosen(memory, u, numbers, size):
         row, _, _ = memory
-        if row[size_place] < numbers[threshold] * size:
+        if row[size_offset] < numbers[threshold] * size:
             chosen_anew(memory, numbers, size)
             set_equal(memory, size)
         predict(memory, u, numbers, size)
@@ -276,7 +276,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
         for i in range(m):
             row[innovation + i] = 0.0
             for k in range(m):
-                row[cov + i * m + k] = numbers[r_place + i * m + k] if i == k else 0.0
+                row[cov + i * m + k] = numbers[r_offset + i * m + k] if i == k else 0.0
         row[likelihood] = 0.0
 
     first = nothing_foreseen
@@ -302,7 +302,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
             draw(memory, proposed, FILTER_PROPOSAL)
         correct(row, z, numbers, table, draws, size)
         if row[likelihood] != row[likelihood]:
-            row[mean_place] = math.nan  # no particle explains z: the belief is lost
+            row[mean_offset] = math.nan  # no particle explains z: the belief is lost
 
     rows = max(scratch + SCRATCH_ROWS, *(work.rows for work in works.values()))
     return Kernels(

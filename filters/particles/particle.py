@@ -21,7 +21,7 @@ from filters.algebra.points import (
     weights,
 )
 from filters.algebra.roots import hstack, pick, zeros
-from filters.baselines import places_of
+from filters.baselines import indices_of
 from filters.engine.belief import Belief, Kernels
 from filters.ensembles.ensemble import add_process_noise, propagate
 from filters.gaussian import extended
@@ -241,7 +241,7 @@ class ParticleFilter(ResampledFilter):
         super().__post_init__()
         one_of("proposal", self.proposal, PROPOSALS)
         one_of("resampling", self.resampling, RESAMPLINGS)
-        object.__setattr__(self, "smoothed", places_of("smoothed", self.smoothed, self.model.n))
+        object.__setattr__(self, "smoothed", indices_of("smoothed", self.smoothed, self.model.n))
         if self.regularisation and self.resampling == "gaussian":
             raise ValueError("a filter that draws from a Gaussian must have no regularisation, but got one")
 
@@ -381,7 +381,7 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
 
     def __post_init__(self):
         super().__post_init__()
-        indices = places_of("sampled", self.sampled, self.model.n)
+        indices = indices_of("sampled", self.sampled, self.model.n)
         if not indices:
             raise ValueError("sampled must be a list of indices, at least one, but got none")
         object.__setattr__(self, "sampled", indices)

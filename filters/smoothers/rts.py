@@ -27,7 +27,7 @@ from filters.algebra.operations import eye, quotient, sym, wrap
 from filters.algebra.points import root, square, units, without_first
 from filters.algebra.roots import careful
 from filters.engine.batch import Estimates
-from filters.engine.belief import memory_places
+from filters.engine.belief import memory_offsets
 from filters.filter import Filter
 from filters.gaussian import sigma_points
 from filters.gaussian.extended import ExtendedKalmanFilter, IteratedExtendedKalmanFilter
@@ -39,7 +39,7 @@ from filters.pages.page_filter import PageFilter
 from thruster_env.core.angles import difference
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.core.threads import spread
-from thruster_env.model.shape import Functions, Shape, number_places
+from thruster_env.model.shape import Functions, Shape, number_offsets
 
 ROUNDING = 1e-12  # of angles that were wrapped [rad]
 Given = tuple[np.ndarray, np.ndarray, np.ndarray]  # means, covariances, and which are restarts, (B, K + 1, ...)
@@ -116,7 +116,7 @@ def smooth_backwards(
     filtered = estimates.means, estimates.covs, is_prior & (estimates.divergences > 0)[:, None]
     numbers = filter_.numbers[None]
     if len(process_noise):
-        numbers, q = np.repeat(numbers, len(process_noise), axis=0), number_places(model.n, model.m).q
+        numbers, q = np.repeat(numbers, len(process_noise), axis=0), number_offsets(model.n, model.m).q
         numbers[:, q : q + process_noise.shape[1]] = process_noise
     return passes(filter_, relation)(filtered, inputs, lag, numbers)
 
@@ -165,9 +165,14 @@ def _smoother(
 
     memory, works, _ = programs_of(page, functions, shape, stages)
     first_step, substep, connect, correct = works
-    n, length, belief, mean_place = shape.n, memory.end, shape.n + shape.n**2, memory_places(shape.n, shape.m).mean
-    later_place, width = length - belief, belief + n * n  # after the link: predicted mean, gain, bracket
-    link_place, substeps = later_place - width, number_places(n, shape.m).substeps
+    n, length, belief, mean_offset = (
+        shape.n,
+        memory.end,
+        shape.n + shape.n**2,
+        memory_offsets(shape.n, shape.m).mean,
+    )
+    later_offset, width = length - belief, belief + n * n  # after the link: predicted mean, gain, bracket
+    link_offset, substeps = later_offset - width, number_offsets(n, shape.m).substeps
     fingerprint = function_fingerprint(*works, within=__name__)
 
     @inlined
@@ -195,33 +200,33 @@ def _smoother(
                         now[i] = numbers[k, i]
                 for i in range(u.shape[0]):
                     u[i] = inputs[b, k, i]
-                put(row, mean_place, filtered, covs, b, k)
+                put(row, mean_offset, filtered, covs, b, k)
                 first_step(row, u, now)
                 for _ in range(int(now[substeps])):
                     substep(row, u, now)
                 connect(row, u, now)
                 total = 0.0
                 for i in range(belief):
-                    total += abs(row[link_place + i])
+                    total += abs(row[link_offset + i])
                 if restarted[b, k + 1] or not total < 1e300:
                     for i in range(belief):
-                        row[link_place + i] = 0.0
-                    copy(row, link_place + belief, row, mean_place + n, n * n)
-                copy(links, k * width, row, link_place, width)
+                        row[link_offset + i] = 0.0
+                    copy(row, link_offset + belief, row, mean_offset + n, n * n)
+                copy(links, k * width, row, link_offset, width)
             for end in range(lag, steps + 1):
-                put(row, later_place, filtered, covs, b, end)
+                put(row, later_offset, filtered, covs, b, end)
                 for k in range(end, end - lag - 1, -1):
                     if k < end:
                         for i in range(n):
-                            row[mean_place + i] = filtered[b, k, i]
-                        copy(row, link_place, links, k * width, width)
+                            row[mean_offset + i] = filtered[b, k, i]
+                        copy(row, link_offset, links, k * width, width)
                         correct(row, u, now)
-                        copy(row, later_place, row, mean_place, belief)
+                        copy(row, later_offset, row, mean_offset, belief)
                     if end == steps or k == end - lag:
                         for i in range(n):
-                            means[b, k, i] = row[later_place + i]
+                            means[b, k, i] = row[later_offset + i]
                             for j in range(n):
-                                out_covs[b, k, i, j] = row[later_place + n + i * n + j]
+                                out_covs[b, k, i, j] = row[later_offset + n + i * n + j]
 
     return CompiledOrPython(smooth)
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.engine.batch import Beliefs, noise_rows, run, trajectories
-from filters.engine.belief import Kernels, constrained, memory_places, restart_if_lost
+from filters.engine.belief import Kernels, constrained, memory_offsets, restart_if_lost
 from filters.engine.compile import new_memory
 from filters.engine.session import Session
 from filters.ensembles.ensemble import EnsembleFilter, named
@@ -30,7 +30,7 @@ from thruster_env.core.checks import at_least
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.core.sources import joiner, vector_part, written_out
 from thruster_env.core.threads import spread
-from thruster_env.model.shape import number_places
+from thruster_env.model.shape import number_offsets
 from thruster_env.model.state_space import StateSpaceModel
 
 
@@ -109,11 +109,11 @@ def _paired_functions(transition: Callable, observe: Callable, n: int) -> tuple[
 def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> CompiledOrPython:
     n, m = kernels.n, kernels.m
     start, predict, update, restart = kernels.start, kernels.predict, kernels.update, restart_if_lost(kernels)
-    layout, pair_places = memory_places(n, m), memory_places(2 * n, m)
+    layout, pair_offsets = memory_offsets(n, m), memory_offsets(2 * n, m)
     key_0, key_1, step, divergences = layout.key_0, layout.key_1, layout.step, layout.divergences
-    pair_key_0, pair_key_1, pair_step = pair_places.key_0, pair_places.key_1, pair_places.step
+    pair_key_0, pair_key_1, pair_step = pair_offsets.key_0, pair_offsets.key_1, pair_offsets.step
     mean, cov, summarise = layout.mean, layout.cov, kernels.summarise
-    q_place, r_place, pair_r_place = number_places(n, m).q, number_places(n, m).r, number_places(2 * n, m).r
+    q_offset, r_offset, pair_r_offset = number_offsets(n, m).q, number_offsets(n, m).r, number_offsets(2 * n, m).r
     fingerprint = function_fingerprint(start, predict, update, analyse_pair, within=__name__)
 
     @inlined
@@ -144,13 +144,13 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
                         u[i] = inputs[b, k - 1, i]
                     if qs.shape[0] > 0:
                         for i in range(qs.shape[1]):
-                            own_parameters[q_place + i] = qs[k - 1, i]
+                            own_parameters[q_offset + i] = qs[k - 1, i]
                     predict(now, u, own_parameters, size)
                 else:
                     start(now, own_parameters, size)
                 if rs.shape[0] > 0:
                     for i in range(rs.shape[1]):
-                        own_parameters[r_place + i] = pair_numbers[pair_r_place + i] = rs[k, i]
+                        own_parameters[r_offset + i] = pair_numbers[pair_r_offset + i] = rs[k, i]
                 copy(forecast, 0, table, 0)
                 update(now, z, own_parameters, size)
                 restart(now, own_parameters, size)

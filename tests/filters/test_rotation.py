@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filters import make_filter, smooth, thruster_model
-from filters.engine.belief import memory_places
+from filters.engine.belief import memory_offsets
 from filters.ensembles.stochastic import rotator
 from thruster_env.core.compiled import compiled
 
@@ -20,8 +20,8 @@ def compiled_rotator(n):
 
 def rotated(members, key, step=3):
     n, size = members.shape
-    row = np.zeros(memory_places(n, 1).extras)
-    places = memory_places(n, 1)
+    row = np.zeros(memory_offsets(n, 1).extras)
+    places = memory_offsets(n, 1)
     row[places.key_0], row[places.key_1], row[places.step] = *key, step
     table = np.hstack([members, np.full((n, 3), 7.0)])
     compiled_rotator(n)((row, table, np.zeros(32)), size)

@@ -50,7 +50,7 @@ def is_angle(index: int, angles: Sequence[bool]) -> bool:
     return index < len(angles) and angles[index]
 
 
-def places_of(angles: Sequence[bool], first: int = 0) -> tuple[int, ...]:
+def angle_indices(angles: Sequence[bool], first: int = 0) -> tuple[int, ...]:
     """Indices of the components that are angles, counted from `first`."""
     return tuple(first + i for i, angle in enumerate(angles) if angle)
 
@@ -61,7 +61,7 @@ def at_angle(index: int | Index, angles: Sequence[bool], if_angle: str, elsewher
         return if_angle if is_angle(index, angles) else elsewhere
     if all(angles):
         return if_angle if angles else elsewhere
-    return f"({if_angle} if {index} in {places_of(angles)} else {elsewhere})" if any(angles) else elsewhere
+    return f"({if_angle} if {index} in {angle_indices(angles)} else {elsewhere})" if any(angles) else elsewhere
 
 
 def short_way(expression: str, index: int | Index, angles: Sequence[bool]) -> str:
@@ -125,7 +125,7 @@ def row_brancher(count: int, angles: tuple[bool, ...]) -> Callable:
     size = len(angles)
     source = Source("align", "y", result=(count, size), y=(count, size))
     middle = source.local("middle", size)
-    for a in source.among(places_of(angles)):
+    for a in source.among(angle_indices(angles)):
         sums = [source.sum(f"{name}(y[{i}][{a}])" for i in source.range(count)) for name in ("sin", "cos")]
         source.line(f"{middle[a]} = arctan2({', '.join(sums)})")
 
@@ -147,7 +147,7 @@ def row_aligner(first: int, angles: tuple[bool, ...], weights: int | None = None
     """
     factor = "" if weights is None else f"table[{weights}, j] * "
     lines = (
-        f"for i in {places_of(angles, first)}:",
+        f"for i in {angle_indices(angles, first)}:",
         "    s = c = 0.0",
         "    for j in range(size):",
         f"        s += {factor}sin(table[i, j])",

@@ -82,7 +82,7 @@ def padded(size, lanes):
     return (size + lanes - 1) // lanes * lanes
 
 
-class NumberPlaces(NamedTuple):
+class NumberOffsets(NamedTuple):
     """First places of the parts of a model's row, for n states and m measurements."""
 
     q: int  # (n, n), process noise covariance
@@ -98,9 +98,9 @@ class NumberPlaces(NamedTuple):
 
 
 @cache
-def number_places(n: int, m: int) -> NumberPlaces:
+def number_offsets(n: int, m: int) -> NumberOffsets:
     """Places in the row of a model's numbers; see `StateSpaceModel.numbers`."""
-    return NumberPlaces(*starts_of(n * n, n * n, m * m, m * m, n, n * n, n * n, n, 1))
+    return NumberOffsets(*starts_of(n * n, n * n, m * m, m * m, n, n * n, n * n, n, 1))
 
 
 def with_root(cov: np.ndarray) -> np.ndarray:
@@ -116,7 +116,7 @@ def starts_of(*lengths: int) -> list[int]:
 @lru_cache(maxsize=64)
 def constants_reader(shape: Shape) -> Callable:
     """Return `read(numbers)`: the model's constants as its functions take them."""
-    start = number_places(shape.n, shape.m).constants
+    start = number_offsets(shape.n, shape.m).constants
     if constants_are_array(shape.form):
         return written_out("read", "row", f"row[{start}:{start + shape.constants}]")
     values = [f"row[{start + i}]" for i in range(shape.constants)]

@@ -18,7 +18,7 @@ from thruster_env.core.compiled import (
 )
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.core.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
-from thruster_env.model.shape import Functions, Shape, constants_reader, number_places, padded
+from thruster_env.model.shape import Functions, Shape, constants_reader, number_offsets, padded
 from thruster_env.model.state_space import StateSpaceModel
 
 
@@ -45,7 +45,7 @@ def add_correlated(out, numbers, root, count, draws):
 @cache
 def noise_step(n: int, m: int):
     """Function disturb(x, draws, step, key, numbers), which adds a step's process noise to an array x (n,)."""
-    q_root = number_places(n, m).q_root
+    q_root = number_offsets(n, m).q_root
 
     @inlined
     def disturb(x, draws, step, key_0, key_1, numbers):
@@ -62,7 +62,7 @@ def truth_steps(functions: Functions, shape: Shape):
     They work on arrays x (n,), u (inputs,), z (m,), draws with room for GROUP multiples, key (2,).
     """
     n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
-    source = number_places(n, m)
+    source = number_offsets(n, m)
     prior_mean, prior_root, substeps = source.prior_mean, source.prior_root, source.substeps
     r_root, disturb = source.r_root, noise_step(n, m)
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)

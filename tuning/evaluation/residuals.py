@@ -19,7 +19,7 @@ from thruster_env.core.angles import difference
 from thruster_env.core.checks import correlation_flaws
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, is_interpreting
 from thruster_env.core.sources import vector_reader, vector_writer
-from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
+from thruster_env.model.shape import Functions, Shape, constants_reader, number_offsets
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import within
 from tuning.problems.check import data_of
@@ -378,7 +378,7 @@ def _is_regular(cov: np.ndarray) -> bool:
 def _steps(functions: Functions, shape: Shape, interpreting: bool):
     """The function steps(states, inputs, numbers, expected, outputs) that evaluates f and h along true states."""
     n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
-    substeps = number_places(n, m).substeps
+    substeps = number_offsets(n, m).substeps
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
     fingerprint = function_fingerprint(transition, observe, within=__name__)

@@ -45,7 +45,7 @@ CANDIDATES = (
     "oscillator",
 )
 BLOCKS = 20  # of the record, of which half are unseen at a time
-TIE = 2.0  # standard errors by which a candidate may be behind the best one
+TIE = 1.0  # standard errors by which a simpler candidate may be behind the best one (Breiman et al. 1984)
 MOST_ROWS = 20_000  # on which models are compared
 RUN = 4096  # rows of a run, into which a long record is cut: runs are filtered side by side
 R = "R"

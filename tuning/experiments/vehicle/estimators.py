@@ -19,7 +19,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, FuzzyKalmanFilter, UnscentedKalmanFilter
 from filters.algebra.members import mean
-from filters.engine.belief import Kernels, memory_places
+from filters.engine.belief import Kernels, memory_offsets
 from filters.filter import Filter
 from filters.pages.kernels import page_kernels
 from filters.pages.page import Page
@@ -27,7 +27,7 @@ from thruster_env.auv.dynamics import angle_rates, attitude_of, in_earth_axes
 from thruster_env.core.angles import difference
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.core.streams import cosine_and_sine
-from thruster_env.model.shape import Functions, Shape, constants_reader, number_places
+from thruster_env.model.shape import Functions, Shape, constants_reader, number_offsets
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.experiments.vehicle.papers import FUZZY_HIGH, FUZZY_LOW, papers_model
 
@@ -118,7 +118,7 @@ def _integral(rates: np.ndarray, dt: float) -> np.ndarray:
 def own_attitude_kernels(functions: Functions, shape: Shape) -> Kernels:
     """Kernels of the extended filter for a model whose last two inputs are roll and pitch."""
     n, m, inner = shape.n, shape.m, page_kernels(ExtendedKalmanFilter.page, functions, shape)
-    layout, source, constants = memory_places(n, m), number_places(n, m), constants_reader(shape)
+    layout, source, constants = memory_offsets(n, m), number_offsets(n, m), constants_reader(shape)
     start_filter, predict_filter, update_filter = inner.start, inner.predict, inner.update
     mean, step, extras, substeps = layout.mean, layout.step, layout.extras, source.substeps
     roll, pitch = shape.inputs - 2, shape.inputs - 1
