@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from thruster_env.core.compiled import CompiledOrPython, inlined, is_interpretin
 from thruster_env.core.streams import filter_keys
 from thruster_env.core.threads import in_parts, spread, worker_threads
 from thruster_env.model.shape import LANES, with_root
+from thruster_env.model.state_space import StateSpaceModel
 
 
 class Estimates(NamedTuple):
@@ -65,6 +66,10 @@ def run(
 ) -> Estimates:
     """Filter many trajectories in one compiled call that uses all cores.
 
+    `run(filter_, z)` filters measurements alone, `run(filter_, inputs=u, measurements=z)` with inputs. A single
+    trajectory may have the shapes (K + 1,) or (K + 1, m), and (K,) or (K, p), as a list or from pandas,
+    too; its results then have no axis B. An input of the last row moves nothing and is left out.
+
     Args:
         filter_: any filter, or an estimator of another package in its place.
         keys: random keys (B, 2), two whole numbers below 2^32 for each trajectory; those of seeds 0, 1, ..., B - 1
@@ -83,6 +88,7 @@ def run(
     Raises:
         ValueError: if shapes do not fit or an input is not finite; errors of `ForeignFilter.fill` for estimators.
     """
+    single = np.ndim(keys if measurements is None and inputs is None else measurements) in (1, 2)
     keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
     n, (count, times, m) = filter_.kernel_model.n, z.shape
     out = Estimates(
@@ -96,10 +102,10 @@ def run(
     noise = noise_rows(filter_, times, process_noise_covs, measurement_noise_covs)
     if isinstance(filter_, ForeignFilter):
         filter_.fill(keys, inputs, z, tuple(out))
-        return out
-    run_all = _run_side_by_side if filter_.kernels().vectors else _run_one_by_one
-    run_all(filter_, (keys, inputs, z), noise, out)
-    return out
+    else:
+        run_all = _run_side_by_side if filter_.kernels().vectors else _run_one_by_one
+        run_all(filter_, (keys, inputs, z), noise, out)
+    return Estimates(*(part[0] for part in out)) if single else out
 
 
 def _run_one_by_one(filter_: Filter, data: tuple, noise: tuple, out: Estimates) -> None:
@@ -130,6 +136,10 @@ def trajectories(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The arguments of `run` as the arrays that compiled code takes; ValueError if something is wrong."""
     model = filter_.kernel_model
+    if measurements is None and inputs is None:
+        keys, measurements = None, keys
+    if measurements is not None and np.ndim(measurements) in (1, 2):
+        measurements, inputs = _as_batch(model, measurements, inputs)
     # Writeable arrays, because numba would compile again for read-only ones.
     requirements: tuple[Literal["C_CONTIGUOUS", "WRITEABLE"], ...] = "C_CONTIGUOUS", "WRITEABLE"
     if measurements is None:
@@ -158,6 +168,20 @@ def trajectories(
     if not ((keys >= 0) & (keys < 2**32) & (keys == np.floor(keys))).all():
         raise ValueError("keys must be whole numbers from 0 to 2^32 - 1, but some are not")
     return keys, inputs, z
+
+
+def _as_batch(model: StateSpaceModel, measurements: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    """A single trajectory as a batch of one: z (1, K + 1, m), and u (1, K, p) if there are inputs."""
+    z = _floats("measurements", measurements)
+    z = z[:, None] if z.ndim == 1 else z
+    if inputs is None:
+        if model.inputs:
+            rule = f"a model with {model.inputs} inputs must get them (inputs=), or be made with inputs=0"
+            raise ValueError(f"{rule}, but got measurements alone")
+        return z[None], None
+    u = _floats("inputs", inputs)
+    u = u[:, None] if u.ndim == 1 else u
+    return z[None], (u[:-1] if len(u) == len(z) else u)[None]
 
 
 def _floats(name: str, value) -> np.ndarray:

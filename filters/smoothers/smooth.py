@@ -210,6 +210,8 @@ def smooth(
         G_k = cov(x_k, x_{k+1}) cov(x_{k+1})^-1,   mean_k += G_k (smoothed mean_{k+1} - predicted mean_{k+1}),
         P_k += G_k (smoothed P_{k+1} - predicted P_{k+1}) G_k'
 
+    A single trajectory may have the shapes (K + 1,) or (K + 1, m) and (K,) or (K, p), as `filters.run` takes it.
+
     The recursion runs without bounds on states, like the filter's; its estimates are constrained at the end, by
     truncation or projection.
 
@@ -236,9 +238,10 @@ def smooth(
     nonlinear dynamics"; fixed lag: Anderson, Moore (1979), Optimal Filtering, chapter 7.
     """
     covs = {"process_noise_covs": process_noise_covs, "measurement_noise_covs": measurement_noise_covs}
+    single = np.ndim(keys if measurements is None and inputs is None else measurements) in (1, 2)
     estimates, divergences = smoothed(filter_, keys, inputs, measurements, lag, **covs)
     warn_of_restarts(filter_, divergences, keys, inputs, measurements, **covs)
-    return estimates
+    return Smoothed(*(part[0] for part in estimates)) if single else estimates
 
 
 def smoothed(
