@@ -88,7 +88,7 @@ def run(
     Raises:
         ValueError: if shapes do not fit or an input is not finite; errors of `ForeignFilter.fill` for estimators.
     """
-    single = np.ndim(keys if measurements is None and inputs is None else measurements) in (1, 2)
+    single = is_single(keys, inputs, measurements)
     keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
     n, (count, times, m) = filter_.kernel_model.n, z.shape
     out = Estimates(
@@ -168,6 +168,11 @@ def trajectories(
     if not ((keys >= 0) & (keys < 2**32) & (keys == np.floor(keys))).all():
         raise ValueError("keys must be whole numbers from 0 to 2^32 - 1, but some are not")
     return keys, inputs, z
+
+
+def is_single(keys: Any, inputs: Any, measurements: Any) -> bool:
+    """Whether the arguments of `run` are one trajectory without the axis of a batch."""
+    return np.ndim(keys if measurements is None and inputs is None else measurements) in (1, 2)
 
 
 def _as_batch(model: StateSpaceModel, measurements: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray | None]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.engine.batch import Beliefs, noise_rows, run, trajectories
+from filters.engine.batch import Beliefs, is_single, noise_rows, run, trajectories
 from filters.engine.belief import Kernels, constrained, memory_offsets, restart_if_lost
 from filters.engine.compile import new_memory
 from filters.engine.session import Session
@@ -238,7 +238,7 @@ def smooth(
     nonlinear dynamics"; fixed lag: Anderson, Moore (1979), Optimal Filtering, chapter 7.
     """
     covs = {"process_noise_covs": process_noise_covs, "measurement_noise_covs": measurement_noise_covs}
-    single = np.ndim(keys if measurements is None and inputs is None else measurements) in (1, 2)
+    single = is_single(keys, inputs, measurements)
     estimates, divergences = smoothed(filter_, keys, inputs, measurements, lag, **covs)
     warn_of_restarts(filter_, divergences, keys, inputs, measurements, **covs)
     return Smoothed(*(part[0] for part in estimates)) if single else estimates
