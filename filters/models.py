@@ -389,7 +389,9 @@ def named_model(name: str) -> Sum:
 def kalman_filter(name: str, dt: float, noise: float, **values: float) -> KalmanFilter:
     """The Kalman filter of a named model, for data whose numbers are known.
 
-        filter_ = filters.kalman_filter("constant-velocity", dt=0.1, noise=0.25, acceleration=0.04)
+        from filters.models import kalman_filter
+
+        filter_ = kalman_filter("constant-velocity", dt=0.1, noise=0.25, acceleration=0.04)
 
     Args:
         name: of the model (`named_model`).

@@ -243,8 +243,9 @@ def test_importing_tuning_is_light_and_says_what_there_is():
         "import sys, tuning; print([n for n in ('numpy', 'optuna', 'rich') if n in sys.modules], tuning.__all__)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    names = tuning.__all__
-    assert done.stdout.strip() == f"[] {names}" and names == sorted(names) and set(names) <= set(dir(tuning))
+    names = ["SearchSpace", "compare", "estimate", "evaluate", "explore", "find_problem", "fit", "identify"]
+    names += ["read_logs", "report", "train_estimator", "tune"]
+    assert done.stdout.strip() == f"[] {names}" and set(names) <= set(dir(tuning))
     with pytest.raises(AttributeError, match="module 'tuning' has no attribute 'tunes'"):
         tuning.tunes  # noqa: B018
     for name in filter(str.islower, names):  # functions

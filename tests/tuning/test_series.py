@@ -222,18 +222,18 @@ def test_an_index_of_dates_and_a_file_are_the_same_numbers(position, tmp_path):
     assert column_of(list(z)).dt == 1.0 and column_of([*z[:30], None]).measured.sum() == 30
 
 
-def test_tune_answers_for_a_log_that_is_a_column_of_numbers(tmp_path):
+def test_tune_names_fit_for_a_log_that_is_a_column_of_numbers(tmp_path):
     file = tmp_path / "level.csv"
     file.write_text("t,level [m]\n" + "".join(f"{k},{z!r}\n" for k, z in enumerate(map(float, NILE.split()))))
-    fit = tuning.tune(tuning.read_logs(file))
-    assert fit.name == "constant" and fit.r == pytest.approx(15098.5, rel=1e-4) and fit.numbers[1].unit == "m^2"
+    with pytest.raises(ValueError, match=r"has one column of numbers: `thruster fit .*level.csv`"):
+        tuning.tune(tuning.read_logs(file))
+    fit = tuning.fit(file, model="constant")
+    assert fit.r == pytest.approx(15098.5, rel=1e-4) and fit.numbers[1].unit == "m^2"
     with pytest.raises(ValueError, match="thruster fit takes models"):
         tuning.read_logs(file, model="constant + oscillator")
-    with pytest.raises(ValueError, match=r"out \(--out\) must be left out"):
-        tuning.tune(tuning.read_logs(file), out=tmp_path / "tuned.json")
     file.write_text("t,level\n" + "1,2\n2,3\n" * 30)
     with pytest.raises(ValueError, match="times must increase"):
-        tuning.tune(tuning.read_logs(file))
+        tuning.fit(file)
 
 
 @pytest.mark.parametrize(

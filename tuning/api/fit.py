@@ -22,7 +22,7 @@ def fit(
     times: Annotated[Any, PythonOnly()] = None,
     column: Annotated[str | None, Option(INPUT, metavar="HEADER")] = None,
     model: Annotated[str, Option(INPUT)] = AUTO,
-    picture: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
+    plot: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
     code: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
     progress: Progress = None,
 ) -> SeriesFit:
@@ -40,7 +40,7 @@ def fit(
 
     Example: thruster fit acc.csv
 
-    Example: thruster fit acc.csv --model constant-velocity --picture acc.png --code acc.md
+    Example: thruster fit acc.csv --model constant-velocity --plot acc.png --code acc.md
 
     Args:
         z: a log with one column of numbers, and times. In Python also an array or list, a pandas Series or table,
@@ -49,7 +49,7 @@ def fit(
         times: of an array's numbers [s], (K,).
         column: header of the numbers, where there are several.
         model: name of a model, or a sum such as "constant-velocity + oscillator"; auto tries the small ones.
-        picture: also draw the data, the estimate with its band, and the innovations: .png, .svg or .pdf.
+        plot: also draw the data, the estimate with its band, and the innovations: .png, .svg or .pdf.
         code: also write the filter as lines to paste, for Python, FilterPy, pykalman, MATLAB, a controller: .md.
         progress: whether to show progress; by default only in terminals and notebooks.
 
@@ -60,9 +60,9 @@ def fit(
     Raises:
         ValueError: for fewer than 20 numbers, numbers that do not vary, times that go back, or an unknown model.
     """
-    if picture is not None:
-        check_picture(picture, "--picture")
-        check_target(picture)
+    if plot is not None:
+        check_picture(plot, "--plot")
+        check_target(plot)
     if code is not None:
         if Path(code).suffix != ".md":
             raise ValueError(f"code (--code) must be a file that ends in .md, but got {str(code)!r}")
@@ -71,8 +71,8 @@ def fit(
     names = CANDIDATES if model == AUTO else (model,)
     with console_for(progress).status("fitting ...") as status:
         fitted = SeriesFit(data, *choose(data, names, lambda name: status.update(f"fitting {name} ...")))
-    if picture is not None:
-        save_figure(fitted.plot(), picture)
+    if plot is not None:
+        save_figure(fitted.plot(), plot)
     if code is not None:
         write_whole(code, "\n".join(f"## {name}\n\n```\n{fitted.code(name)}\n```\n" for name in LANGUAGES))
     return fitted

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tuning.problems.problem import Problem
 
 CUTS = ("blocks", "lead", "start")  # which only a problem of logs has
+AUGMENT = "augment"
 SPLITS = ("held_out", "hold_gaps", "outliers")
 
 
@@ -57,19 +58,19 @@ class RecordedRuns:
         Raises:
             ValueError: if there are several runs, or options of such.
         """
-        self.check_uncut("one log", (*SPLITS, *CUTS))
+        self.check_uncut("one log", (*SPLITS, *CUTS, AUGMENT))
         several = isinstance(self.files, list | tuple)
         if several and len(self.files) != 1:
             raise ValueError(f"logs must be a single one here, but got {len(self.files)}")
         file = self.files[0] if several else self.files
         return read_named(file, **{**(tuned or {}), **self.reading}, name=name_of(file, 0))
 
-    def check_uncut(self, what: str, options: Sequence[str] = CUTS) -> None:
+    def check_uncut(self, what: str, options: Sequence[str] = (*CUTS, AUGMENT)) -> None:
         """Raise ValueError if an option is set that only problems of logs have."""
-        wrong = next((name for name in options if name in self.splits or name in self.cuts), None)
+        values = {**self.splits, **self.cuts, **({AUGMENT: self.augment} if self.augment else {})}
+        wrong = next((name for name in options if name in values), None)
         if wrong is not None:
-            value = {**self.splits, **self.cuts}[wrong]
-            raise ValueError(f"{wrong} must be left out for {what}, but got {short_repr(value)}")
+            raise ValueError(f"{wrong} must be left out for {what}, but got {short_repr(values[wrong])}")
 
     def __repr__(self) -> str:
         files = self.files if isinstance(self.files, list | tuple) else [self.files]

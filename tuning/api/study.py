@@ -19,7 +19,6 @@ from thruster_env.core.checks import short_repr
 from thruster_env.core.text_tables import plain_text
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.display import about, drawn, frame, html, number
-from tuning.api.fit import fit
 from tuning.api.held_out import HeldOut
 from tuning.api.markers import (
     FILTER,
@@ -359,8 +358,7 @@ def tune(
     --full-q (and --full-r) to mse or log-score. `thruster methods` lists all methods.
 
     With --log the study uses recorded runs, cut into blocks of which every third is held out. It minimises the
-    negative log-likelihood of the innovations, unless the logs contain the true states. A log with one column of
-    numbers and no thruster is fitted by `thruster fit`.
+    negative log-likelihood of the innovations, unless the logs contain the true states.
 
     Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100
 
@@ -397,18 +395,16 @@ def tune(
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
-        `Study`: `filter`, `choice`, `held_out`, `save(path)`, `to_frame()`, `plot_history()`, `plot_errors()`;
-        of a log with one column of numbers what `tuning.fit` returns.
+        `Study`: `filter`, `choice`, `held_out`, `save(path)`, `to_frame()`, `plot_history()`, `plot_errors()`.
 
     Raises:
         ValueError: states the rule and the value.
         KeyboardInterrupt: after Ctrl-C before any trial is complete, or during the held-out evaluation.
     """
     if isinstance(problem, RecordedRuns) and (column := column_alone(problem.files, problem.reading)) is not None:
-        if isinstance(out, str | Path):
-            rule = "out (--out) must be left out for a log with one column of numbers, which has no tuned file"
-            raise ValueError(f"{rule} (thruster fit), but got {short_repr(str(out))}")
-        return fit(column, **problem.reading, progress=progress)  # type: ignore[return-value]  # its own result
+        rule = "a log to tune a filter on must have the columns of a model, a thruster's by default"
+        way_out = f"`thruster fit {column}` (tuning.fit) finds a model, Q and R"
+        raise ValueError(f"{rule}, but {column} has one column of numbers: {way_out}")
     if not isinstance(filter, str):
         raise ValueError(
             f"filter must be a name or 'module:object', by which trials keep it, but got {short_repr(filter)}"

@@ -1,4 +1,4 @@
-"""Q and R of one column of numbers, in one line: `tuning.fit_series`.
+"""Q and R of one column of numbers, in one line: `tuning.fit`.
 
 column   the numbers and their times, read as logs are
 fit      named models by maximum likelihood, with intervals, and the choice among them

@@ -81,6 +81,7 @@ def test_a_broken_outermost_function_is_a_fault_to_report():
 def test_a_model_that_numba_refuses_is_none(function):
     said = warning_of(function)
     assert said.startswith(f"{compiled.IN_PYTHON}: numba refuses it: ") and FAULT not in said
+    assert "runs as Python" in said
 
 
 def test_a_disk_without_room_is_neither(monkeypatch):

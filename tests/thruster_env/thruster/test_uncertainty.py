@@ -123,7 +123,7 @@ def test_the_constants_in_memory_are_those_of_the_drawn_parameters():
     for i in (0, 1, 127, 128, 149):
         p = drawn_parameters(plant.parameters, numbers_of(plant), Draws(tuple(keys[i]), 0))
         constants = derive_constants(p, 0.3, plant.dt / plant.substeps)
-        first = next(k for k in range(len(stored)) if stored[k, i] == pytest.approx(constants[0], rel=1e-13))
+        (first,) = np.flatnonzero(np.isclose(stored[:, i], constants[0], rtol=1e-13, atol=0.0))
         np.testing.assert_allclose(stored[first : first + len(constants), i], constants, rtol=1e-13)
 
 

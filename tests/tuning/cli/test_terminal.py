@@ -58,7 +58,8 @@ def test_every_option_is_in_a_panel(thruster, name):  # noqa: F811
 
 def test_what_is_random_has_a_seed_and_all_write_json(thruster):  # noqa: F811
     without = {name for name in COMMANDS if name != "study" and "--seed " not in thruster(name, "--help").stdout}
-    assert without == {"inspect", "filters", "new", "methods", "report", "verify", "export", "log", "bollard"}
+    rest = {"inspect", "filters", "fit", "new", "methods", "report", "verify", "export", "log", "bollard"}
+    assert without == rest
     writing, studies = set(COMMANDS) - {"study", *WITHOUT_JSON}, ("policies", "recordings", "users", "methods")
     for name in (*writing, *(f"study {one}" for one in studies)):
         assert "--json " in thruster(*name.split(), "--help").stdout

@@ -287,7 +287,7 @@ def test_fisher_scoring_ends_where_l_bfgs_ends():
         find_method(method).run(method, task)
     by_scoring, by_l_bfgs = (task.value(task.best, LIKELIHOOD) for task in tasks.values())
     assert by_scoring == pytest.approx(by_l_bfgs, rel=1e-8)
-    assert len(tasks["scoring"].kept) < len(tasks["likelihood"].kept)
+    assert len(tasks["scoring"].answers) < len(tasks["likelihood"].answers)
 
 
 def test_als_refuses_what_it_cannot_do():
