@@ -200,7 +200,14 @@ def test_training_of_estimators_imports_torch_when_it_is_called():
     assert result.stdout.strip() == "False"
 
 
-ORDERS = ("filters, gymnasium", "gymnasium, filters", "filters, thruster_env.auv", "thruster_env.auv, filters")
+ASKED = "filters, importlib.util; importlib.util.find_spec('gymnasium'); import gymnasium"  # whether it is there
+ORDERS = (
+    "filters, gymnasium",
+    "gymnasium, filters",
+    "filters, thruster_env.auv",
+    "thruster_env.auv, filters",
+    ASKED,
+)
 
 
 @pytest.mark.parametrize("order", ORDERS)

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder
-from importlib.util import find_spec
 from types import FrameType, ModuleType
 from typing import Any
 
@@ -159,18 +158,24 @@ class _Import:
         self._package, self._act = package, act
 
     def find_spec(self, name: str, path=None, target=None) -> ModuleSpec | None:
-        """The spec as the other finders give it, whose loader then calls `act`."""
+        """The spec as the later finders give it, whose loader then calls `act`.
+
+        It watches on until an import has succeeded: who asks for a spec need not import, and an import may fail.
+        """
         if name != self._package:
             return None
-        sys.meta_path.remove(self)
-        spec = find_spec(name)
+        later = sys.meta_path[sys.meta_path.index(self) + 1 :]
+        specs = (finder.find_spec(name, path, target) for finder in later)
+        spec = next((spec for spec in specs if spec is not None), None)
         loader: Any = spec and spec.loader
         if loader is not None:
             execute = loader.exec_module
 
             def execute_and_act(module: ModuleType) -> None:
                 execute(module)
-                self._act()
+                if self in sys.meta_path:  # a loader may have been wrapped twice
+                    sys.meta_path.remove(self)
+                    self._act()
 
             loader.exec_module = execute_and_act
         return spec
