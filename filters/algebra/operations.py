@@ -428,7 +428,7 @@ def geometric_mean(a, b):
     size = len(a)
     if a.dtype == object and size > 2:
         numbers = [a[0, 0].graph.number(entry) for entry in (*a.ravel(), *b.ravel())]
-        entries = called(_taught(size), size * size, *numbers)
+        entries = called(_taught(size)[0], size * size, *numbers)
         return mirrored.compute(np.array(entries, dtype=object).reshape(size, size))
     if size == 1:
         return np.array([[(a[0, 0] * b[0, 0]) ** 0.5]])
@@ -494,8 +494,8 @@ def geometric_mean_of(size: int) -> Callable:
 
 
 @cache
-def _taught(size: int) -> str:
-    """The name under which programs call the mean."""
+def _taught(size: int) -> tuple[str, Callable]:
+    """The name under which programs call the mean, and the function, which lives as long as this is remembered."""
     mean, name, write = geometric_mean_of(size), f"geometric_mean_{size}", matrix_writer(size, size, 0)
     first, second = (matrix_reader(size, size, at) for at in (0, size * size))
 
@@ -504,7 +504,7 @@ def _taught(size: int) -> str:
         write(result, mean(first(pair), second(pair)))
 
     CALLED[name], CALLED_IN_ROUNDS[name] = work, lambda: _as_programs(size)
-    return name
+    return name, work
 
 
 def _as_programs(size: int) -> tuple[Program, Program, Program, int, int]:

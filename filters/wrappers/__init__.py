@@ -2,8 +2,9 @@
 
 `gym.make("filters:BowThruster-EnKF-v0")` makes one, `gym.make_vec` many.
 
-The entry point group PLANTS lists packages whose envs offer a model. Each of their ids with a vector env gets a
-filtered one, "BowThruster-Filtered-v0", whose argument `filter` names the filter, and one for each of ALIASES.
+The entry point group PLANTS lists packages whose envs offer a model. Each of their ids gets a filtered one,
+"BowThruster-Filtered-v0", whose argument `filter` names the filter, and one for each of ALIASES, with a vector env
+if the id has one.
 """
 
 from importlib import import_module
@@ -19,7 +20,7 @@ def filtered_id(env_id: str, word: str = "Filtered") -> str:
 
 
 def plant_ids() -> list[str]:
-    """Ids of registered envs, single and vectorised, of the packages in PLANTS; no env is imported."""
+    """Ids of the registered envs of the packages in PLANTS; no env is imported."""
     from importlib.metadata import entry_points  # here, because it loads what reads mails
 
     from gymnasium.envs.registration import registry
@@ -27,12 +28,10 @@ def plant_ids() -> list[str]:
     packages = {point.value for point in entry_points(group=PLANTS)}
     for package in sorted(packages):
         import_module(package)
-    entries = {
-        env_id: spec.entry_point for env_id, spec in registry.items() if spec.vector_entry_point is not None
-    }
+    entries = [(env_id, spec.entry_point) for env_id, spec in registry.items()]
     return [
         env_id
-        for env_id, entry in entries.items()
+        for env_id, entry in entries
         if isinstance(entry, str) and entry.partition(":")[0].partition(".")[0] in packages
     ]
 
@@ -42,12 +41,13 @@ def register_filtered_envs() -> None:
     from gymnasium.envs.registration import register, registry
 
     for env_id in plant_ids():
+        has_vector_env = registry[env_id].vector_entry_point is not None
         for word, filter in [("Filtered", None), *((word, name) for name, word in ALIASES.items())]:
             if filtered_id(env_id, word) not in registry:
                 register(
                     id=filtered_id(env_id, word),
                     entry_point="filters.wrappers.envs:make_env",
-                    vector_entry_point="filters.wrappers.envs:make_vector_env",
+                    vector_entry_point="filters.wrappers.envs:make_vector_env" if has_vector_env else None,
                     max_episode_steps=registry[env_id].max_episode_steps,
                     kwargs={"env_id": env_id} | ({} if filter is None else {"filter": filter}),
                 )

@@ -217,6 +217,8 @@ _instead: weakref.WeakKeyDictionary[Callable, Callable[[], Instead]] = weakref.W
 _lessons: list[Callable[[], None]] = [lambda: optimise_once(Which(_asked, _marked, _called, _apart))]
 _untaught: weakref.WeakKeyDictionary[Callable, Callable[[Callable], None]] = weakref.WeakKeyDictionary()
 _taught: weakref.WeakSet[Callable] = weakref.WeakSet()  # those of `_instead` that numba knows
+_calls: weakref.WeakKeyDictionary[Callable, tuple[Callable, ...]] = weakref.WeakKeyDictionary()  # `overloaded`
+_teaching = threading.RLock()  # numba must know all that a function calls before another thread compiles it
 _interpreting = os.environ.get("NUMBA_DISABLE_JIT", "").strip() not in ("", "0")
 
 
@@ -249,13 +251,16 @@ def not_inlined(function: Callable) -> Callable:
     return inlined(function, into_callers=False)
 
 
-def overloaded(function: Callable, teach: Callable[[Callable], None] | None = None) -> Callable:
+def overloaded(
+    function: Callable, teach: Callable[[Callable], None] | None = None, calls: Iterable[Callable] = ()
+) -> Callable:
     """Mark a plain function in whose place compiled functions have machine code, by `numba.extending.overload`.
 
     `teach(function)`, if there is one, says which; it is called before the next compilation, unless nobody has the
-    function any more.
+    function any more. The machine code may call other functions, `calls`.
     """
     _marked.add(function)
+    _calls[function] = tuple(calls)
     if teach is not None:
         _untaught[function] = teach
     return function
@@ -303,6 +308,21 @@ def _teach_other(function: Callable) -> None:
     overload(function, jit_options=options, strict=False)(lambda *arguments: plain)
 
 
+def _teach_callees(function: Callable) -> None:
+    """Have numba know the machine code that stands in the place of functions."""
+    for part in _with_callees([function]):
+        if part in _instead and part not in _taught:
+            _teach_other(part)
+            _taught.add(part)
+    while _lessons or _untaught:  # a lesson may bring others
+        if _lessons:
+            _lessons.pop()()
+            continue
+        with contextlib.suppress(KeyError):  # the last one has just gone
+            untaught, teach = _untaught.popitem()
+            teach(untaught)
+
+
 def when_compiling(teach: Callable[[], None]) -> Callable[[], None]:
     """Mark a function that registers something with numba; it is called once, before the first compilation."""
     _lessons.append(teach)
@@ -310,8 +330,9 @@ def when_compiling(teach: Callable[[], None]) -> Callable[[], None]:
 
 
 def _callees(function: Callable) -> list[Callable]:
-    """Plain functions that a function has in its closure or calls by a global name."""
-    return [part for part in _values_in(function) if isinstance(part, types.FunctionType)]
+    """Plain functions that a function or its machine code calls by a global name, or has in its closure."""
+    values = (*_values_in(function), *_calls.get(function, ()))
+    return [part for part in values if isinstance(part, types.FunctionType)]
 
 
 def _values_in(function: Callable) -> list:
@@ -357,25 +378,14 @@ def compiled(function: Callable) -> Callable:
     import numba
     from numba.extending import register_jitable
 
-    for part in _with_callees([function]):
-        if part in _instead and part not in _taught:
-            _taught.add(part)
-            _teach_other(part)
-    while _lessons or _untaught:  # a lesson may bring others
-        if _lessons:
-            _lessons.pop()()
-            continue
-        with contextlib.suppress(KeyError):  # the last one has just gone
-            untaught, teach = _untaught.popitem()
-            teach(untaught)
-    while _waiting:
-        inner = _waiting.pop()()
-        if inner is None:
-            continue
-        register_jitable(forceinline=inner not in _called, no_cfunc_wrapper=True, fastmath=fastmath_of(inner))(
-            inner
-        )  # by itself LLVM inlines small ones only
-    _asked.add(function)
+    with _teaching:
+        _teach_callees(function)
+        while _waiting:
+            inner = _waiting.pop()()
+            if inner is not None:  # by itself LLVM inlines small ones only
+                options: Any = {"forceinline": inner not in _called, "no_cfunc_wrapper": True}
+                register_jitable(**options, fastmath=fastmath_of(inner))(inner)
+        _asked.add(function)
     return keep_code(numba.njit(nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function))
 
 

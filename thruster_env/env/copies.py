@@ -15,7 +15,7 @@ from thruster_env.core.memory import KEY_0, KEY_1, gathered, new_memory, scatter
 from thruster_env.core.results import as_array
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.core.threads import worker_threads
-from thruster_env.env.page import LANES, machine_code_of, packed, programs_of
+from thruster_env.env.page import LANES, compiled_page, packed, programs_of
 from thruster_env.env.plant_data import checked_state
 from thruster_env.graphs.graphs import where
 from thruster_env.graphs.values import built, shape_of
@@ -58,7 +58,7 @@ class PlantCopies:
         self.parameters, self.numbers = parameters, packed(parameters)
         self.report_rows, self.reported = programs.report, programs.reported
         self.commands, self.lines = programs.action, programs.lines
-        self.advance, self._advance_in_parts = machine_code_of(page, shape, self.count == 1, is_interpreting())
+        self.advance, self._advance_in_parts = compiled_page(page, shape, self.count == 1, is_interpreting())
         return programs.rows
 
     @property

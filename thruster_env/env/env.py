@@ -383,6 +383,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
     """
 
     single_env: ClassVar[type[PlantEnv]]
+    offers: ClassVar[tuple[str, ...]] = ()  # attributes of the single env that it has, too
 
     def __init__(
         self,
@@ -398,7 +399,8 @@ class PlantVectorEnv(gym.vector.VectorEnv):
             raise ValueError(f"render_mode must be None in a vector env, but got {arguments['render_mode']!r}")
         env = self.single_env(**arguments)
         self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
-        self.single = env  # for what it offers
+        for name in self.offers:
+            setattr(self, name, getattr(env, name))
         self.plant, self.task, self._rows = env.plant, env.task, env.report_rows
         self.inputs = env.inputs
         self._observed = self._rows.observed
@@ -440,7 +442,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
         report = self._copies.report()
         which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         self._restart(which, report, numbers)
-        return observations_of(report, self._observed, self.single.observation_type), self._info(report, mask)
+        return observations_of(report, self._observed, self.single_env.observation_type), self._info(report, mask)
 
     def step(self, actions):
         """Apply one action per copy, (num_envs, p), or (num_envs,) if p is 1, for one sample time.
@@ -461,7 +463,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
             rewards = rewards.copy()
             ends = self._endings(report)
             self._restart(np.flatnonzero(self._done), report)
-        observations = observations_of(report, self._observed, self.single.observation_type)
+        observations = observations_of(report, self._observed, self.single_env.observation_type)
         return observations, rewards, terminated, truncated, self._info(report) | ends
 
     def _restart(self, which: np.ndarray, report: np.ndarray, numbers: np.ndarray | None = None) -> None:
@@ -475,7 +477,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
 
     def _endings(self, report: np.ndarray) -> dict[str, Any]:
         done = self._done.copy()
-        observations = observations_of(report, self._observed, self.single.observation_type)
+        observations = observations_of(report, self._observed, self.single_env.observation_type)
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(done):
             final[i] = observations[i]

@@ -22,12 +22,11 @@ from thruster_env.effects.signals import ConstantSignal, GaussMarkov, Gusts, Rec
 from thruster_env.env.copies import clipped, correlated, root_of
 from thruster_env.env.env import PlantEnv, PlantVectorEnv
 from thruster_env.env.page import Page
-from thruster_env.graphs.graphs import Graph
-from thruster_env.graphs.programs import Place, values_of
 from thruster_env.graphs.values import traceable
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import Functions, Shape, constants_are_array
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.traced import TracedFunction, traced_function
 
 DISTURBANCES = Registry(
     "disturbances",
@@ -39,8 +38,7 @@ DISTURBANCES = Registry(
         "recorded": RecordedSignal,
     },
 )
-Part = tuple[Callable, tuple[int, ...], Any]  # a function, the sizes of its arguments, the form of its constants
-MOST_OPERATIONS = 20_000  # of a traced f or h; a larger one is called
+Part = tuple[Callable, tuple[int, ...], Any, int]  # a function, sizes of arguments, form of constants, results
 
 
 class ModelPlant(NamedTuple):
@@ -76,45 +74,16 @@ class Parameters(NamedTuple):
     effects: Any  # parameters of the effects by chain
 
 
-def _vector(values: Sequence) -> Any:
-    """A vector in the form that a model's functions take."""
-    return np.array(values, dtype=object) if is_array(len(values)) else tuple(values)
-
-
-def _constants(values: Sequence, form: type | int) -> Any:
-    if constants_are_array(form):
-        return np.array(values, dtype=object)
-    return tuple(values) if isinstance(form, int) else form(*values)
+@lru_cache(maxsize=64)
+def _traced(function: Callable, sizes: tuple[int, ...], form: type | int, count: int) -> TracedFunction | None:
+    """The graph of a function of vectors and constants with `count` results; None if it can only be called."""
+    try:
+        return traced_function(function, sizes, form, (count,))
+    except Exception:  # whatever a user's function raises if it gets Numbers
+        return None
 
 
 @lru_cache(maxsize=64)
-def _is_traceable(function: Callable, sizes: tuple[int, ...], form: type | int) -> bool:
-    """Whether a function of vectors and constants can be traced, and its graph has its values.
-
-    A function that checks the types of its arguments may treat Numbers differently from floats.
-    """
-    graph, ends = Graph(MOST_OPERATIONS), np.cumsum(sizes)
-    points = np.array([size * np.sin(phase + np.arange(ends[-1])) for size, phase in ((0.1, 0.5), (1.0, 2.5))])
-    points[:, ends[-2] :] = 0.1 + abs(points[:, ends[-2] :])  # constants
-    numbers = [graph.given(Place("numbers", k)) for k in range(ends[-1])]
-
-    def result(values: Sequence, function: Callable) -> list:
-        *vectors, c = (list(values[end - size : end]) for end, size in zip(ends, sizes, strict=True))
-        values = function(*map(_vector, vectors), _constants(c, form))
-        return np.ravel(np.array(values, dtype=object)).tolist()
-
-    try:
-        traced_numbers = [graph.number(leaf) for leaf in result(numbers, traceable(function))]
-        with np.errstate(all="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            values = values_of(traced_numbers, points.T)
-            expected = np.array([result(point.tolist(), function) for point in points], dtype=np.float64).T
-    except Exception:  # whatever a user's function raises if it gets Numbers
-        return False
-    finite = np.isfinite(expected).all(axis=0)
-    return bool(finite.any() and np.allclose(values[:, finite], expected[:, finite], rtol=1e-9, atol=1e-9))
-
-
 def _called(function: Callable, sizes: tuple[int, ...], form: type | int, count: int) -> Callable:
     """The function of a table of constants and vectors, called for each copy: work(given, found, numbers)."""
     lines, at = ["first = int(given[0])"], 1
@@ -136,19 +105,15 @@ def _called(function: Callable, sizes: tuple[int, ...], form: type | int, count:
 @lru_cache(maxsize=64)
 def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, task: ModelTask) -> Page:
     """The page of a model: its f and h, traced or called, its noise, disturbances and task."""
-    n, m, form = shape.n, shape.m, shape.form
+    n, m = shape.n, shape.m
     of_f, of_h = _parts(functions, shape)
-    f_is_traceable, h_is_traceable = _is_traceable(*of_f), _is_traceable(*of_h)
-    (f, _, _), (h, _, _), call_f, call_h = of_f, of_h, _called(*of_f, n), _called(*of_h, m)
+    f, h, call_f, call_h = _traced(*of_f), _traced(*of_h), _called(*of_f), _called(*of_h)
     kinds_of = dict(kinds)
 
-    def entries(result: Any) -> tuple:
-        return tuple(np.ravel(np.array(result, dtype=object)))
-
-    def evaluated(is_traceable: bool, function: Callable, call: Callable, count: int, p: Any, *vectors) -> tuple:
-        if not is_traceable:
+    def evaluated(function: TracedFunction | None, call: Callable, count: int, p: Any, *vectors) -> tuple:
+        if function is None:
             return tuple(p.table.call(call, count, *(entry for vector in vectors for entry in vector)))
-        return entries(traceable(function)(*map(_vector, vectors), _constants(p.constants, form)))
+        return tuple(function(*(np.array(vector, dtype=object) for vector in (*vectors, p.constants))).tolist())
 
     def act(name: str, p: Parameters, value: Any, effects: dict | None, t: Moment) -> tuple[Any, dict]:
         last = None if effects is None else effects[name]
@@ -161,7 +126,7 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
         return tuple(value for value, _ in parts), {k: v for _, memory in parts for k, v in memory.items()}
 
     def observed(p: Parameters, x: tuple, u: tuple, effects: dict | None, memories: dict, t: Moment) -> tuple:
-        z = evaluated(h_is_traceable, h, call_h, m, p, x)
+        z = evaluated(h, call_h, m, p, x)
         noise, readings = correlated(p.r_root, t.draws.normals(MEASUREMENT, m)), list[Reading]()
         for i in range(m):
             reading, memory = act(f"sensor {i}", p, Reading(z[i] + noise[i], 1.0), effects, t._replace(state=x))
@@ -190,7 +155,7 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
         v, memories = disturbed(p, u, effects, t._replace(state=x))
 
         def body(x: tuple, inputs: tuple) -> tuple:
-            return evaluated(f_is_traceable, f, call_f, n, p, x, inputs)
+            return evaluated(f, call_f, n, p, x, inputs)
 
         noise = correlated(p.q_root, t.draws.normals(PROCESS, n))
         x = tuple(a + w for a, w in zip(t.repeat(substeps, body, x, v), noise, strict=True))
@@ -200,9 +165,9 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
 
 
 def _parts(functions: Functions, shape: Shape) -> tuple[Part, Part]:
-    """The functions f and h, the sizes of their arguments and the form of the constants."""
-    n, p, c = shape.n, shape.inputs, shape.constants
-    return (functions.transition, (n, p, c), shape.form), (functions.observe, (n, c), shape.form)
+    """The functions f and h, with the sizes of their arguments, form of constants and number of results."""
+    n, p, m, c = shape.n, shape.inputs, shape.m, shape.constants
+    return (functions.transition, (n, p, c), shape.form, n), (functions.observe, (n, c), shape.form, m)
 
 
 def page_of(plant: ModelPlant, task: ModelTask) -> tuple[Page, Parameters]:
@@ -213,7 +178,7 @@ def page_of(plant: ModelPlant, task: ModelTask) -> tuple[Page, Parameters]:
     chains = {f"input {i}": chain_of(chain, context, i * SPACING) for i, chain in enumerate(signals)}
     first = len(signals)
     chains |= {f"sensor {i}": chain_of(chain, context, (first + i) * SPACING) for i, chain in enumerate(effects)}
-    is_traced = all(_is_traceable(*part) for part in _parts(truth.functions, truth.shape))
+    is_traced = all(_traced(*part) for part in _parts(truth.functions, truth.shape))
     parameters = Parameters(
         plant.dt,
         tuple(truth.constants),
@@ -309,11 +274,8 @@ class ModelVectorEnv(PlantVectorEnv):
     """
 
     single_env: ClassVar[type[ModelEnv]] = ModelEnv
-
-    def state_space_model(self, **changes) -> StateSpaceModel:
-        """The model that filters assume, with changes."""
-        single: Any = self.single
-        return single.state_space_model(**changes)
+    offers = ("state_space_model",)
+    state_space_model: Callable[..., StateSpaceModel]
 
 
 def with_noise(

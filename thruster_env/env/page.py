@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.core.compiled import CompiledOrPython, compiled, function_fingerprint, inlined
+from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined
 from thruster_env.core.memory import (
     FIRST_REPORTED,
     FRONT,
@@ -232,7 +232,9 @@ class _Loop(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def machine_code_of(page: Page, shape: Any, single: bool, interpreting: bool) -> tuple[Callable, CompiledOrPython]:
+def compiled_page(
+    page: Page, shape: Any, single: bool, interpreting: bool
+) -> tuple[CompiledOrPython, CompiledOrPython]:
     """The compiled `advance(first, last, memory, numbers, lines, out, begin)`, and the same for several threads.
 
     It works on blocks first ... last - 1 of a memory (blocks, rows, width): with `begin` it starts an episode of
@@ -265,7 +267,7 @@ def machine_code_of(page: Page, shape: Any, single: bool, interpreting: bool) ->
                 for j in range(block.shape[1]):
                     out[i, b, j] = block[i, j]
 
-    return compiled(step), in_parts(step)
+    return CompiledOrPython(step), in_parts(step)
 
 
 @inlined

@@ -66,7 +66,7 @@ SPECIAL = {
     "table": "table(numbers, {})",
 }
 
-CALLED: dict[str, Callable] = {}
+CALLED: WeakValueDictionary[str, Callable] = WeakValueDictionary()
 """Functions work(given, found) of two arrays that programs call: what would be too long if it were written out."""
 READ_NUMBERS: set[str] = set()
 """Names of those that have the array `numbers` of the program as a third argument."""
@@ -170,7 +170,8 @@ def callable_of(program: Program, width: int, arrays: Sequence[str] = ARRAYS, sc
     exec(f"def work({arguments}):\n    run('{digest}', {width}, {arguments})\n", names)
     work = names["work"]
     work.program = program, width, arrays, scratch  # of which `loops` makes instructions
-    return overloaded(work, lambda work: _teach(work, program, width, arrays, scratch))
+    calls = [CALLED[number.arguments[0]] for number in program.works if number.operation == "call"]
+    return overloaded(work, lambda work: _teach(work, program, width, arrays, scratch), calls)
 
 
 class Text:
@@ -274,7 +275,6 @@ def _teach(work: Callable, program: Program, width: int, arrays: Sequence[str], 
 
 
 SUMS = 16  # of one loop: as many vectors, with their terms, fit into the registers
-
 
 Loop = tuple[int, int]  # its turn, and which one it is in that
 

@@ -383,7 +383,8 @@ def _on_all_sides(function: Callable, now: threading.local) -> Callable:
     """A function whose branches are joined where it returns, within `on_every_side` of the graph `now`."""
 
     def joined(*arguments, **named):
-        if now.graph.decide is None:
+        graph = getattr(now, "graph", None)  # of a function that is called with floats there is none
+        if graph is None or graph.decide is None:
             return function(*arguments, **named)
         before = [*_identities(arguments), *_identities(named)]
 
@@ -392,7 +393,7 @@ def _on_all_sides(function: Callable, now: threading.local) -> Callable:
                 raise TypeError("a function that decides must not change its arguments")
             return function(*arguments, **named)
 
-        return on_every_side(result, now.graph)
+        return on_every_side(result, graph)
 
     return joined
 

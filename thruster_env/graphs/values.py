@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator
 from functools import lru_cache
+from itertools import count as count_from
 from typing import Any
 
 import numpy as np
@@ -59,10 +60,11 @@ class Table:
 
         Its arguments are the table's place in `numbers` and the numbers given here.
         """
-        name = f"{work.__name__}_{function_fingerprint(work, within=__name__)[:24]}"
-        if name not in CALLED:
-            CALLED[name] = inlined(work)
-            READ_NUMBERS.add(name)
+        name = base = f"{work.__name__}_{function_fingerprint(work, within=__name__)[:24]}"
+        versions = count_from(1)  # functions of equal code may hold different objects
+        while CALLED.setdefault(name, inlined(work)) is not work:
+            name = f"{base}_{next(versions)}"
+        READ_NUMBERS.add(name)
         return called(name, count, self.first, *map(self.first.graph.number, numbers))
 
 

@@ -162,7 +162,8 @@ class Sag(Effect):
 # Reference thrust: signals that the thruster has to follow; those of a list are added.
 #
 # Levels are fractions of T_max, the steady thrust at max_voltage, so that one reference fits every preset. Random
-# values are drawn for each episode. Observation k holds r_{k+1}, so each signal works one step ahead.
+# values are drawn for each episode. Observation k holds r_{k+1}: `t.step` is the number of
+# the reference, one ahead of the plant's.
 
 
 REFERENCE_SIGNALS = Registry("reference")
@@ -236,7 +237,7 @@ class Steps(_Levels):
     @staticmethod
     def act(e, value, memory, t):
         """Add levels that are drawn from an interval and held."""
-        u = _level(t, math.floor((t.step + 1.0) / e.hold))
+        u = _level(t, math.floor(t.step / e.hold))
         return value + e.low + (e.high - e.low) * u, memory
 
 
@@ -248,7 +249,7 @@ class Ramps(_Levels):
     @staticmethod
     def act(e, value, memory, t):
         """Add straight lines between levels that are drawn from an interval."""
-        position = (t.step + 1.0) / e.hold
+        position = t.step / e.hold
         part = math.floor(position)
         before, after = _level(t, part), _level(t, part + 1.0)
         return value + e.low + (e.high - e.low) * (before + (position - part) * (after - before)), memory
@@ -262,7 +263,7 @@ class BinarySequence(_Levels):
     @staticmethod
     def act(e, value, memory, t):
         """Add a pseudo-random binary sequence: one of two levels, drawn and held."""
-        u = _level(t, math.floor((t.step + 1.0) / e.hold))
+        u = _level(t, math.floor(t.step / e.hold))
         return value + where(u < 0.5, e.high, e.low), memory
 
 
@@ -290,7 +291,7 @@ class MultiSine(Effect):
         """Add sines of equal amplitude with phases that are drawn."""
         if t.begin:
             phases = tuple(2.0 * math.pi * _level(t, float(i)) for i in range(len(e.periods)))
-        time = (t.step + 1.0) * t.dt
+        time = t.step * t.dt
         pairs = zip(e.periods, phases, strict=True)
         sines = [math.sin(2.0 * math.pi * time / period + phase) for period, phase in pairs]
         return value + e.offset + e.amplitude * sum(sines), phases
@@ -332,7 +333,7 @@ class BandLimitedNoise(Effect):
     @staticmethod
     def act(e, value, memory, t):
         """Add white noise through a low-pass, x' = A x + b n, r = c x, stationary from the start."""
-        n, m, _, _ = t.normals(REFERENCE_SIGNAL, t.step + 1.0)
+        n, m, _, _ = t.normals(REFERENCE_SIGNAL)
         if t.begin:
             x, y = e.root[0] * n, e.root[1] * n + e.root[2] * m
         else:
@@ -349,7 +350,7 @@ class RecordedReference(RecordedSeries):
     @staticmethod
     def act(e, value, memory, t):
         """Add a recorded series."""
-        return value + recorded_value(e, (t.step + 1.0) * t.dt), memory
+        return value + recorded_value(e, t.step * t.dt), memory
 
 
 # Uncertain parameters: factors on a preset's values, drawn once per episode from its key.

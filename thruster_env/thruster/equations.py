@@ -134,8 +134,8 @@ def thruster(kinds: tuple, channels: tuple[Callable, ...], substeps: int, uncert
         x = tuple(mean + w for mean, w in zip(p.prior_mean, noise, strict=True))
         thrust = thrust_of(p, x, c)
         readings, sensors = measure(p, x, thrust, voltage, c, None, t)
-        reference, signals = act("reference", p, 0.0, None, t._replace(step=t.step - 1.0))  # r_0, then r_1 as ever
-        following, signals = act("reference", p, 0.0, signals, t._replace(begin=False))
+        reference, signals = act("reference", p, 0.0, None, t)
+        following, signals = act("reference", p, 0.0, signals, t._replace(begin=False, step=t.step + 1.0))
         report = report_of(x, thrust, voltage, ambient, reference, following, readings, p, t)
         effects = amplifier | flow | sensors | signals
         return Memory(x, 0.0, following, c if uncertain else None, effects), report
@@ -150,7 +150,7 @@ def thruster(kinds: tuple, channels: tuple[Callable, ...], substeps: int, uncert
         x = tuple(f + w for f, w in zip(move(p, m.x, (voltage, ambient), c, t), noise, strict=True))
         thrust = thrust_of(p, x, c)
         readings, sensors = measure(p, x, thrust, voltage, c, m.effects, t)
-        following, signals = act("reference", p, 0.0, m.effects, t)
+        following, signals = act("reference", p, 0.0, m.effects, t._replace(step=t.step + 1.0))
 
         error = (thrust - m.reference) / p.thrust_scale
         error = where(abs(error) < LARGEST_ERROR, error, LARGEST_ERROR)  # NaN, too, as the episode ends

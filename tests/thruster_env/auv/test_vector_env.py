@@ -57,6 +57,7 @@ def test_ids_with_a_filter_are_made_of_the_vehicles_too(monkeypatch):
     before = set(gym.registry)
     ids.register_filtered_envs()
     try:
+        assert gym.spec("Replay-EKF-v0").vector_entry_point is None  # as of Replay-v0
         env = gym.make("SegorogeniAUVPath-EKF-v0", path="I")
         assert env.reset(seed=0)[0].shape == (12 + 4 + 6,) and env.spec.max_episode_steps == 600
     finally:

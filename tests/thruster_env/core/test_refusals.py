@@ -1,12 +1,13 @@
 """Why a function runs as Python: a model that numba refuses, a broken function of the package, a full disk."""
 
 import functools
+import threading
 import warnings
 
 import pytest
 
 from thruster_env.core import compiled
-from thruster_env.core.compiled import CompiledOrPython
+from thruster_env.core.compiled import CompiledOrPython, Instead, compiled_in_place_of
 from thruster_env.core.sources import Source, written_out
 
 FAULT = "a fault of the package and not of the model: please report it"
@@ -100,3 +101,28 @@ def test_what_compiles_is_quiet():
     with warnings.catch_warnings():
         warnings.filterwarnings("error", ".*runs as Python")
         assert CompiledOrPython(called_by_ours(abs))(-2.0) == 3.0
+
+
+def test_a_second_thread_waits_for_the_machine_code_of_what_it_calls():
+    def replaced(x):
+        return -x
+
+    def first(x):
+        return replaced(x)
+
+    def second(x):
+        return replaced(x) + 1.0
+
+    def find():
+        thread.start()  # that compiles while this one traces
+        thread.join(0.3)
+        return Instead(lambda x: 2.0 * x)
+
+    results = []
+    compiled_in_place_of(replaced, find)
+    thread = threading.Thread(target=lambda: results.append(CompiledOrPython(second)(2.0)))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", ".*runs as Python")
+        assert CompiledOrPython(first)(2.0) == 4.0
+        thread.join()
+    assert results == [5.0]

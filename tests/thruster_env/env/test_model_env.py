@@ -1,6 +1,13 @@
 """A state-space model as a Gymnasium env, and filters around it."""
 
+import json
+import math
+import os
 import pickle
+import subprocess
+import sys
+import threading
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -11,7 +18,8 @@ from filters import EstimateState
 from tests.models import lonely_model, plane_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
-from thruster_env.env.model_env import ModelEnv, ModelVectorEnv
+from thruster_env.env.model_env import ModelEnv, ModelVectorEnv, page_of
+from thruster_env.graphs.values import traceable
 from thruster_env.model.simulate import simulate
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.experiments import range_bearing
@@ -118,6 +126,81 @@ def test_a_model_that_can_only_be_called_is_simulated_too(transition):
     truth, env = simulate(model, episode_keys([7]), inputs), ModelEnv(model)
     found = [env.reset(seed=7)[1], *(env.step(u)[4] for u in inputs[0])]
     np.testing.assert_allclose([info["state"] for info in found], truth.states[0], rtol=1e-13)
+
+
+def catching(x, u, c):
+    try:
+        inverse = 1.0 / u[0]
+    except ZeroDivisionError:
+        inverse = 0.0
+    return (0.9 * x[0] + 0.1 * inverse,)
+
+
+class Deciding:
+    """A model's f that is an object."""
+
+    def __call__(self, x, u, c):
+        """The next state."""
+        return deciding(x, u, c)
+
+
+def states_and_warnings(transition) -> tuple[list[float], list[str]]:
+    """States of an episode, and what is said of the model."""
+    env = ModelEnv(one_state(transition))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        infos = [env.reset(seed=7)[1], *(env.step([u])[4] for u in (0.5, 0.0, 2.0))]
+    return [float(info["state"][0]) for info in infos], [str(warning.message) for warning in caught]
+
+
+FIRST_USE = """
+import json
+from tests.thruster_env.env.test_model_env import Deciding, catching, deciding, states_and_warnings
+print(json.dumps([states_and_warnings(f) for f in (deciding, catching, Deciding())]))
+"""
+
+
+def test_an_env_is_the_first_use_of_a_model_that_can_only_be_called(tmp_path):
+    here = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_DISABLE_JIT": "0"}
+    command = [sys.executable, "-c", FIRST_USE]
+    printed = subprocess.run(command, env=here, capture_output=True, text=True, check=True).stdout
+    compiled, *as_python = json.loads(printed)
+    for (states, said), transition in zip((compiled, *as_python), (deciding, catching, Deciding()), strict=True):
+        np.testing.assert_allclose(states, states_and_warnings(transition)[0], rtol=1e-13)
+        assert len(said) == (transition is not deciding) and all("runs as Python" in text for text in said)
+
+
+def test_models_of_equal_code_have_their_own_functions():
+    def of(gains):
+        def transition(x, u, c):
+            steps = 0.0
+            while steps < abs(x[0]):  # cannot be traced
+                steps += 1.0
+            return (gains["decay"] * x[0] + 0.0 * steps + u[0],)
+
+        return transition
+
+    envs = [ModelEnv(one_state(of({"decay": decay}))) for decay in (0.9, -0.9)]
+    before = [env.reset(seed=7)[1]["state"][0] for env in envs]
+    after = [env.step([0.0])[4]["state"][0] for env in envs]  # with equal noise
+    assert before[0] == before[1] and after[0] - after[1] == pytest.approx(1.8 * before[0])
+
+
+def test_a_model_without_value_at_some_points_is_traced_all_the_same():
+    env = ModelEnv(one_state(lambda x, u, c: (math.sqrt(x[0] - 0.7),)))
+    assert page_of(env.plant, env.task)[1].table is None  # no constants for a function that is called
+
+
+def test_a_traced_function_takes_floats_in_a_thread_that_has_traced_nothing():
+    def larger(x, y):
+        return x if x > y else y
+
+    results = []
+    function = traceable(lambda x: 2.0 * larger(x, 1.0))
+    thread = threading.Thread(target=lambda: results.append(function(3.0)))
+    thread.start()
+    thread.join()
+    assert results == [6.0]
 
 
 def test_copies_are_single_envs_with_all_disturbances_and_a_task():

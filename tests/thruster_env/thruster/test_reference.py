@@ -1,6 +1,7 @@
 """Reference signals against their definitions, when they are seen and used, and the reward that follows."""
 
 import math
+from dataclasses import dataclass
 
 import gymnasium as gym
 import numpy as np
@@ -9,6 +10,7 @@ from scipy import signal, stats
 
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.streams import episode_keys
+from thruster_env.effects.effects import Effect
 from thruster_env.thruster.analysis import steady_state
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
 from thruster_env.thruster.env import BowThrusterReversalEnv, BowThrusterTrackingEnv
@@ -124,6 +126,27 @@ def test_band_limited_noise_is_butterworth_noise_from_the_start(bandwidth, dt):
             if k + lag <= 100:
                 found = (x[:, k] * x[:, k + lag]).mean()
                 assert abs(found - expected) < 4 * math.sqrt((1 + expected**2) / copies)
+
+
+@dataclass(frozen=True)
+class StepNumber(Effect):
+    """A reference [N] that is the number of its step, beside one that draws."""
+
+    name = "step-number"
+
+    @staticmethod
+    def act(e, value, memory, t):
+        """Add the number of the step."""
+        return value + t.step + 0.1 * t.normals()[0], memory
+
+
+def test_a_reference_signal_of_a_user_begins_with_step_0():
+    thrusters = copies_of(make_plant(), Task((StepNumber(),)), 1)
+    reports = [thrusters.begin(episode_keys([3])).copy()]
+    reports += [thrusters.step(np.zeros(1)).copy() for _ in range(3)]
+    rows = (thrusters.report_rows[name] for name in ("reference", "next_reference"))
+    now, following = ([float(report[row, 0]) for report in reports] for row in rows)
+    assert now[1:] == following[:-1] and [round(value) for value in (*now, following[-1])] == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("repeat", [False, True])
