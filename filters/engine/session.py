@@ -79,12 +79,12 @@ class Session:
         self._p, self._m = model.inputs, m
         self._scalar = self._p == m == 1
         self._prior_variances = model.prior_cov.diagonal()
-        self._first_values, self._is_direct = values.copy(), False
+        self._first_values = values.copy()
         self._noise_was: np.ndarray | None = None  # numbers before another Q or R
         self.source: tuple = ()  # the origin of the numbers, for sessions that are kept
         self.divergences = 0
         self._given = (*self._memory, size, values, self._numbers)
-        self._operate: Callable[[int], int] = operation_on(kernels, self._given)
+        self._operate: Callable[[int], int] = self._operate_first
         self.mean = self._row[layout.mean : layout.mean + n]
         self.cov = self._row[layout.cov : layout.cov + n * n].reshape(n, n)
         self.innovation = self._row[layout.innovation : layout.innovation + m]
@@ -105,12 +105,12 @@ class Session:
         for array, stored in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
             array[...] = stored
         self.divergences = divergences
-        self._call_directly()
 
-    def _call_directly(self) -> None:
-        if not self._is_direct:
-            self._operate = operation_on(self._kernels, self._given)  # `step` has to be quick
-            self._is_direct = True
+    def _operate_first(self, task: int) -> int:
+        """Operate once, so that numba has compiled; later calls are direct, because `step` has to be quick."""
+        divergences = operation_on(self._kernels, self._given)(task)
+        self._operate = operation_on(self._kernels, self._given)
+        return divergences
 
     def _do(self, task: int) -> None:
         self.divergences = self._operate(task)
@@ -231,7 +231,6 @@ class Session:
         self.set_key(key)
         self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
         self._do(START + UPDATE)
-        self._call_directly()
 
     def step(self, u, z) -> None:
         """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel.
@@ -266,7 +265,6 @@ class Session:
             self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
         for _ in range(count):
             self._do(TASKS[operation])
-            self._call_directly()
 
     def load(self, belief: Belief) -> None:
         """Put a belief into the memory; ValueError if it does not fit the filter or is no belief."""
