@@ -53,6 +53,16 @@ def check_not_read(path: str | Path, read: Iterable[str | Path]) -> None:
             raise ValueError(f"an output file must not replace an input file, but got {path} for both")
 
 
+def is_private(folder: Path) -> bool:
+    """Whether a folder, no link to one, is this user's, and nobody else can read or write it.
+
+    Raises OSError if there is none.
+    """
+    status = folder.lstat()
+    is_own = not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o077)
+    return stat.S_ISDIR(status.st_mode) and is_own
+
+
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:
     """Write a file aside, then rename it into place: a reader sees the old file or the new one.
 

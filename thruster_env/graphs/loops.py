@@ -28,12 +28,12 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 
 from thruster_env.graphs.instructions import DOUBLE, FLAGS, LONG, Writer
-from thruster_env.graphs.machine_code import Code, add_builtin, code_of
+from thruster_env.graphs.machine_code import Code, NotLinked, add_builtin, code_of
 
 BOOL = ir.IntType(1)
 LONGEST = 4096  # numbers of an array that a function makes for itself, on the stack
 OF_KNOWN = {"Add": operator.add, "Sub": operator.sub, "Mult": operator.mul}  # of numbers that are known
-OF_WHOLE = {"Add": "add", "Sub": "sub", "Mult": "mul", "FloorDiv": "sdiv", "Mod": "srem", "BitAnd": "and_"}
+OF_WHOLE = {"Add": "add", "Sub": "sub", "Mult": "mul", "BitAnd": "and_"}
 OF_FLOATS = {"Add": "fadd", "Sub": "fsub", "Mult": "fmul", "Div": "fdiv"}
 COMPARISONS = {"Lt": "<", "LtE": "<=", "Gt": ">", "GtE": ">=", "Eq": "==", "NotEq": "!="}
 
@@ -63,7 +63,7 @@ def machine_code_of(function: Callable, shapes: Sequence, *, as_builtin: bool = 
         add_builtin(module, "call", entry, word_count - 1)
     try:
         return code_of(module, "call" if as_builtin else "run")
-    except RuntimeError:  # this system's libraries lack a function that numba brings
+    except NotLinked:  # numba brings the function that is lacking
         return None
 
 
@@ -276,11 +276,23 @@ class _Translator:
         if isinstance(a, (int, float)) and isinstance(b, (int, float)) and name in OF_KNOWN:
             return OF_KNOWN[name](a, b)
         a, b, builder = _as_value(a), _as_value(b), self._builder
-        if DOUBLE not in (a.type, b.type) and name in OF_WHOLE:
-            return getattr(builder, OF_WHOLE[name])(_whole(builder, a), _whole(builder, b))
+        if DOUBLE not in (a.type, b.type) and name in (*OF_WHOLE, "FloorDiv", "Mod"):
+            a, b = _whole(builder, a), _whole(builder, b)
+            return getattr(builder, OF_WHOLE[name])(a, b) if name in OF_WHOLE else self._divided(name, a, b)
         if name not in OF_FLOATS:
             raise Untranslated(f"{name} of two numbers")
         return getattr(builder, OF_FLOATS[name])(_float(builder, a), _float(builder, b), flags=FLAGS)
+
+    def _divided(self, name: str, a: ir.Value, b: ir.Value) -> ir.Value:
+        """Python's `//` or `%`: LLVM rounds towards zero, Python down, and its remainder has the sign of b."""
+        builder, zero = self._builder, ir.Constant(LONG, 0)
+        rest = builder.srem(a, b)
+        rounded_up = builder.and_(
+            builder.icmp_signed("!=", rest, zero), builder.icmp_signed("<", builder.xor(rest, b), zero)
+        )
+        if name == "Mod":
+            return builder.add(rest, builder.select(rounded_up, b, zero))
+        return builder.sub(builder.sdiv(a, b), builder.zext(rounded_up, LONG))
 
     def _unaryop(self, node: ast.UnaryOp) -> Any:
         if isinstance(node.op, ast.Not):
@@ -388,7 +400,6 @@ BUILTINS: dict[Any, Callable] = {
     int: _Translator._as_whole,
     min: _Translator._least,
     abs: lambda translator, x: translator._of_llvm("fabs", x),
-    np.ceil: lambda translator, x: translator._of_llvm("ceil", x),
 }
 
 

@@ -25,6 +25,7 @@ from llvmlite import binding as llvm
 from llvmlite import ir
 
 from thruster_env.core.compiled import private_folder
+from thruster_env.core.files import is_private
 
 FOLDER = "thruster-env-code"  # within the folder of numba's cache or of the user's
 # Levels of LLVM's optimisation: of the module, and of its translation. A third level of passes takes longer and
@@ -43,27 +44,38 @@ OF_PYTHON = {  # functions of Python's C interface that code calls: the result a
 }
 
 _compiling = threading.RLock()
+if hasattr(os, "register_at_fork"):  # a fork waits, so that no child finds this lock or LLVM's own ones taken
+    os.register_at_fork(
+        before=_compiling.acquire, after_in_parent=_compiling.release, after_in_child=_compiling.release
+    )
 _number = itertools.count()
 _loaded: WeakValueDictionary[str, Code] = WeakValueDictionary()
 
 
-class Code:
-    """Machine code in memory, for as long as this object lives.
+class NotLinked(RuntimeError):
+    """This system's libraries lack a function that code calls."""
 
-    Attributes:
-        kilobytes: size of the object code.
-    """
+
+class Code:
+    """Machine code in memory, for as long as this object lives."""
 
     def __init__(self, object_code: bytes, name: str):
         builder = llvm.JITLibraryBuilder().add_object_img(object_code).add_current_process().export_symbol(name)
         for symbol in OF_PYTHON:
             builder.import_symbol(symbol, ctypes.cast(getattr(ctypes.pythonapi, symbol), ctypes.c_void_p).value)
-        self._library = builder.link(_linker(), f"code {next(_number)}")
-        self.address, self.kilobytes = self._library[name], len(object_code) / 1024
+        linker = _linker()
+        try:
+            self._library = builder.link(linker, f"code {next(_number)}")
+        except RuntimeError as error:
+            raise NotLinked(str(error)) from error
+        self.address = self._library[name]
 
 
 def code_of(module: ir.Module, name: str) -> Code:
-    """Compile a module, or load its object code, unless it is in memory; `name` is the function to be called."""
+    """Compile a module, or load its object code, unless it is in memory; `name` is the function to be called.
+
+    Raises NotLinked if this system's libraries lack a function, and RuntimeError for a module that LLVM refuses.
+    """
     text = str(module)
     digest = hashlib.sha256(f"{_host()}\n{name}\n{text}".encode()).hexdigest()
     with _compiling:
@@ -101,6 +113,7 @@ def _compiled(text: str) -> bytes:
     context = llvm.create_context()  # of its own, so that all of it can be freed
     module = llvm.parse_assembly(text, context)
     try:
+        module.verify()  # the parser takes values that are read where they may not have been computed
         machine = _machine()
         module.data_layout, module.triple = str(machine.target_data), machine.triple
         passes = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(PASSES))
@@ -116,16 +129,19 @@ def _folder(told: str) -> Path | None:
     """Where object code is kept: in numba's folder if one is set, else in the user's cache; None if nowhere."""
     home = {"win32": "~/AppData/Local", "darwin": "~/Library/Caches"}.get(sys.platform, "~/.cache")
     cached = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME") or home
-    for root in (told or cached, private_folder()):
-        if root is not None:
-            folder = Path(root).expanduser() / FOLDER
-            try:
-                folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            except OSError:
-                continue
-            if os.access(folder, os.W_OK):
-                return folder
-    return None
+    return _folder_in(told or cached) or _folder_in(private_folder())
+
+
+def _folder_in(root: str | None) -> Path | None:
+    """The folder within another one; None if it cannot be made, or others could write what is run from it."""
+    folder = Path(os.path.expanduser(root or "~"), FOLDER)
+    if root is None or folder.parts[0].startswith("~"):  # no home is known
+        return None
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        return folder if is_private(folder) and os.access(folder, os.W_OK) else None
+    except OSError:
+        return None
 
 
 def _file(digest: str) -> Path | None:
@@ -199,7 +215,7 @@ def builtin_of(code: Code, *arguments) -> Callable[[int], int]:
 def words_of(arguments: Iterable) -> list[int]:
     """Whole numbers, and of each array its address and its lengths; tuples have those of their parts.
 
-    Raises TypeError for an array that is not of float64 in C order.
+    Raises TypeError for an array that is not of float64 in C order, and for another number.
     """
     words: list[int] = []
     for argument in arguments:
@@ -207,8 +223,12 @@ def words_of(arguments: Iterable) -> list[int]:
             if argument.dtype != np.float64 or not argument.flags.c_contiguous:
                 raise TypeError(f"arrays must be of float64 in C order, but got {argument.dtype}")
             words += argument.ctypes.data, *argument.shape
+        elif isinstance(argument, tuple):
+            words += words_of(argument)
+        elif isinstance(argument, int | np.integer):
+            words.append(int(argument))
         else:
-            words += words_of(argument) if isinstance(argument, tuple) else [argument]
+            raise TypeError(f"a number must be a whole one, but got {argument!r}")
     return words
 
 

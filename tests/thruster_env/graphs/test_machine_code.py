@@ -1,6 +1,7 @@
 """Loops around programs as machine code: the same numbers as Python, without numba."""
 
 import gc
+import os
 import subprocess
 import sys
 
@@ -12,7 +13,7 @@ from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.graphs import machine_code
 from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.loops import Untranslated, add_function, machine_code_of
-from thruster_env.graphs.machine_code import add_builtin, builtin_of, code_of, function_of
+from thruster_env.graphs.machine_code import NotLinked, add_builtin, builtin_of, code_of, function_of
 from thruster_env.graphs.programs import OF_STEPS, Place, callable_of, program_of
 
 
@@ -121,9 +122,31 @@ def test_what_cannot_be_translated_is_refused(function):
         add_function(ir.Module(), "run", function, [(None,)])
 
 
+def at_times(x):
+    if x[0] > 0.0:
+        y = 2.0 * x[1]
+    x[2] = y
+
+
+def test_a_value_that_may_not_have_been_computed_is_a_fault():
+    with pytest.raises(RuntimeError, match="does not dominate"):
+        machine_code_of(at_times, [(None,)])
+
+
+def divided(a, b):
+    return 1000 * (a // b) + a % b
+
+
+@pytest.mark.parametrize("b", [3, -3, 1, 8])
+def test_whole_numbers_are_divided_as_in_python(b):
+    run = machine(divided, None, None)
+    for a in range(-17, 18):
+        assert run(a, b) == divided(a, b)
+
+
 def test_what_cannot_be_linked_is_left_to_numba(monkeypatch):
     def refuse(module, name):
-        raise RuntimeError("Symbols not found: [ cos ]")
+        raise NotLinked("Symbols not found: [ cos ]")
 
     assert machine_code_of(count_up, [(None,), None]) is not None
     monkeypatch.setattr("thruster_env.graphs.loops.code_of", refuse)
@@ -155,6 +178,13 @@ def test_other_arrays_are_refused(x):
         builtin(x)
 
 
+@pytest.mark.parametrize("number", [1.5, 2.0, np.float64(2.0), None, "2"])
+def test_other_numbers_are_refused(number):
+    with pytest.raises(TypeError, match="a number must be a whole one, but got"):
+        machine(divided, None, None)(number, 3)
+    assert machine(divided, None, None)(np.int32(7), 3) == 2001
+
+
 def test_code_is_freed_with_its_last_user():
     machine_code._loaded.clear()
     call = builtin(np.zeros(3))
@@ -177,6 +207,63 @@ def test_object_code_is_kept_and_damage_is_noticed(folder, monkeypatch):
     machine_code._loaded.clear()
     monkeypatch.setattr(machine_code, "_compiled", None)
     assert builtin(np.zeros(2))(1) == 3
+
+
+def test_a_folder_that_others_can_write_is_not_used(folder, tmp_path, monkeypatch):
+    private = tmp_path / "private"
+    monkeypatch.setattr(machine_code, "private_folder", lambda: str(private))
+    machine_code._folder.cache_clear()
+    assert machine_code._folder(str(tmp_path)) == folder and folder.stat().st_mode & 0o777 == 0o700
+    for spoil in (lambda: folder.chmod(0o770), link_to_itself(folder, tmp_path)):
+        machine_code._folder.cache_clear()
+        spoil()
+        assert machine_code._folder(str(tmp_path)) == private / machine_code.FOLDER
+    private.chmod(0o700)
+    (private / machine_code.FOLDER).chmod(0o777)
+    machine_code._folder.cache_clear()
+    assert machine_code._folder(str(tmp_path)) is None
+
+
+def link_to_itself(folder, tmp_path):
+    def spoil():
+        folder.rename(tmp_path / "elsewhere")
+        (tmp_path / "elsewhere").chmod(0o700)
+        folder.symlink_to(tmp_path / "elsewhere")
+
+    return spoil
+
+
+def test_without_a_home_object_code_goes_to_the_private_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as it is where neither HOME nor a user is known
+    monkeypatch.setattr(machine_code, "private_folder", lambda: str(tmp_path))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    machine_code._folder.cache_clear()
+    assert machine_code._folder("") == tmp_path / machine_code.FOLDER
+    machine_code._folder.cache_clear()
+
+
+FORK = """
+import os, threading, time
+from thruster_env.graphs import machine_code
+taken = threading.Event()
+def compile_for_long():
+    with machine_code._compiling:
+        taken.set()
+        time.sleep(0.2)
+threading.Thread(target=compile_for_long).start()
+taken.wait()
+child = os.fork()
+if child == 0:
+    os._exit(0 if machine_code._compiling.acquire(timeout=5) else 1)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), machine_code._compiling.acquire(timeout=5))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no forks")
+def test_a_fork_while_another_thread_compiles_can_compile():
+    result = subprocess.run([sys.executable, "-c", FORK], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["0", "True"]
 
 
 FIRST_USE = """
