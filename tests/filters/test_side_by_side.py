@@ -9,6 +9,7 @@ from filters.engine.compile import GROUPS
 from filters.registry import make_filter
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
+from thruster_env.graphs.machine_code import NotLinked
 from thruster_env.model import simulate
 from thruster_env.model.shape import LANES
 
@@ -47,6 +48,34 @@ def test_filters_on_pages_need_no_numba(name, monkeypatch):
     kernels = make_filter(name, thruster_model()).kernels()
     assert engine._operation_code.__wrapped__(kernels) == "call"
     assert engine._code_side_by_side.__wrapped__(kernels) == "run"
+
+
+@pytest.mark.slow  # numba compiles the loops of two programs
+def test_numba_compiles_the_same_loops_where_code_cannot_be_linked(monkeypatch):
+    model, (keys, inputs, z) = simulated(BLOCK + 3)
+    z[5, 4] = 1e200  # restarts, too
+    filter_ = ExtendedKalmanFilter(model=model)
+
+    def results():
+        belief = filter_.predict(filter_.init(), [1.0])
+        return *run(filter_, keys, inputs, z), *filter_.update(belief, [0.5])[0]
+
+    linked, refused = results(), []
+
+    def refuse(module, name):
+        refused.append(name)
+        raise NotLinked("Symbols not found: [ cos ]")
+
+    monkeypatch.setattr("thruster_env.graphs.loops.code_of", refuse)
+    for build in (engine._operation_code, engine._code_side_by_side, engine._runner):
+        build.cache_clear()
+    filter_ = ExtendedKalmanFilter(model=model)
+    by_numba = results()
+    for build in (engine._operation_code, engine._code_side_by_side, engine._runner):
+        build.cache_clear()
+    assert sorted(set(refused)) == ["call", "run"] and linked[5][5] >= 1
+    for one, other in zip(linked, by_numba, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)
 
 
 def test_what_one_trajectory_loses_no_other_misses():
