@@ -63,7 +63,7 @@ def test_the_same_command_goes_on_with_the_answer_that_is_there(tmp_path):
         ("nominal", {"method": "als"}, "method 'als' needs a linear model"),
         ("nominal", {"method": "magic"}, "method must be one of"),
         ("nominal", {"method": "em", "worst": True}, "must minimise the mean over problems"),
-        ("nominal", {"method": "squarem", "full_q": True}, "must come without full_q"),
+        ("nominal", {"method": "squarem", "space": tuning.SearchSpace(full_q=True)}, "must come without full_q"),
     ],
 )
 def test_what_a_method_lacks_is_said_in_one_line(problem, options, words):
@@ -203,7 +203,7 @@ def test_an_answer_that_is_worse_than_the_start_is_not_given(as_python, monkeypa
         assert f"a {reported_name(objective)} of {answer} and the given filter {given}," in one.tuning.chosen[0]
 
 
-@pytest.mark.parametrize("options", [{}, {"hold_r": True}])
+@pytest.mark.parametrize("options", [{}, {"space": tuning.SearchSpace(hold_r=True)}])
 def test_an_answer_is_no_worse_than_the_numbers_of_the_model(as_python, monkeypatch, options):
     keeps_the_rule_of_thumb = METHODS["scoring"]._replace(function=lambda task: None)
     monkeypatch.setitem(METHODS, "scoring", keeps_the_rule_of_thumb)
