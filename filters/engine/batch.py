@@ -138,7 +138,7 @@ def trajectories(
     model = filter_.kernel_model
     if measurements is None and inputs is None:
         keys, measurements = None, keys
-    if measurements is not None and np.ndim(measurements) in (1, 2):
+    if is_single(None, inputs, measurements):
         measurements, inputs = _as_batch(model, measurements, inputs)
     # Writeable arrays, because numba would compile again for read-only ones.
     requirements: tuple[Literal["C_CONTIGUOUS", "WRITEABLE"], ...] = "C_CONTIGUOUS", "WRITEABLE"
@@ -172,7 +172,11 @@ def trajectories(
 
 def is_single(keys: Any, inputs: Any, measurements: Any) -> bool:
     """Whether the arguments of `run` are one trajectory without the axis of a batch."""
-    return np.ndim(keys if measurements is None and inputs is None else measurements) in (1, 2)
+    values = keys if measurements is None and inputs is None else measurements
+    try:
+        return np.ndim(values) in (1, 2)
+    except ValueError:  # lists of different lengths, which `trajectories` refuses
+        return False
 
 
 def _as_batch(model: StateSpaceModel, measurements: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray | None]:

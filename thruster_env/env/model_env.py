@@ -201,8 +201,8 @@ class ModelEnv(PlantEnv):
         x_{k+1} = f(x_k, u_k + d_k) + w,  w ~ N(0, Q);   z_k = sensors(h(x_k) + v),  v ~ N(0, R)
 
     The first episode after `reset(seed=s)` is, to rounding, the trajectory that
-    `thruster_env.model.simulate.simulate` draws for the key of seed s under the same inputs, and the data of seed s
-    in a tuning problem of the same model.
+    `thruster_env.model.simulate.simulate` draws for the key of seed s under the same inputs, and the data of that
+    seed in a tuning problem of the same model.
     `info` holds "state" (n,) and "measurement" (m,) in float64, "time" [s] if dt is known, and "measurement_valid"
     (m,) if a measurement may be missing. `ModelVectorEnv` is the same for many copies at once.
 
