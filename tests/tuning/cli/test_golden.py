@@ -5,6 +5,7 @@ and give it a line in CHANGELOG.md. Numbers have two digits, so that all process
 """
 
 import contextlib
+import difflib
 import io
 import json
 import os
@@ -18,6 +19,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from thruster_env.core.text_tables import console
 from tuning.cli.app import COMMANDS
 from tuning.cli.main import main
 
@@ -142,17 +144,23 @@ def outcomes(patch):
 
 
 def differing(texts):
-    """Files whose text is another one, and files that nothing makes any more."""
+    """Differences of files whose text is another one, also of files that nothing makes any more."""
     texts = dict(texts)
     folder = (GOLDEN / next(iter(texts))).parent
     stored = {path.relative_to(GOLDEN).as_posix(): path.read_text() for path in folder.glob("*.txt")}
-    return sorted(name for name in texts.keys() | stored.keys() if texts.get(name) != stored.get(name))
+    pairs = {name: (stored.get(name, ""), texts.get(name, "")) for name in sorted(texts.keys() | stored.keys())}
+    return [
+        "\n".join(difflib.unified_diff(before.splitlines(), after.splitlines(), name, name, n=0, lineterm=""))
+        for name, (before, after) in pairs.items()
+        if before != after
+    ]
 
 
 @pytest.fixture
 def patch(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", WIDTH)
+    monkeypatch.setattr(console, "_width", int(WIDTH))  # it may have read another number when it was made
     monkeypatch.setattr(sys, "argv", [])
     return monkeypatch
 
@@ -170,6 +178,7 @@ def test_output_json_files_and_page_are_the_frozen_ones(patch):
 if __name__ == "__main__":
     os.environ["COLUMNS"] = WIDTH
     with pytest.MonkeyPatch.context() as of_main, tempfile.TemporaryDirectory() as scratch:
+        of_main.setattr(console, "_width", int(WIDTH))
         os.chdir(scratch)
         for name, text in (*helps(), *(outcomes(of_main) if sys.argv[1:] != ["help"] else ())):
             (GOLDEN / name).parent.mkdir(parents=True, exist_ok=True)
