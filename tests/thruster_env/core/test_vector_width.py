@@ -26,7 +26,11 @@ import numba
 from thruster_env.core.compiled import compiled
 from loop import add_squares
 
-for code in (compiled(add_squares), numba.njit(add_squares)):
+def plain_squares(out, values):
+    for i in range(values.shape[0]):
+        out[i] += values[i] * values[i]
+
+for code in (compiled(add_squares), numba.njit(plain_squares)):
     code.compile("void(f8[::1], f8[::1])")
     print("%zmm" in code.inspect_asm(code.signatures[0]))
 """
