@@ -34,9 +34,7 @@ class Scales(NamedTuple):
     """What the data say about the size of a model's numbers."""
 
     spread: float  # standard deviation of the values
-    roughness: (
-        float  # the most that noise can be: the least deviation of differences of any order, for white noise
-    )
+    roughness: float  # the most that noise can be: by the differences of that order in which they vary least
     dt: float  # [s]
     duration: float  # [s]
     frequency: float  # of the highest peak of the spectrum [Hz]
@@ -349,7 +347,6 @@ class Sum(NamedTuple):
         signal, unit = self.signal(values), quantity.unit
         n, orders = len(signal.output), np.array(signal.orders)
         level = int(np.argmax(signal.output))
-        names = [symbol for symbol, _ in signal.states]
         return affine_model(
             a=signal.transition(positive("dt", dt)),
             b=np.zeros((n, 0)),
@@ -359,10 +356,7 @@ class Sum(NamedTuple):
             prior_mean=np.eye(n)[level] * (first - offset),
             prior_cov=(WIDE * spread / dt**orders) ** 2,
             measurement_offset=[offset],
-            states=[
-                Quantity(symbol, symbol, in_unit(text, unit))
-                for symbol, (_, text) in zip(_numbered(names), signal.states, strict=True)
-            ],
+            states=[Quantity(symbol, symbol, in_unit(text, unit)) for symbol, text in signal.states],
             input_quantities=[],
             measurements=[quantity],
         )
@@ -380,6 +374,8 @@ def named_model(name: str) -> Sum:
         ValueError: for an unknown name; the message has the known ones.
     """
     parts = tuple(NAMED[one_of("a model", part.strip().lower(), tuple(NAMED))] for part in name.split("+"))
+    if len(set(parts)) < len(parts):
+        raise ValueError(f"parts of a sum must differ, but got {name!r}")
     if sum(not part.about_mean for part in parts) > 1:
         rule = "a sum must have at most one part with a level, since data determine the sum of two levels alone"
         raise ValueError(f"{rule}, but got {name!r}")
@@ -416,13 +412,6 @@ def in_unit(text: str, unit: str) -> str:
 
 def _unique(part: str, name: str, names: list[str]) -> str:
     return f"{part.replace('-', '_')}_{name}" if names.count(name) > 1 else name
-
-
-def _numbered(names: list[str]) -> list[str]:
-    """Symbols, with a number where several states have the same."""
-    return [
-        f"{name}_{names[: i + 1].count(name)}" if names.count(name) > 1 else name for i, name in enumerate(names)
-    ]
 
 
 def _added(signals: list[Signal]) -> Signal:

@@ -1,7 +1,9 @@
 """Q and R of a column of numbers: closed forms, Durbin and Koopman's Nile, code that runs, and clear refusals."""
 
+import copy
 import ctypes
 import math
+import pickle
 import shutil
 import subprocess
 
@@ -98,8 +100,13 @@ def test_a_sum_has_the_parts_side_by_side():
     f, _, _, c, _ = model.matrices()
     np.testing.assert_array_equal(f[:2, 2:], 0.0)
     np.testing.assert_array_equal(c, [[1.0, 0.0, 1.0, 0.0]])
-    twice = named_model("oscillator + oscillator")
-    assert len({number.name for number in twice.free}) == 3  # of equal parts the data know no order
+    both = named_model("ornstein-uhlenbeck + oscillator")
+    assert [number.name for number in both.free if "std" in number.name] == [
+        "ornstein_uhlenbeck_std",
+        "oscillator_std",
+    ]
+    with pytest.raises(ValueError, match="parts of a sum must differ"):
+        named_model("oscillator + oscillator")
     with pytest.raises(ValueError, match="at most one part with a level"):
         named_model("constant + constant-velocity")
     with pytest.raises(ValueError, match="a model must be one of"):
@@ -116,6 +123,12 @@ def test_intervals_hold_the_numbers_that_made_the_data(name):
             number.value * (end / number.value) ** 1.5 for end in (number.low, number.high)
         )
         assert low < value < high, (number, value)
+
+
+def test_an_answer_can_be_copied_and_sent(position):
+    sent = pickle.loads(pickle.dumps(position))
+    assert str(sent) == str(position) and copy.deepcopy(position).name == position.name
+    np.testing.assert_array_equal(sent.filter.model.numbers, position.filter.model.numbers)
 
 
 def test_the_unit_of_time_scales_the_numbers_and_moves_no_estimate(position):

@@ -15,11 +15,12 @@ from filters.bounds import steady_state
 from filters.consistency.nees import LAGS, Whiteness, whiteness
 from filters.engine.batch import Estimates
 from filters.gaussian.kalman import KalmanFilter
+from filters.models import named_model
 from thruster_env.core.text_tables import plain_text, table
 from thruster_env.model.affine import AffineModel
 from tuning.api.display import frame, html
 from tuning.series.column import Column
-from tuning.series.fit import Fitted, Number, behind, filtered, model_of
+from tuning.series.fit import Candidate, Number, behind, filtered, model_of
 from tuning.series.paste import lines_of
 
 if TYPE_CHECKING:
@@ -42,19 +43,19 @@ class SeriesFit:
     """
 
     column: Column
-    chosen: Fitted
-    candidates: tuple[Fitted, ...]
+    chosen: Candidate
+    candidates: tuple[Candidate, ...]
     numbers: tuple[Number, ...]
 
     @property
     def name(self) -> str:
         """Name of the model."""
-        return self.chosen.sum.name
+        return self.chosen.name
 
     @cached_property
     def model(self) -> AffineModel:
         """The model with its numbers."""
-        return model_of(self.chosen.sum, self.column, self.chosen.values)
+        return model_of(named_model(self.name), self.column, self.chosen.values)
 
     @property
     def filter(self) -> KalmanFilter:
@@ -172,7 +173,7 @@ class SeriesFit:
             )
             for number in self.numbers
         ]
-        about = " plus ".join(part.about for part in self.chosen.sum.parts)
+        about = " plus ".join(part.about for part in named_model(self.name).parts)
         numbers = table(
             f"Model: {self.name}, {about}", ["", "value", "95 % from", "to", "unit", ""], rows, words=True
         )
@@ -196,7 +197,7 @@ class SeriesFit:
     def _standings(self) -> list[tuple[str, float, float]]:
         """Of each candidate, best first: by how much it is behind the best, and the standard error of that."""
         best = self.candidates[0]
-        return [(fitted.sum.name, *behind(fitted, best)) for fitted in self.candidates]
+        return [(candidate.name, *behind(candidate, best)) for candidate in self.candidates]
 
     def __repr__(self) -> str:
         values = ", ".join(f"{number.name} {number.value:.4g}" for number in self.numbers)

@@ -129,7 +129,7 @@ def column_alone(files: Any, reading: Mapping[str, Any]) -> str | Path | None:
 
 
 def _as_columns(z: Any, times: Any) -> Mapping[str, Any]:
-    """An array, a list or a pandas Series as a mapping from headers to arrays, without infinities."""
+    """An array, a list or a pandas Series as a table or a mapping from headers to arrays."""
     if hasattr(z, "to_frame") and times is None:
         return z.to_frame(z.name or "z")
     try:

@@ -59,24 +59,39 @@ FAR = 100.0  # root of a fall where the filter has no likelihood
 PRECISION = 0.01  # of an interval's end, in coordinates
 
 
-class Fitted(NamedTuple):
-    """A candidate's maximum of the likelihood."""
+class Candidate(NamedTuple):
+    """A named model with its likeliest numbers.
 
-    sum: Sum
+    Attributes:
+        name: of the model.
+        values: of the free numbers, and R.
+        log_likelihood: of the rows that it was fitted on.
+        held_out: log-likelihoods of blocks that it was not fitted on, (blocks,).
+        size: how simple it is: free numbers, then states.
+    """
+
+    name: str
+    values: dict[str, float]
+    log_likelihood: float
+    held_out: np.ndarray
+    size: tuple[int, int]
+
+
+class Fitted(NamedTuple):
+    """A model's maximum of the likelihood, and the function that it is the maximum of."""
+
+    model: Sum
     objective: Objective
     ascent: Ascent
     rivals: tuple[Ascent, ...]  # maxima to which searches led from elsewhere, perhaps the same one
-    held_out: np.ndarray  # (blocks,), log-likelihoods of blocks that it was not fitted on
+    held_out: np.ndarray  # (blocks,)
 
     @property
-    def values(self) -> dict[str, float]:
-        """Values of the free numbers, and R."""
-        return self.objective.coordinates.named(self.ascent.at)
-
-    @property
-    def order(self) -> tuple[int, int]:
-        """How simple it is: free numbers, then states."""
-        return len(self.sum.free), self.objective.model_at(self.ascent.at).n
+    def candidate(self) -> Candidate:
+        """What is left of it for the answer: plain data."""
+        values = self.objective.coordinates.named(self.ascent.at)
+        size = len(self.model.free), self.objective.model_at(self.ascent.at).n
+        return Candidate(self.model.name, values, self.ascent.found.value, self.held_out, size)
 
 
 class Number(NamedTuple):
@@ -94,8 +109,8 @@ class Number(NamedTuple):
 class Choice(NamedTuple):
     """The chosen model, all candidates, best first, and the chosen one's numbers."""
 
-    chosen: Fitted
-    candidates: tuple[Fitted, ...]
+    chosen: Candidate
+    candidates: tuple[Candidate, ...]
     numbers: tuple[Number, ...]
 
 
@@ -116,13 +131,14 @@ def choose(column: Column, names: Sequence[str], progress: Callable[[str], None]
     for name in names:
         progress(name)
         fitted.append(_fit(named_model(name), part, prove=len(names) > 1))
-    ranked = tuple(sorted(fitted, key=lambda candidate: -candidate.held_out.sum()))
-    tied = [candidate for candidate in ranked if _ties(candidate, ranked[0])]
-    chosen = min(tied, key=lambda candidate: candidate.order)
+    fitted.sort(key=lambda result: -result.held_out.sum())
+    candidates = tuple(result.candidate for result in fitted)
+    tied = [i for i, candidate in enumerate(candidates) if _ties(candidate, candidates[0])]
+    chosen = fitted[min(tied, key=lambda i: candidates[i].size)]
     if part is not column:
-        progress(f"{chosen.sum.name} on all rows")
+        progress(f"{chosen.model.name} on all rows")
         chosen = _on_all(chosen, column)
-    return Choice(chosen, ranked, _numbers(chosen))
+    return Choice(chosen.candidate, candidates, _numbers(chosen))
 
 
 def model_of(candidate: Sum, column: Column, values: Mapping[str, float]) -> AffineModel:
@@ -195,9 +211,9 @@ def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
 
 def _on_all(chosen: Fitted, column: Column) -> Fitted:
     """A candidate that was fitted on a part of the record, on the whole of it."""
-    objective = _objective(chosen.sum, column)
+    objective = _objective(chosen.model, column)
     coordinates = objective.coordinates
-    begin = np.clip(coordinates.of(list(chosen.values.values())), coordinates.low, coordinates.high)
+    begin = np.clip(coordinates.of(list(chosen.candidate.values.values())), coordinates.low, coordinates.high)
     ascent = climb(objective, begin, coordinates.low, coordinates.high)
     return chosen._replace(objective=objective, ascent=ascent, rivals=())
 
@@ -232,13 +248,13 @@ def _starts(objective: Objective, candidate: Sum, scales: Scales) -> list[np.nda
     return sorted(best, key=objective.value)[-SEARCHES:]
 
 
-def behind(candidate: Fitted, best: Fitted) -> tuple[float, float]:
+def behind(candidate: Candidate, best: Candidate) -> tuple[float, float]:
     """How much lower a candidate's likelihood on unseen blocks is, and the standard error of that."""
     differences = best.held_out - candidate.held_out
     return float(differences.sum()), float(np.std(differences, ddof=1) * math.sqrt(len(differences)))
 
 
-def _ties(candidate: Fitted, best: Fitted) -> bool:
+def _ties(candidate: Candidate, best: Candidate) -> bool:
     loss, error = behind(candidate, best)
     return loss <= TIE * error
 
@@ -246,7 +262,7 @@ def _ties(candidate: Fitted, best: Fitted) -> bool:
 def _numbers(fitted: Fitted) -> tuple[Number, ...]:
     """Values with intervals by the profile of the likelihood."""
     coordinates, best = fitted.objective.coordinates, fitted.ascent
-    meanings = {number.name: number.meaning for number in fitted.sum.free}
+    meanings = {number.name: number.meaning for number in fitted.model.free}
     ends = np.array(
         [
             [_end(fitted, index, limits[index]) for index in range(len(best.at))]
