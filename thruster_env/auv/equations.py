@@ -23,7 +23,7 @@ from thruster_env.auv.dynamics import angle_rates, attitude_of, current_substep,
 from thruster_env.auv.paths import PIECE, Task, make_task, step_cost
 from thruster_env.auv.plant import CHANNELS, DIRECTIONS, MEASURED, STATES, SYMBOLS, Plant
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS, REFERENCE_SIGNAL, cosine_and_sine
-from thruster_env.effects.effects import SPACING, Context, Moment, chain_of, run_chain
+from thruster_env.effects.effects import SPACING, Context, Moment, chain_of, chain_runner
 from thruster_env.effects.sensors import Reading
 from thruster_env.env.copies import PlantCopies, clipped, correlated, root_of
 from thruster_env.env.page import Page
@@ -118,14 +118,8 @@ def vehicle(kinds: tuple, channels: tuple[str, ...], substeps: int, has_torque: 
         has_torque: whether the propeller's torque is an action of its own.
         steps_depth: whether the depth to keep steps up and down.
     """
-    kinds_of = dict(kinds)
+    act = chain_runner(dict(kinds))
     measured_in = {SYMBOLS.index(name): i for i, name in enumerate(channels) if MEASURED[name] == name}
-
-    def act(name: str, p: Parameters, value: Any, effects: dict | None, t: Moment) -> tuple[Any, dict]:
-        """The value after the effects of a chain, and their memories."""
-        last = None if effects is None else effects[name]
-        value, memory = run_chain(kinds_of[name], p.effects[name], value, last, t)
-        return value, {name: memory}
 
     def flow(p: Parameters, effects: dict | None, t: Moment) -> tuple[tuple, dict]:
         """The current to the north, to the east and down [m/s]."""

@@ -251,6 +251,20 @@ def run_chain(
     return value, tuple(memories_after)
 
 
+def chain_runner(kinds_of: Mapping[str, Sequence[Kind]]) -> Callable:
+    """Return `act(name, p, value, effects, t)` of a page: the value after a chain by name, and {name: memories}.
+
+    `effects` are the memories of all chains after the last step, None at the start of an episode.
+    """
+
+    def act(name: str, p: Any, value: Any, effects: Mapping[str, Any] | None, t: Moment) -> tuple[Any, dict]:
+        last = None if effects is None else effects[name]
+        value, memories = run_chain(kinds_of[name], p.effects[name], value, last, t)
+        return value, {name: memories}
+
+    return act
+
+
 def _representable(effect: Effect, parameters: Mapping[str, Any]) -> Mapping[str, Any]:
     """An effect's parameters; ValueError if an argument or a parameter is too large or too small."""
     smallest, largest = MAGNITUDES

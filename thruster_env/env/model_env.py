@@ -15,7 +15,7 @@ from thruster_env.core.checks import one_of, positive, short_repr
 from thruster_env.core.compiled import function_fingerprint
 from thruster_env.core.sources import is_array, tuple_of, written_out
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS
-from thruster_env.effects.effects import SPACING, Context, Effect, Moment, Registry, chain_of, run_chain
+from thruster_env.effects.effects import SPACING, Context, Effect, Moment, Registry, chain_of, chain_runner
 from thruster_env.effects.effects import dropping_channels as losing
 from thruster_env.effects.sensors import SENSOR_EFFECTS, Reading
 from thruster_env.effects.signals import ConstantSignal, GaussMarkov, Gusts, RecordedSignal, Sinusoid
@@ -108,17 +108,12 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
     n, m = shape.n, shape.m
     of_f, of_h = _parts(functions, shape)
     f, h, call_f, call_h = _traced(*of_f), _traced(*of_h), _called(*of_f), _called(*of_h)
-    kinds_of = dict(kinds)
+    act = chain_runner(dict(kinds))
 
     def evaluated(function: TracedFunction | None, call: Callable, count: int, p: Any, *vectors) -> tuple:
         if function is None:
             return tuple(p.table.call(call, count, *(entry for vector in vectors for entry in vector)))
         return tuple(function(*(np.array(vector, dtype=object) for vector in (*vectors, p.constants))).tolist())
-
-    def act(name: str, p: Parameters, value: Any, effects: dict | None, t: Moment) -> tuple[Any, dict]:
-        last = None if effects is None else effects[name]
-        value, memory = run_chain(kinds_of[name], p.effects[name], value, last, t)
-        return value, {name: memory}
 
     def disturbed(p: Parameters, u: Sequence, effects: dict | None, t: Moment) -> tuple[tuple, dict]:
         """The inputs with their disturbances."""

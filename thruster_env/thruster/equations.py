@@ -17,7 +17,7 @@ import numpy as np
 
 from thruster_env.core.matrices import zero_order_hold
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS
-from thruster_env.effects.effects import SPACING, Moment, chain_of, run_chain
+from thruster_env.effects.effects import SPACING, Moment, chain_of, chain_runner
 from thruster_env.effects.sensors import Reading
 from thruster_env.env.copies import PlantCopies, clipped, correlated, root_of
 from thruster_env.env.page import Page
@@ -74,13 +74,7 @@ def thruster(kinds: tuple, channels: tuple[Callable, ...], substeps: int, uncert
         uncertain: name and distribution of each parameter that is drawn for an episode.
         angles: convention of the preset, for which constants are drawn.
     """
-    kinds_of = dict(kinds)
-
-    def act(name: str, p: Parameters, value: Any, effects: dict | None, t: Moment) -> tuple[Any, dict]:
-        """The value after the effects of a chain, and their memories."""
-        last = None if effects is None else effects[name]
-        value, memory = run_chain(kinds_of[name], p.effects[name], value, last, t)
-        return value, {name: memory}
+    act = chain_runner(dict(kinds))
 
     def constants_of(p: Parameters, t: Moment) -> Any:
         """The constants of an episode, drawn from its key where a parameter is uncertain."""

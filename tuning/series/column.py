@@ -170,10 +170,9 @@ def _roughness(values: np.ndarray, spread: float) -> float:
 
 
 def _peak(values: np.ndarray, dt: float) -> float:
-    """Frequency of the highest peak of the spectrum [Hz], without the trend."""
-    rows = np.arange(len(values))
-    known = ~np.isnan(values)
-    filled = np.interp(rows, rows[known], values[known])
-    filled = filled - np.polyval(np.polyfit(rows, filled, 1), rows)
+    """Frequency of the highest peak of the spectrum [Hz], without the trend; missing numbers lie on the trend."""
+    rows, known = np.arange(len(values)), ~np.isnan(values)
+    trend = np.polynomial.Polynomial.fit(rows[known], values[known], 1)(rows)
+    filled = np.where(known, values - trend, 0.0)
     power = np.abs(np.fft.rfft(filled * np.hanning(len(filled)))) ** 2
     return float(np.fft.rfftfreq(len(filled), dt)[1 + int(np.argmax(power[1:]))])

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import product
 from typing import NamedTuple
@@ -154,18 +155,17 @@ def model_of(candidate: Sum, column: Column, values: Mapping[str, float]) -> Aff
     )
 
 
-def _runs(column: Column, hidden: np.ndarray | None) -> np.ndarray:
-    """The numbers as runs (B, K) of equal length, NaN at the end of the last one and where they are hidden."""
-    values = column.values if hidden is None else np.where(hidden, np.nan, column.values)
+def _runs(values: np.ndarray) -> np.ndarray:
+    """The numbers as runs (B, K) of equal length, NaN at the end of the last one."""
     count = max(1, round(len(values) / RUN))
     padded = np.full(count * -(-len(values) // count), np.nan)
     padded[: len(values)] = values
     return padded.reshape(count, -1)
 
 
-def _objective(candidate: Sum, column: Column, hidden: np.ndarray | None = None) -> Objective:
+def _objective(candidate: Sum, column: Column) -> Objective:
     """The log-likelihood of the record, whose runs begin without a prior: their first rows do not count."""
-    scales, unit, runs = column.scales, column.quantity.unit, _runs(column, hidden)
+    scales, unit, runs = column.scales, column.quantity.unit, _runs(column.values)
     free = [
         Parameter(number.name, low, high, in_unit(number.unit, unit), default=number.values(scales)[0])
         for number in candidate.free
@@ -191,22 +191,31 @@ def _objective(candidate: Sum, column: Column, hidden: np.ndarray | None = None)
 
 
 def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
-    """The candidate with the likeliest numbers, and its likelihood on blocks that it was not fitted on."""
+    """The candidate with the likeliest numbers, and its likelihood on blocks that it was not fitted on.
+
+    The first block counts for no candidate: there each filter still learns its state, one with few states sooner.
+    """
+    fitted = _maximum(candidate, column)
+    if not prove:
+        return fitted
+    blocks = np.arange(len(column.values)) * BLOCKS // len(column.values)
+    held_out = np.empty(BLOCKS)
+    for fold in range(2):
+        visible = replace(column, values=np.where(blocks % 2 == fold, np.nan, column.values))
+        values = _maximum(candidate, visible).candidate.values
+        held_out[fold::2] = _by_blocks(model_of(candidate, visible, values), column, blocks)[fold::2]
+    return fitted._replace(held_out=held_out[1:])
+
+
+def _maximum(candidate: Sum, column: Column) -> Fitted:
+    """The candidate with the likeliest numbers for a column."""
     objective = _objective(candidate, column)
     bounds = objective.coordinates.low, objective.coordinates.high
     ascents = [climb(objective, at, *bounds) for at in _starts(objective, candidate, column.scales)]
     ascent = climb(objective, max(ascents, key=lambda end: end.found.value).at, *bounds, enough=EXACT)
     if not math.isfinite(ascent.found.value):
         raise ValueError(f"{candidate.name} must have a likelihood on the data, but has none from any start")
-    if not prove:
-        return Fitted(candidate, objective, ascent, tuple(ascents), np.zeros(BLOCKS))
-    blocks = np.arange(len(column.values)) * BLOCKS // len(column.values)
-    held_out = np.empty(BLOCKS)
-    for fold in range(2):
-        hidden = blocks % 2 == fold
-        trained = climb(_objective(candidate, column, hidden), ascent.at, *bounds)
-        held_out[fold::2] = _by_blocks(objective, trained.at, column, blocks)[fold::2]
-    return Fitted(candidate, objective, ascent, tuple(ascents), held_out)
+    return Fitted(candidate, objective, ascent, tuple(ascents), np.zeros(BLOCKS - 1))
 
 
 def _on_all(chosen: Fitted, column: Column) -> Fitted:
@@ -218,9 +227,8 @@ def _on_all(chosen: Fitted, column: Column) -> Fitted:
     return chosen._replace(objective=objective, ascent=ascent, rivals=())
 
 
-def _by_blocks(objective: Objective, at: np.ndarray, column: Column, blocks: np.ndarray) -> np.ndarray:
+def _by_blocks(model: AffineModel, column: Column, blocks: np.ndarray) -> np.ndarray:
     """Log-likelihood of each block of the record, filtered from its beginning, (BLOCKS,)."""
-    model = objective.model_at(at)
     estimates = filtered(model, column)
     v, s = estimates.innovations[0, :, 0], estimates.innovation_covs[0, :, 0, 0]
     terms = -0.5 * (np.log(2.0 * math.pi * s) + v**2 / s)
