@@ -131,6 +131,15 @@ def test_an_answer_can_be_copied_and_sent(position):
     np.testing.assert_array_equal(sent.filter.model.numbers, position.filter.model.numbers)
 
 
+def test_white_noise_about_a_level_has_no_drift():
+    z = 5.0 + np.random.default_rng(4).normal(size=400)
+    fit = tuning.fit(z)
+    drift = fit.numbers[0]
+    assert fit.name == "constant" and not drift.determined and drift.high < 0.01
+    assert fit.r == pytest.approx(np.var(z), rel=0.02) and fit.memory > 20.0
+    assert "do not determine drift" in str(fit)
+
+
 def test_the_unit_of_time_scales_the_numbers_and_moves_no_estimate(position):
     z = position.column.values
     slower = tuning.fit(z, 100.0, model="constant-velocity")  # a thousand times

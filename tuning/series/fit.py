@@ -46,7 +46,7 @@ CANDIDATES = (
     "oscillator",
 )
 BLOCKS = 20  # of the record, of which half are unseen at a time
-TIE = 1.0  # standard errors by which a simpler candidate may be behind the best one (Breiman et al. 1984)
+EVIDENCE = 3.0  # log-likelihood by which a simpler model may always be behind the best one
 MOST_ROWS = 20_000  # on which models are compared
 RUN = 4096  # rows of a run, into which a long record is cut: runs are filtered side by side
 R = "R"
@@ -263,8 +263,14 @@ def behind(candidate: Candidate, best: Candidate) -> tuple[float, float]:
 
 
 def _ties(candidate: Candidate, best: Candidate) -> bool:
+    """Whether a candidate's likelihood on unseen blocks is as good as the best one's.
+
+    Sources: Breiman, Friedman, Olshen, Stone (1984), Classification and Regression Trees, section 3.4.3, for the
+    standard error; Kass, Raftery (1995), "Bayes factors", Journal of the American Statistical Association 90(430),
+    for the evidence below which no model is preferred.
+    """
     loss, error = behind(candidate, best)
-    return loss <= TIE * error
+    return loss <= max(error, EVIDENCE)
 
 
 def _numbers(fitted: Fitted) -> tuple[Number, ...]:
