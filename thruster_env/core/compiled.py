@@ -21,7 +21,6 @@ import importlib.util
 import inspect
 import os
 import shutil
-import stat
 import tempfile
 import threading
 import types
@@ -34,6 +33,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from thruster_env.core.files import is_private
 from thruster_env.core.optimising import Which, optimise_once
 from thruster_env.core.user_functions import OURS, code_text, codes_in, names_read
 
@@ -133,9 +133,7 @@ def private_folder() -> str | None:
         try:
             folder.mkdir(mode=0o700)
         except FileExistsError:
-            status = folder.lstat()
-            is_private = not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o077)
-            if not (stat.S_ISDIR(status.st_mode) and is_private):
+            if not is_private(folder):
                 folder = Path(tempfile.mkdtemp(prefix="thruster-env-"))  # lasts as long as the process
                 atexit.register(shutil.rmtree, folder, ignore_errors=True)
         return str(folder)
