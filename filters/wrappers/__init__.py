@@ -7,6 +7,7 @@ The entry point group PLANTS lists packages whose envs offer a model. Each of th
 if the id has one.
 """
 
+import warnings
 from importlib import import_module
 
 PLANTS = "filters.plants"  # group of entry points: packages that register their envs when imported
@@ -20,14 +21,21 @@ def filtered_id(env_id: str, word: str = "Filtered") -> str:
 
 
 def plant_ids() -> list[str]:
-    """Ids of the registered envs of the packages in PLANTS; no env is imported."""
+    """Ids of the registered envs of the packages in PLANTS; no env is imported.
+
+    A package that cannot be imported has no ids: this runs within `import gymnasium`, which must not fail for it.
+    """
     from importlib.metadata import entry_points  # here, because it loads what reads mails
 
     from gymnasium.envs.registration import registry
 
     packages = {point.value for point in entry_points(group=PLANTS)}
     for package in sorted(packages):
-        import_module(package)
+        try:
+            import_module(package)
+        except Exception as error:  # whatever its lines raise
+            rule = "a package of the entry points filters.plants must import"
+            warnings.warn(f"{rule}, but {package} raised {error!r}: its envs are not registered", stacklevel=2)
     entries = [(env_id, spec.entry_point) for env_id, spec in registry.items()]
     return [
         env_id

@@ -1,5 +1,6 @@
 """Filters by name, their numbers, and the file that carries a tuned filter."""
 
+import importlib.metadata
 import json
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from filters import FILTERS, EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, make_filter, thruster_model
 from filters.registry import filter_type
 from filters.tuned_file import read_tuned_file, sealed
+from filters.wrappers import PLANTS, plant_ids
 from tests.models import TUNED
 from tuning.problems.problem import Parameter
 
@@ -164,3 +166,11 @@ def test_a_tuned_file_that_is_not_there_is_refused(tmp_path):
         read_tuned_file(tmp_path / "nowhere.json")
     with pytest.raises(ValueError, match="must be readable"):
         read_tuned_file(tmp_path)
+
+
+def test_a_broken_package_of_plants_leaves_gymnasium_whole(monkeypatch):
+    point = importlib.metadata.EntryPoint("broken", "package_that_is_missing", PLANTS)
+    entry_points = importlib.metadata.entry_points
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [*entry_points(group=group), point])
+    with pytest.warns(UserWarning, match="must import, but package_that_is_missing raised ModuleNotFoundError"):
+        assert "BowThruster-v0" in plant_ids()
