@@ -1,6 +1,6 @@
 """The loops around programs as instructions of LLVM: a small part of Python, read from a function's source.
 
-    for k in range(steps):                      for, if, else, conditional expressions
+    for k in range(steps):                      for, while, if, else, conditional expressions
         for g in range(groups):                 whole numbers, floats, arrays of floats, their lengths, parts
             update(rows[g], zs[g], numbers)     calls of programs, a few builtin functions, and such functions
         if not total < LARGEST:
@@ -43,10 +43,11 @@ class Untranslated(TypeError):
 
 
 class Array(NamedTuple):
-    """An array of float64 in C order: the address of its first number, and its lengths."""
+    """An array of float64: the address of its first number, its lengths, and the steps along them, in numbers."""
 
     pointer: ir.Value
     shape: tuple
+    steps: tuple
 
 
 def machine_code_of(function: Callable, shapes: Sequence, *, as_builtin: bool = False) -> Code | None:
@@ -96,13 +97,15 @@ def add_function(module: ir.Module, name: str, function: Callable, shapes: Seque
         if isinstance(shape, list):
             return tuple(map(argument_of, shape))
         pointer, lengths = builder.inttoptr(next_word(), DOUBLE.as_pointer()), [next_word() for _ in shape]
-        return Array(pointer, tuple(b if a is None else a for a, b in zip(shape, lengths, strict=True)))
+        lengths = [b if a is None else a for a, b in zip(shape, lengths, strict=True)]
+        return translator.array_at(pointer, lengths)
 
+    translator = _Translator(builder, {})
     arguments = [argument_of(shape) for shape in shapes]
     body = builder.append_basic_block("body")
     builder.branch(body)
     builder.position_at_end(body)
-    result = _Translator(builder, {}).call(function, arguments)
+    result = translator.call(function, arguments)
     builder.ret(ir.Constant(LONG, 0) if result is None else _whole(builder, result))
     return target, word
 
@@ -127,6 +130,13 @@ class _Translator:
         if not isinstance(function, types.FunctionType):
             raise Untranslated(f"a call of {function!r}")
         return _Translator(self._builder, self._programs)._body(function, arguments)
+
+    def array_at(self, pointer: ir.Value, shape: Sequence) -> Array:
+        """An array in C order."""
+        steps: list = [1]
+        for size in reversed(shape[1:]):
+            steps.insert(0, self._of_two("Mult", size, steps[0]))
+        return Array(pointer, tuple(shape), tuple(steps[: len(shape)]))
 
     def _body(self, function: types.FunctionType, arguments: Sequence) -> Any:
         node, self._function = _definition(function), function
@@ -216,6 +226,19 @@ class _Translator:
         for at in self._loop(first, stop, step):
             self._names[target.id] = at
             self._statements(statement.body)
+
+    def _while(self, statement: ast.While) -> None:
+        if statement.orelse:
+            raise Untranslated("a loop with an else")
+        builder = self._builder
+        head, inside, after = (builder.append_basic_block(name) for name in ("head", "inside", "after"))
+        builder.branch(head)
+        builder.position_at_end(head)
+        builder.cbranch(self._truth(statement.test), inside, after)
+        builder.position_at_end(inside)
+        self._statements(statement.body)
+        builder.branch(head)
+        builder.position_at_end(after)
 
     def _loop(self, first: Any, stop: Any, step: Any = 1) -> Iterator[ir.Value]:
         """The index of a loop, once: what is translated meanwhile is its body."""
@@ -342,15 +365,18 @@ class _Translator:
             if isinstance(value, tuple) and isinstance(index, int):
                 return value[index]
             raise Untranslated("an index")
-        if isinstance(index, slice):
-            if len(value.shape) != 1 or index.step is not None:
-                raise Untranslated("a slice")
-            first, stop = index.start or 0, value.shape[0] if index.stop is None else index.stop
-            return Array(self._behind(value.pointer, first), (self._of_two("Sub", stop, first),))
-        indices, at = index if isinstance(index, tuple) else (index,), 0
-        for k, size in enumerate(value.shape):
-            at = self._of_two("Add", self._of_two("Mult", at, size), indices[k] if k < len(indices) else 0)
-        return Array(self._behind(value.pointer, at), value.shape[len(indices) :])
+        indices = list(index) if isinstance(index, tuple) else [index]
+        indices += [slice(None)] * (len(value.shape) - len(indices))
+        at, shape, steps = 0, [], []
+        for part, size, step in zip(indices, value.shape, value.steps, strict=True):
+            if isinstance(part, slice):
+                if part.step is not None:
+                    raise Untranslated("a slice with a step")
+                part, stop = part.start or 0, size if part.stop is None else part.stop
+                shape.append(self._of_two("Sub", stop, part))
+                steps.append(step)
+            at = self._of_two("Add", at, self._of_two("Mult", part, step))
+        return Array(self._behind(value.pointer, at), tuple(shape), tuple(steps))
 
     def _behind(self, pointer: ir.Value, count: Any) -> ir.Value:
         return self._builder.gep(pointer, [_as_value(count)], source_etype=DOUBLE)
@@ -361,22 +387,27 @@ class _Translator:
         """Call a program, which is a function of its own: within a loop it would take other last digits."""
         program, width, names, _ = function.program
         called = self._programs.get(function)
+        of_copies = "memory" in names  # a part of a wider array: the step from row to row is one more argument
         if called is None:
-            kind = ir.FunctionType(ir.VoidType(), [DOUBLE.as_pointer()] * len(names))
+            pointers, steps = [DOUBLE.as_pointer()] * len(names), [LONG] * of_copies
+            kind = ir.FunctionType(ir.VoidType(), pointers + steps)
             called = ir.Function(self._builder.module, kind, f"program_{len(self._programs)}")
             called.linkage, self._programs[function] = "internal", called
             called.attributes.add("noinline")
             builder = ir.IRBuilder(called.append_basic_block())
-            Writer(None, builder, dict(zip(names, called.args, strict=True)), width).write(program)
+            writer = Writer(None, builder, dict(zip(names, called.args, strict=False)), width)
+            writer.stride = called.args[-1]
+            writer.write(program)
             builder.ret_void()
-        self._builder.call(called, [array.pointer for array in arrays])
+        strides = [_as_value(arrays[names.index("memory")].steps[0])] if of_copies else []
+        self._builder.call(called, [*(array.pointer for array in arrays), *strides])
 
     def _new_array(self, shape: Any) -> Array:
         sizes = shape if isinstance(shape, tuple) else (shape,)
         if not all(isinstance(size, int) for size in sizes) or np.prod(sizes) > LONGEST:
             raise Untranslated("an array whose size is not known, or a large one")
         count = int(np.prod(sizes))
-        array = Array(self._slot(DOUBLE, max(count, 1)), sizes)
+        array = self.array_at(self._slot(DOUBLE, max(count, 1)), sizes)
         for at in self._loop(0, count):
             self._builder.store(ir.Constant(DOUBLE, 0.0), self._behind(array.pointer, at), align=8)
         return array

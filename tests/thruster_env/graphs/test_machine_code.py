@@ -104,8 +104,7 @@ def test_programs_are_called_side_by_side(width):
 
 
 def looked_up(x):
-    while x[0] < 1.0:
-        x[0] += 1.0
+    x[0] = sum(value for value in x)
 
 
 def printed(x):
@@ -131,6 +130,27 @@ def at_times(x):
 def test_a_value_that_may_not_have_been_computed_is_a_fault():
     with pytest.raises(RuntimeError, match="does not dominate"):
         machine_code_of(at_times, [(None,)])
+
+
+def columns_doubled(x, first, most):
+    k = 0
+    while k < most and x[0, first] < 100.0:
+        columns = x[1:, first : first + 2]
+        for i in range(columns.shape[0]):
+            for j in range(columns.shape[1]):
+                columns[i, j] *= 2.0
+        x[0, first] += 30.0
+        k += 1
+    return k
+
+
+def test_parts_of_rows_and_loops_of_unknown_length():
+    for most in (0, 2, 9):
+        x = np.arange(15.0).reshape(3, 5)
+        expected = x.copy()
+        result = columns_doubled(expected, 2, most)
+        assert machine(columns_doubled, (None, None), None, None)(x, 2, most) == result
+        assert np.array_equal(x, expected)
 
 
 def divided(a, b):
