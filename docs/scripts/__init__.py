@@ -1,8 +1,8 @@
 """Compute the tables of the docs and draw their pictures: `python -m docs.scripts PAGE`.
 
-A table stands on its page between `<!-- table NAME -->` and `<!-- end -->`. `TABLES` of a module has its function
-by name, which returns Markdown; `FIGURES` that of a picture by the file's name, which writes it to a path. The
-modules are the scripts in this folder, and experiments.
+A table stands on its page, or on that of the same name in docs/appendix, between `<!-- table NAME -->` and
+`<!-- end -->`. `TABLES` of a module has its function by name, which returns Markdown; `FIGURES` that of a picture
+by the file's name, which writes it to a path. The modules are the scripts in this folder, and experiments.
 """
 
 from __future__ import annotations
@@ -69,10 +69,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in options.figure or figures if everything or options.figure else ():
         if not options.check:
             figures[name](options.out / name)
-    page, differing = options.out / f"{options.page}.md", []
-    for name in options.table or tables if everything or options.table else ():
-        if page.exists():  # written one by one, so that what is done stays
-            text = page.read_text(encoding="utf-8")
+    differing: list[str] = []
+    for page in (options.out / f"{options.page}.md", options.out / "appendix" / f"{options.page}.md"):
+        if not page.exists():
+            continue
+        for name in options.table or tables if everything or options.table else ():
+            text = page.read_text(encoding="utf-8")  # written one by one, so that what is done stays
             computed = with_tables(text, {name: tables[name]})
             differing += [name] if computed != text else []
             if not options.check:

@@ -141,7 +141,7 @@ def run_alone(
 def _start(plan: Plan, name: str) -> Choice | None:
     """Noise estimation where gradients of an error follow full matrices; None for the rule of thumb.
 
-    From a start far off these often end elsewhere, and from there they do not (docs/methods.md, groups C and D).
+    From a start far off these often end elsewhere, and from there they do not (docs/appendix/methods.md).
     """
     if name not in OF_STATES or not plan.full_q:
         return None

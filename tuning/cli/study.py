@@ -289,7 +289,9 @@ def methods(
         progress_console.print(f"Interrupted: finished results are in {out}, and the same command continues.")
         raise
     makers = tables(results, protocol)
-    written = [figure(results, protocol, (out if page is None else page.parent) / "methods_groups.png")]
+    picture, written = "methods_groups.png", []
+    if page is None or text is None or picture in text:
+        written.append(figure(results, protocol, (out if page is None else page.parent) / picture))
     if page is not None and text is not None:
         write_whole(page, with_tables(text, makers))
         written.append(page)

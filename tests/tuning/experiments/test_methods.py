@@ -104,7 +104,7 @@ def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     name = file_of(tmp_path, WALK, "likelihood", 1, few)
     assert name.is_file() and file_of(tmp_path, WALK, "likelihood", 1, few._replace(runs=999)) != name
     made = tables(again, few)
-    assert "noise-estimation" in made["what to use"]() and "`walk`" in made["group A"]()
+    assert "noise-estimation" in made["what to use"]() and "`walk`" in made["groups A to D"]()
 
 
 def test_results_that_say_way_are_read(tmp_path):
@@ -156,7 +156,7 @@ def test_a_ring_is_tuned_by_its_inflation_alone():
 
 def test_the_command_writes_its_page(as_json, thruster, tmp_path):  # noqa: F811
     page = tmp_path / "methods.md"
-    page.write_text("# Methods\n\n<!-- table group A -->\n<!-- end -->\n", encoding="utf-8")
+    page.write_text("<!-- table groups A to D -->\n<!-- end -->\n![](methods_groups.png)\n", encoding="utf-8")
     told = as_json("study", "methods", "--quick", "--method", "likelihood", "--method", "start", "--page", page)
     assert "| likelihood |" in page.read_text(encoding="utf-8") and (tmp_path / "methods_groups.png").is_file()
     assert {one["method"] for one in told["results"]} == {"likelihood", "start", "reference"}

@@ -17,7 +17,6 @@ from tuning.experiments.methods.problems import (
     ORACLE,
     RUNS,
     SCALED,
-    SECONDS,
     START,
     STUDY,
     STUDY_LOG_SCORE,
@@ -38,6 +37,7 @@ BLIND = (
 SEARCHES = ("nelder-mead", "coordinate-steps", "tpe-only", "gp-only", "cma-es-only", "random-only")
 ENOUGH, ENOUGH_NATS = 0.005, 0.02  # of log ratios and log scores, up to which the cheaper method is taken
 NO_METHODS = (START, ORACLE)  # nobody has these
+TIMED = ("A", "D", "F")  # groups whose seconds stand beside the budgets
 LEAST, MOST = 1e-4, 3.0  # of log ratios, at which points are clipped
 MARKS = dict(zip(RUNS, (("o", "0.75"), ("o", "C0"), ("o", "C3")), strict=True))
 
@@ -151,55 +151,46 @@ def percent(ratio: float) -> str:
     return f"x {ratio:.3g}" if ratio >= 2.0 else f"{100.0 * (ratio - 1.0):+.1f} %"
 
 
-def group_table(results: Sequence[Result], protocol: Protocol, group: str) -> str:
-    """Regrets of all methods in the cases of a group [%]; in italics if significantly worse than the best."""
-    cases = [case for case in protocol.cases if case.group == group]
+def group_table(results: Sequence[Result], protocol: Protocol, groups: str) -> str:
+    """Regrets [%] of all methods in the cases of some groups; in italics if significantly worse than the best."""
+    cases = [case for case in protocol.cases if case.group in groups]
     columns = [{regret.method: regret for regret in regrets(results, case)} for case in cases]
     methods = dict.fromkeys(method for column in columns for method in column)
-    order = sorted(methods, key=lambda method: _rank(columns, method))
-    heads = ["method", *(f"`{case.name}`" for case in cases), "NEES / n", "passes", "seconds"]
-    return markdown_table(heads, [_row(method, columns) for method in order])
+    rows = []
+    for method in sorted(methods, key=lambda method: _rank(columns, method)):
+        name = f"**{method}**" if method in (STUDY, STUDY_LOG_SCORE) else method
+        values = [column[method].nees for column in columns if method in column]
+        rows.append([name, *(_cell(column.get(method)) for column in columns), spread(values)])
+    heads = ["method", *(f"{case.group}: `{case.name}`" for case in cases), "NEES / n"]
+    return markdown_table(heads, rows)
 
 
 def _rank(columns: Sequence[Mapping[str, Regret]], method: str) -> float:
-    return float(
-        np.mean([math.log(column[method].ratio.value) if method in column else 9.0 for column in columns])
-    )
-
-
-def _row(method: str, columns: Sequence[Mapping[str, Regret]]) -> list[str]:
-    regrets_ = [column[method] for column in columns if method in column]
-    cells = [_cell(column.get(method)) for column in columns]
-    name = f"**{method}**" if method in (STUDY, STUDY_LOG_SCORE) else method
-    cost = (
-        f"{np.median([regret.runs for regret in regrets_]):.0f}",
-        f"{np.median([regret.seconds for regret in regrets_]):.2g}",
-    )
-    return [name, *cells, spread([regret.nees for regret in regrets_]), *cost]
+    return float(np.mean([math.log(column[method].ratio.value) for column in columns if method in column]))
 
 
 def _cell(regret: Regret | None) -> str:
     if regret is None:
         return "-"
-    half = 50.0 * (regret.ratio.high - regret.ratio.low)
-    text = percent(regret.ratio.value)
-    if regret.ratio.value < 2.0 and regret.sets > 1:
-        text = f"{text[:-2]} ± {half:.1f} %" if half < 100.0 else f"{text[:-2]} ± 100 % or more"
-    failed = f", {regret.failures} of {regret.sets} failed" if regret.failures else ""
+    value = 100.0 * (regret.ratio.value - 1.0)
+    text = f"{value:+.1f}" if value < 100.0 else f"{value:+.0f}"
     text = f"*{text}*" if regret.worse else text
-    return f"**{text}**{failed}" if regret.equal else f"{text}{failed}"
+    return f"{f'**{text}**' if regret.equal else text}{' †' if regret.failures else ''}"
 
 
 def budget_table(results: Sequence[Result], protocol: Protocol) -> str:
-    """Mean regret over the cases of groups A to D and F, at each budget of passes and of seconds."""
+    """Mean regret over the cases of groups A to D and F at each budget of passes, and seconds by group."""
     cases = [case for case in protocol.cases if case.group in "ABCDF"]
-    by_runs = [f"{limit:g}" for limit in RUNS if limit <= protocol.runs]
-    by_seconds = [f"{limit:g}" for limit in SECONDS if limit <= protocol.seconds]
-    looks = [(f"{key} passes", within("by_runs", key)) for key in by_runs]
-    looks += [(f"{key} s", within("by_seconds", key)) for key in by_seconds]
+    budgets = [f"{limit:g}" for limit in RUNS if limit <= protocol.runs]
     by_budget = {
-        name: [{regret.method: regret for regret in regrets(results, case, at)} for case in cases]
-        for name, at in looks
+        key: [
+            {regret.method: regret for regret in regrets(results, case, within("by_runs", key))} for case in cases
+        ]
+        for key in budgets
+    }
+    seconds = {
+        key: [{regret.method: regret for regret in regrets(results, case)} for case in cases if case.group == key]
+        for key in TIMED
     }
     rows = []
     for method in (*ALONE, *FULL_METHODS, STUDY, STUDY_LOG_SCORE):
@@ -209,10 +200,12 @@ def budget_table(results: Sequence[Result], protocol: Protocol) -> str:
         ]
         if logs and all(logs):
             means = [float(np.mean(of_budget)) for of_budget in logs]
-            rows.append((means[-1], [method, str(len(logs[-1])), *(percent(math.exp(mean)) for mean in means)]))
-    return markdown_table(
-        ["method", "cases", *by_budget], [row for _, row in sorted(rows, key=lambda pair: pair[0])]
-    )
+            times = [[column[method].seconds for column in each if method in column] for each in seconds.values()]
+            cells = [percent(math.exp(mean)) for mean in means]
+            cells += [f"{np.median(each):.2g}" if each else "-" for each in times]
+            rows.append((means[-1], [method, str(len(logs[-1])), *cells]))
+    heads = ["method", "cases", *(f"{key} passes" for key in budgets), *(f"s, {key}" for key in TIMED)]
+    return markdown_table(heads, [row for _, row in sorted(rows, key=lambda pair: pair[0])])
 
 
 def methods_table() -> str:
@@ -234,12 +227,12 @@ def methods_table() -> str:
 
 def tables(results: Sequence[Result], protocol: Protocol) -> dict[str, Callable[[], str]]:
     """The tables of the page, by name."""
-    of_groups = {f"group {key}": (lambda key=key: group_table(results, protocol, key)) for key in GROUPS}
     return {
         "what to use": lambda: what_to_use(results, protocol),
         "methods": methods_table,
         "budgets": lambda: budget_table(results, protocol),
-        **of_groups,
+        "groups A to D": lambda: group_table(results, protocol, "ABCD"),
+        "groups E to H": lambda: group_table(results, protocol, "EFGH"),
     }
 
 
