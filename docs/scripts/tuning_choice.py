@@ -1,4 +1,4 @@
-"""The tables of docs/tuning.md on objectives, pruning and wrong choices; each takes some minutes."""
+"""The tables of docs/appendix/tuning.md on objectives, pruning and wrong choices; each takes some minutes."""
 
 from __future__ import annotations
 
@@ -139,7 +139,6 @@ FINALISTS = 6
 ROWS, SHORT_ROWS, RUN_STEPS, LEAD_IN = 1500, 200, 60, 20
 STUDIES, TRUTH_STUDIES, SIZE_STUDIES = 200, 300, 2000
 CHUNK = 50  # studies that are simulated at once
-OLD_BLOCKS, EVERY_FOURTH = 8, 4  # of a log, and the share that was set aside, before there were 72 blocks
 GIVEN = "given"
 TIMES = (0, 60, 120, 240)  # time constants of scores [rows]
 
@@ -277,17 +276,12 @@ def empty_logs(count: int, rows: int) -> list[Log]:
     return [Log(f"run{i}", 1.0, np.zeros((rows - 1, 1)), np.zeros((rows, 1)), *channels) for i in range(count)]
 
 
-def blocks_of(logs: int, rows: int, old: bool = False) -> tuple[list[Block], list[Block], list[Block], int]:
-    """Training, validation and held-out blocks of logs, and their lead-in, now or as they were."""
-    blocks = min(OLD_BLOCKS, (rows - 50) // 25) if old else None
-    parts = parts_of(empty_logs(logs, rows), blocks=blocks, sizes=True)
+def blocks_of(logs: int, rows: int) -> tuple[list[Block], list[Block], list[Block], int]:
+    """Training, validation and held-out blocks of logs, and their lead-in."""
+    parts = parts_of(empty_logs(logs, rows), sizes=True)
     training, validation, held_out = (
         [parts.blocks[i] for i in numbers] for numbers in (parts.training, parts.sizes, parts.held_out)
     )
-    if old:
-        both = sorted([*training, *validation])
-        validation = both[EVERY_FOURTH - 1 :: EVERY_FOURTH]
-        training = [block for block in both if block not in validation]
     return training, validation, held_out, parts.lead
 
 
@@ -319,24 +313,13 @@ def is_significant(a: Measured, b: Measured, truth: bool) -> tuple[bool, bool]:
     return ratio.high < equal, ratio.low > equal
 
 
-def before(choosing: Choosing) -> str:
-    """The choice as it was: the best trial, if its interval says that it is better."""
-    return (
-        choosing.best if is_significant(_trial(choosing), choosing.baselines[GIVEN], choosing.ratio)[0] else GIVEN
-    )
-
-
-def after(choosing: Choosing) -> str:
+def chosen_by(choosing: Choosing) -> str:
     """The choice of a study: the first trial in order that can be taken."""
     return next((name for name in choosing.order() if choosing.wins(name)), GIVEN)
 
 
-def _trial(choosing: Choosing) -> Measured:
-    return choosing.trials[choosing.best]
-
-
-def case_rates(case: Case, truth: bool, studies: int = STUDIES, chunk: int = CHUNK) -> tuple[Rates, Rates]:
-    """Rates of wrong choices in a case, before and after.
+def case_rates(case: Case, truth: bool, studies: int = STUDIES, chunk: int = CHUNK) -> Rates:
+    """Rates of wrong choices in a case.
 
     Args:
         case: what is simulated, and given.
@@ -344,27 +327,23 @@ def case_rates(case: Case, truth: bool, studies: int = STUDIES, chunk: int = CHU
         studies: their number.
         chunk: studies that are simulated at once.
     """
-    plan, counts = plan_of(truth), np.zeros((2, 3))
+    plan, counts = plan_of(truth), np.zeros(3)
     start = _optimum(case.runs) if case.from_optimum else np.array([Q, R])
     grid = np.vstack([GRID, start * case.user_factors])
     for first in range(0, studies, chunk):
-        generator = np.random.default_rng(first)
-        count = min(chunk, studies - first)
-        sets = _runs_of(case, grid, generator, count) if truth else _blocks_of(case, grid, generator, count)
-        for which, (training, validation, held_out, logs) in enumerate(sets):
-            for study in range(count):
-                counts[which] += _outcome(
-                    plan, truth, training[study], validation[study], held_out[study], logs, (before, after)[which]
-                )
-    return Rates(*(100.0 * counts[0] / studies)), Rates(*(100.0 * counts[1] / studies))
+        generator, count = np.random.default_rng(first), min(chunk, studies - first)
+        training, validation, held_out, logs = (_runs_of if truth else _blocks_of)(case, grid, generator, count)
+        for study in range(count):
+            counts += _outcome(plan, truth, training[study], validation[study], held_out[study], logs)
+    return Rates(*(100.0 * counts / studies))
 
 
-def _outcome(plan, truth, training, validation, held_out, logs, choose) -> np.ndarray:
+def _outcome(plan, truth, training, validation, held_out, logs) -> np.ndarray:
     """Whether one study takes a trial, keeps wrongly and changes wrongly."""
     finalists = np.argsort(training.sum(axis=0)[:-1])[:FINALISTS].tolist()
     trials = {str(i): measured_of(validation[:, i], truth, logs) for i in finalists}
     choosing = Choosing(plan, {GIVEN: measured_of(validation[:, -1], truth, logs)}, trials)
-    chosen = choose(choosing)
+    chosen = chosen_by(choosing)
     tested = {name: measured_of(held_out[:, int(name)], truth) for name in {choosing.best, chosen} - {GIVEN}}
     baseline = measured_of(held_out[:, -1], truth)
     if chosen == GIVEN:
@@ -379,37 +358,31 @@ def _optimum(runs: Mapping[str, Any]) -> np.ndarray:
 
 
 def _blocks_of(case: Case, grid: np.ndarray, generator: np.random.Generator, studies: int):
-    """Sums of negative log-likelihoods over blocks, (studies, blocks, grid), by old and by new blocks."""
+    """Sums of negative log-likelihoods over blocks, (studies, blocks, grid)."""
     sums = []
     for log in range(3):
         options = case.second if log == 1 and case.second is not None else case.runs
         values = scores(*simulated(generator, studies, case.rows, **options), grid, False)
         sums.append(np.cumsum(np.concatenate([np.zeros_like(values[:1]), values]), axis=0, dtype=np.float64))
-    held_out = blocks_of(3, case.rows)[2]
-    for old in (True, False):
-        training, validation, _, lead = blocks_of(3, case.rows, old)
-        arrays = [
-            np.stack(
-                [
-                    sums[block.run][block.first + block.rows] - sums[block.run][block.first + lead]
-                    for block in blocks
-                ],
-                axis=1,
-            )
-            for blocks in (training, validation, held_out)
-        ]
-        yield *arrays, None if old else np.array([block.run for block in validation])
+    training, validation, held_out, lead = blocks_of(3, case.rows)
+    arrays = [
+        np.stack(
+            [sums[block.run][block.first + block.rows] - sums[block.run][block.first + lead] for block in blocks],
+            axis=1,
+        )
+        for blocks in (training, validation, held_out)
+    ]
+    return *arrays, np.array([block.run for block in validation])
 
 
 def _runs_of(case: Case, grid: np.ndarray, generator: np.random.Generator, studies: int):
-    """Mean square errors of training, validation and held-out runs, (studies, runs, grid), twice."""
+    """Mean square errors of training, validation and held-out runs, (studies, runs, grid)."""
     arrays = []
     for count in (TRAINING_SEEDS, VALIDATION_SEEDS, HELD_OUT_SEEDS):
         states, measured = simulated(generator, studies * count, RUN_STEPS, **case.runs)
         values = scores(states, measured, grid, True)[LEAD_IN:].mean(axis=0, dtype=np.float64)
         arrays.append(values.reshape(studies, count, -1))
-    for _ in range(2):
-        yield *arrays, None
+    return *arrays, None
 
 
 def choice_size(time: float, heavy: bool, studies: int = SIZE_STUDIES) -> tuple[float, float, float, float]:
@@ -449,9 +422,8 @@ def _table(cases: Sequence[Case], truth: bool, studies: int) -> str:
     rows = []
     for case in cases:
         rates = case_rates(case, truth, studies)
-        rows.append([case.about, *(f"{share:.1f}" for part in rates for share in part)])
-    parts = "changed", "false keeps", "false changes"
-    return markdown_table(["case", *(f"{part}, {when} [%]" for when in ("before", "now") for part in parts)], rows)
+        rows.append([case.about, *(f"{share:.1f}" for share in rates)])
+    return markdown_table(["case", "changed [%]", "false keeps [%]", "false changes [%]"], rows)
 
 
 def log_choices(studies: int = STUDIES) -> str:
@@ -469,16 +441,9 @@ def choice_sizes(studies: int = SIZE_STUDIES) -> str:
     rows = []
     for heavy in (False, True):
         for time in TIMES:
-            shares = choice_size(time, heavy, studies)
-            rows.append(
-                ["t, 2.5 degrees" if heavy else "normal", str(time), *(f"{share:.1f}" for share in shares)]
-            )
-    heads = (
-        "all blocks, Student [%]",
-        "every third, Student [%]",
-        "every third, signed ranks [%]",
-        "the choice [%]",
-    )
+            blocks, _, _, choice = choice_size(time, heavy, studies)
+            rows.append(["t, 2.5 degrees" if heavy else "normal", str(time), f"{blocks:.1f}", f"{choice:.1f}"])
+    heads = "all blocks, Student [%]", "the choice [%]"
     return markdown_table(["scores", "time constant [rows]", *heads], rows)
 
 

@@ -27,13 +27,23 @@ from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.parameters import PRESETS
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "plant.md").read_text()
+
+
+def with_appendix(page):
+    """A page of the docs and the page of measurements behind it, if it has one."""
+    paths = ROOT / "docs" / f"{page}.md", ROOT / "docs" / "appendix" / f"{page}.md"
+    return "\n".join(path.read_text() for path in paths if path.exists())
+
+
+PAGE = with_appendix("plant")
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 NUMBER = r"(\d+(?:\.\d+)?(?:e-?\d+)?)"
-FILTER_PAGE = (ROOT / "docs" / "filters.md").read_text()
-TUNING_PAGE = (ROOT / "docs" / "tuning.md").read_text()
+FILTER_PAGE = with_appendix("filters")
+TUNING_PAGE = with_appendix("tuning")
 PAGES = {"plant": PAGE, "filters": FILTER_PAGE, "tuning": TUNING_PAGE}
 FILTER_EXAMPLES = re.findall(r"```python\n(.*?)```", FILTER_PAGE, flags=re.DOTALL)
+WRITTEN = [path for path in sorted((ROOT / "docs").rglob("*.md")) if "tutorials" not in path.parts]
+FENCED = re.compile(r"^```.*?^```", flags=re.DOTALL | re.MULTILINE)
 every_page = pytest.mark.parametrize("page", PAGES)
 KINDS = {
     "Reference signals": REFERENCE_SIGNALS.effects,
@@ -46,7 +56,7 @@ EFFECTS = [(section, name) for section, effects in KINDS.items() for name in eff
 
 
 def pictures_of(page):
-    return set(re.findall(r"!\[.*?\]\((.*?)\)", PAGES[page]))
+    return set(re.findall(r"!\[.*?\]\((?:\.\./)?(.*?)\)", PAGES[page]))
 
 
 def rows_of(section):
@@ -131,13 +141,19 @@ def test_the_page_names_every_env_and_every_preset():
     assert all(f"`{name}`" in PAGE for name in PRESETS)
 
 
-@every_page
+def anchors_of(path):
+    """The anchors of a page's headings."""
+    headings = re.findall(r"^#+ (.*)$", path.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda path: path.name)
 def test_every_link_leads_somewhere(page):
-    text = PAGES[page]
-    headings = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
-    anchors = {re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings}
-    for target in re.findall(r"\]\((?!http)([^)]+)\)", text):
-        assert target[1:] in anchors if target.startswith("#") else (ROOT / "docs" / target).exists(), target
+    for target in re.findall(r"\]\((?!http)([^)\s]+)\)", FENCED.sub("", page.read_text())):
+        name, _, anchor = target.partition("#")
+        path = (page.parent / name).resolve() if name else page
+        assert path.exists() or "tutorials" in name, target
+        assert not anchor or path.suffix != ".md" or anchor in anchors_of(path), target
 
 
 @every_page
@@ -186,7 +202,7 @@ def test_the_chart_of_filters_names_filters_that_there_are():
     from filters.learned.file import LEARNED
 
     assert {name for step in (*STEPS, OTHERWISE) for name in step.filters} <= {*FILTERS, *LEARNED}
-    page = (ROOT / "docs" / "ranking.md").read_text()
+    page = with_appendix("ranking")
     assert FILE in page and as_text() in page
 
 

@@ -57,7 +57,7 @@ def test_the_picture_that_moves_is_small_and_moves():
 
 
 def test_what_tuning_is_worth_is_what_the_page_on_tuning_says():
-    page = (ROOT / "docs" / "tuning.md").read_text().partition("<!-- table earned -->")[2]
+    page = (ROOT / "docs" / "appendix" / "tuning.md").read_text().partition("<!-- table earned -->")[2]
     rows = [[cell.strip("` ") for cell in line.split("|")[1:-1]] for line in page.splitlines()[3:15]]
     ekf = {rows[i - 1][0]: row for i, row in enumerate(rows) if row[1] == "ekf"}  # the row above has the scenario
     ratios = [cell.split()[0] for cell in ekf["outliers"][2:5]]

@@ -168,7 +168,7 @@ def test_a_comparison_s_study_does_not_tune_the_ensemble_size():
 
 
 def test_what_filters_know_has_one_explanation(thruster):  # noqa: F811
-    page = (Path(__file__).parents[2] / "docs" / "tuning.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "appendix" / "tuning.md").read_text()
     help_text = thruster("compare", "--help").stdout.replace("│", " ")
     columns = "".join(line[30:] for line in help_text.splitlines(keepends=True))  # without names and types
     explanation = described(tuning.compare)[1]["knows"].partition(": ")[2]

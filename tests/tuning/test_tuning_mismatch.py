@@ -1,4 +1,4 @@
-"""What tuning can buy where the model is wrong: the script of the table in docs/tuning.md, in a small form."""
+"""What tuning can buy where the model is wrong: a table of docs/appendix/tuning.md, in a small form."""
 
 import numpy as np
 import pytest

@@ -10,6 +10,7 @@ import csv
 import io
 import json
 import math
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
@@ -44,6 +45,7 @@ LEVEL = 0.05  # of a whole table: the chance that Holm's procedure calls any pai
 MARK = "!"  # of a ratio that is significantly above 1
 FIRST = ("given", "scaled default", "rule of thumb", "noise estimation")  # the order of columns; others follow
 TAIL = 0.025  # of a 95 % interval on one side
+LEFT_OUT = "ukf", "ekf-robust"  # of the page's table
 RESULTS = Path("out") / "users"
 
 
@@ -390,8 +392,15 @@ def cases() -> tuple[Case, ...]:
 
 
 def users() -> str:
-    """Scores of tuned filters over those of each baseline, a row per problem and filter."""
-    return markdown(cases())
+    """Scores over those of each baseline of two filters, in parentheses if the interval covers 1."""
+
+    def brief(match: re.Match) -> str:
+        return f"({match[1]})" if float(match[2]) <= 1.0 <= float(match[3]) else match[1]
+
+    lines = [
+        line for line in markdown(cases()).splitlines() if not any(f"| `{name}` |" in line for name in LEFT_OUT)
+    ]
+    return re.sub(r"([\d.]+) \[([\d.]+), ([\d.]+)\]", brief, "\n".join(lines)).replace("1, the same", "1")
 
 
 def losses() -> str:

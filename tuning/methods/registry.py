@@ -124,7 +124,7 @@ def study(task: Task) -> None:
 
     The first trials are the baselines and the maximum-likelihood values. The best trials then meet the baselines
     on validation seeds, and the best baseline is chosen unless one of them is significantly better
-    (docs/tuning.md).
+    (docs/appendix/tuning.md).
     """
     raise ValueError("a study must be run by tuning.tune or thruster tune, but got a task")
 

@@ -138,7 +138,7 @@ def validate(
     If the best trial cannot be taken, the best of those that can is; if there is none, the best baseline. At last
     the log score may decide for another: `_by_log_score`. The level is not divided by the number of trials: a
     trial that is taken by chance is one that hardly differs, and held out it is significantly worse in less than
-    1 % of studies, but where failures are rare (docs/tuning.md).
+    1 % of studies, but where failures are rare (docs/appendix/tuning.md).
 
     Args:
         plan: of the study.
