@@ -1,4 +1,4 @@
-"""Generated pages: the command line's, the operations of a filter's page, and the tutorials of examples."""
+"""Generated pages: the command line's, operations, methods of tuning, and the tutorials of examples."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ EXAMPLES = re.compile(r"^Example: thruster .*(?:\n\nExample: thruster .*)*$", re
 SUMMARY = re.compile(r"^(\* `(\w+)`: ).*\.\.\.$", re.MULTILINE)
 GIVEN_BY_NAME = re.compile(r"\[default: \(([^()]*)\)")
 OPERATIONS_PAGE = "reference/operations"
+METHODS_PAGE = "appendix/methods"
 ALGEBRA = {
     "operations": "Symmetry, angles, missing channels, quotients, numbers",
     "points": "Roots, sigma points, weights, densities",
@@ -105,8 +106,23 @@ def _operations_of(name: str, title: str) -> Iterator[str]:
         yield f"| `{public}({', '.join(arguments)})` | {result} |"
 
 
+# What `thruster methods` says, as a table.
+
+
+def methods() -> str:
+    """All methods of tuning, what they need, when to use which, and whose they are, in Markdown."""
+    from tuning.methods.registry import GRADIENT, METHODS, TRUTH
+
+    needs = {TRUTH: "true states", GRADIENT: "a gradient"}
+    lines = ["## Every method", "", "| method | what it does | needs | use it | source |", "|---|---|---|---|---|"]
+    for name, method in METHODS.items():
+        needed = ", ".join(text for need, text in needs.items() if need in method.needs)
+        lines.append(f"| `{name}` | {method.about} | {needed} | {method.when} | {method.source} |")
+    return "\n".join(lines)
+
+
 def _append(app, name: str, source: list[str]) -> None:
-    for page, generate in ((PAGE, commands), (OPERATIONS_PAGE, operations)):
+    for page, generate in ((PAGE, commands), (OPERATIONS_PAGE, operations), (METHODS_PAGE, methods)):
         if name == page:
             source[0] += "\n" + generate()
 

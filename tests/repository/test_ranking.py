@@ -1,4 +1,4 @@
-"""Where filters differ: each claim in a quick form whose paired interval leaves no doubt, and docs/ranking.md."""
+"""Where filters differ: each claim in a quick form whose paired interval leaves no doubt, and its page."""
 
 import dataclasses
 import re
@@ -72,7 +72,8 @@ def test_there_iteration_brings_the_ekf_to_half_and_an_honest_covariance(publish
     assert published_noise["iekf"].evaluation.nees.value < 3
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "ranking.md").read_text()
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = "\n".join((DOCS / name).read_text() for name in ("ranking.md", "appendix/ranking.md"))
 
 
 def table(name):
@@ -111,8 +112,8 @@ def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
     *networks, gain = map(float, elsewhere["`dropout`"])
     assert min(networks) > 5 > 1.05 > gain and "**" in elsewhere["`mismatch`"][0]
     conditional, accurate = table("conditional"), table("accurate")
-    assert all(center(conditional["rbpf 100"][i]) < 1.01 * center(conditional["pf 1000"][i]) for i in range(4))
-    assert all(center(accurate["pf 1000 optimal"][i]) <= center(accurate["pf 10000"][i]) for i in range(4))
+    assert all(center(conditional["rbpf 100"][i]) < 1.01 * center(conditional["pf 1000"][i]) for i in range(2))
+    assert all(center(accurate["pf 1000 optimal"][i]) <= center(accurate["pf 10000"][i]) for i in range(2))
     assert upper(table("constants")["pf 300 smoothed + U_0"][3]) < center(table("constants")["pf 300 + U_0"][3])
     assert len(table("scores")) == len(SCENARIOS)
     rows = table("network_mismatch")

@@ -45,7 +45,7 @@ LEVEL = 0.05  # of a whole table: the chance that Holm's procedure calls any pai
 MARK = "!"  # of a ratio that is significantly above 1
 FIRST = ("given", "scaled default", "rule of thumb", "noise estimation")  # the order of columns; others follow
 TAIL = 0.025  # of a 95 % interval on one side
-LEFT_OUT = "ukf", "ekf-robust"  # of the page's table
+NOT_ON_PAGE = "ukf", "ekf-robust", "over rule of thumb", "over oracle"  # of the table
 RESULTS = Path("out") / "users"
 
 
@@ -392,15 +392,22 @@ def cases() -> tuple[Case, ...]:
 
 
 def users() -> str:
-    """Scores over those of each baseline of two filters, in parentheses if the interval covers 1."""
+    """Scores of two filters over those of three baselines, in parentheses if the interval covers 1."""
 
-    def brief(match: re.Match) -> str:
-        return f"({match[1]})" if float(match[2]) <= 1.0 <= float(match[3]) else match[1]
+    def brief(cell: str) -> str:
+        match = re.match(r"([\d.]+) \[([\d.]+), ([\d.]+)\]", cell)
+        if match is None:
+            return cell.removesuffix(", the same")
+        covers = float(match[2]) <= 1.0 <= float(match[3])
+        return (f"({match[1]})" if covers else match[1]) + cell[match.end() :]
 
-    lines = [
-        line for line in markdown(cases()).splitlines() if not any(f"| `{name}` |" in line for name in LEFT_OUT)
-    ]
-    return re.sub(r"([\d.]+) \[([\d.]+), ([\d.]+)\]", brief, "\n".join(lines)).replace("1, the same", "1")
+    panel = cases()
+    heads = header(panel)
+    columns = [at for at, head in enumerate(heads) if head not in NOT_ON_PAGE]
+    rows = [row for row in rows_of(panel) if row[1] not in NOT_ON_PAGE]
+    cells = [[brief(row[at]) for at in columns] for row in rows]
+    names = [[f"`{row[0]}`" if row[0] else "", f"`{row[1]}`", *row[2:]] for row in cells]
+    return markdown_table([heads[at] for at in columns], names)
 
 
 def losses() -> str:

@@ -12,7 +12,6 @@ import numpy as np
 from thruster_env.core.files import new_figure, save_figure, tidy
 from thruster_env.core.text_tables import markdown_table
 from tuning.experiments.methods.problems import (
-    FULL_METHODS,
     GROUPS,
     ORACLE,
     RUNS,
@@ -25,7 +24,7 @@ from tuning.experiments.methods.problems import (
     Protocol,
 )
 from tuning.experiments.methods.runs import Regret, Result, regrets, within
-from tuning.methods.registry import ALONE, GRADIENT, METHODS, TRUTH
+from tuning.methods.registry import ALONE, TRUTH
 from tuning.search.objectives import LIKELIHOOD
 
 # Methods that look at no true state; but searches minimise an error where there are true states.
@@ -37,7 +36,6 @@ BLIND = (
 SEARCHES = ("nelder-mead", "coordinate-steps", "tpe-only", "gp-only", "cma-es-only", "random-only")
 ENOUGH, ENOUGH_NATS = 0.005, 0.02  # of log ratios and log scores, up to which the cheaper method is taken
 NO_METHODS = (START, ORACLE)  # nobody has these
-TIMED = ("A", "D", "F")  # groups whose seconds stand beside the budgets
 LEAST, MOST = 1e-4, 3.0  # of log ratios, at which points are clipped
 MARKS = dict(zip(RUNS, (("o", "0.75"), ("o", "C0"), ("o", "C3")), strict=True))
 
@@ -178,59 +176,10 @@ def _cell(regret: Regret | None) -> str:
     return f"{f'**{text}**' if regret.equal else text}{' †' if regret.failures else ''}"
 
 
-def budget_table(results: Sequence[Result], protocol: Protocol) -> str:
-    """Mean regret over the cases of groups A to D and F at each budget of passes, and seconds by group."""
-    cases = [case for case in protocol.cases if case.group in "ABCDF"]
-    budgets = [f"{limit:g}" for limit in RUNS if limit <= protocol.runs]
-    by_budget = {
-        key: [
-            {regret.method: regret for regret in regrets(results, case, within("by_runs", key))} for case in cases
-        ]
-        for key in budgets
-    }
-    seconds = {
-        key: [{regret.method: regret for regret in regrets(results, case)} for case in cases if case.group == key]
-        for key in TIMED
-    }
-    rows = []
-    for method in (*ALONE, *FULL_METHODS, STUDY, STUDY_LOG_SCORE):
-        logs = [
-            [math.log(column[method].ratio.value) for column in columns if method in column]
-            for columns in by_budget.values()
-        ]
-        if logs and all(logs):
-            means = [float(np.mean(of_budget)) for of_budget in logs]
-            times = [[column[method].seconds for column in each if method in column] for each in seconds.values()]
-            cells = [percent(math.exp(mean)) for mean in means]
-            cells += [f"{np.median(each):.2g}" if each else "-" for each in times]
-            rows.append((means[-1], [method, str(len(logs[-1])), *cells]))
-    heads = ["method", "cases", *(f"{key} passes" for key in budgets), *(f"s, {key}" for key in TIMED)]
-    return markdown_table(heads, [row for _, row in sorted(rows, key=lambda pair: pair[0])])
-
-
-def methods_table() -> str:
-    """What the methods are, whose, and when to use which."""
-    rows = [
-        [
-            f"`{name}`",
-            method.about,
-            "yes" if TRUTH in method.needs else "",
-            "yes" if GRADIENT in method.needs else "",
-            method.when,
-        ]
-        for name, method in METHODS.items()
-    ]
-    sources = [method.source for method in METHODS.values()]
-    heads = ["method", "what it does", "truth", "gradient", "use it", "source"]
-    return markdown_table(heads, [[*row, source] for row, source in zip(rows, sources, strict=True)])
-
-
 def tables(results: Sequence[Result], protocol: Protocol) -> dict[str, Callable[[], str]]:
     """The tables of the page, by name."""
     return {
         "what to use": lambda: what_to_use(results, protocol),
-        "methods": methods_table,
-        "budgets": lambda: budget_table(results, protocol),
         "groups A to D": lambda: group_table(results, protocol, "ABCD"),
         "groups E to H": lambda: group_table(results, protocol, "EFGH"),
     }
