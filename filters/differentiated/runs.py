@@ -139,8 +139,7 @@ def derivatives(
     the model in place of its own. A parameter may move its `own_parameters` by `own_slopes`, (p, their count).
     An output that is not wanted is empty: (B, 0, 0).
     """
-    count, parameters, m, functions = len(measurements), len(slopes.constants), model.m, model.functions
-    given_model = model
+    parameters, given_model, functions = len(slopes.constants), model, model.functions
     model, page, own_parameters = differentiable(model, used)
     if model.functions != functions:  # those of an affine approximation, with constants of its own
         if wanted.constants:
@@ -155,36 +154,68 @@ def derivatives(
     if isinstance(used, PageFilter) and used.follows_from:
         own_slopes = own_slopes + _following(used, given_model, slopes)
     wanted = wanted._replace(own=bool(own_slopes.any()))
-    recursion = recursion_of(model.functions, model.shape, wanted, page)
-    begun = as_the_prior_says(model, count) if starts is None else starts
-    moves_prior = 1.0 - (begun.free & begun.held).astype(np.float64)  # of runs whose priors parameters move
-    density = density or Density(np.inf, np.ones(m))
-    turns = 1 if (density.seen > 0).all() else 2  # channels that are predicted only come after the others
-    tails = [tail_of(np.inf, m), tail_of(density.degrees, m)]
-    states, weights = truth or Truth(np.zeros((count, 0, 0)), np.zeros(0))
-    of_density = tails if turns == 2 else tails[::-1]
-    numbers = np.concatenate([model.numbers, *of_density, own_parameters, np.diag(weights).ravel()])
-    out = np.zeros((count, blocks, 1 + parameters))
-    information = np.zeros((count, parameters, parameters) if wanted.information else (count, 0, 0))
-    arguments = (
-        *(np.ascontiguousarray(array) for array in (inputs, measurements, states, _begins(model, begun))),
-        numbers,
-        _moves(slopes, own_slopes, model),
-        moves_prior,
-        begun.counted_from.astype(np.float64),
-        density.seen,
-        turns,
-        out,
-        information,
+    repeated = RepeatedRuns(
+        *(model, page, wanted, inputs, measurements),
+        density=density,
+        blocks=blocks,
+        starts=starts,
+        truth=truth,
     )
-    at_once, sizes = recursion.at_once, recursion.sizes(parameters)
+    return repeated(model.numbers, moves_of(slopes, own_slopes, model), own_parameters)
 
-    def run_some(first: int, last: int) -> None:
-        memory = (np.zeros(size) for size in sizes)
-        recursion.run(*arguments, *memory, first * at_once, min(last * at_once, count))
 
-    spread(run_some, -(-count // at_once))
-    return out, information
+class RepeatedRuns:
+    """`derivatives` on the same runs for many numbers of one model, without finding its code anew.
+
+    Arguments are those of `derivatives`; the page is that of the filter, and the prior of runs without a start of
+    their own is the model's.
+    """
+
+    def __init__(
+        self,
+        model: StateSpaceModel,
+        page: Page,
+        wanted: Wanted,
+        inputs: np.ndarray,
+        measurements: np.ndarray,
+        *,
+        density: Density | None = None,
+        blocks: int = 1,
+        starts: Starts | None = None,
+        truth: Truth | None = None,
+    ):
+        """Find the compiled recursion; see the class for the arguments."""
+        m, density = model.m, density or Density(np.inf, np.ones(model.m))
+        begun = as_the_prior_says(model, len(measurements)) if starts is None else starts
+        states, weights = truth or Truth(np.zeros((len(measurements), 0, 0)), np.zeros(0))
+        self._recursion = recursion_of(model.functions, model.shape, wanted, page)
+        self._blocks, self._informative = blocks, wanted.information
+        turns = 1 if (density.seen > 0).all() else 2  # channels that are predicted only come after the others
+        tails = [tail_of(np.inf, m), tail_of(density.degrees, m)]
+        self._tails, self._weights = tails if turns == 2 else tails[::-1], np.diag(weights).ravel()
+        arrays = inputs, measurements, states, _begins(model, begun)
+        self._data = tuple(np.ascontiguousarray(array) for array in arrays)
+        moves_prior = 1.0 - (begun.free & begun.held).astype(np.float64)  # of runs whose priors parameters move
+        self._settings = moves_prior, begun.counted_from.astype(np.float64), density.seen, turns
+
+    def __call__(
+        self, numbers: np.ndarray, moves: np.ndarray, own_parameters: Sequence[float] | np.ndarray = ()
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The results of `derivatives` for a model's numbers and rows of `moves_of`."""
+        count, parameters = len(self._data[1]), len(moves)
+        numbers = np.concatenate([numbers, *self._tails, own_parameters, self._weights])
+        out = np.zeros((count, self._blocks, 1 + parameters))
+        information = np.zeros((count, parameters, parameters) if self._informative else (count, 0, 0))
+        moves = moves if parameters else np.zeros((1, moves.shape[1]))  # compiled code reads a row
+        arguments = *self._data, numbers, moves, *self._settings, out, information
+        at_once, sizes, run = self._recursion.at_once, self._recursion.sizes(parameters), self._recursion.run
+
+        def run_some(first: int, last: int) -> None:
+            memory = (np.zeros(size) for size in sizes)
+            run(*arguments, *memory, first * at_once, min(last * at_once, count))
+
+        spread(run_some, -(-count // at_once))
+        return out, information
 
 
 def _following(used: PageFilter, model: StateSpaceModel, slopes: ModelSlopes) -> np.ndarray:
@@ -212,14 +243,13 @@ def _begins(model: StateSpaceModel, starts: Starts) -> np.ndarray:
     return np.concatenate([means, covs.reshape(count, model.n**2)], axis=1)
 
 
-def _moves(slopes: ModelSlopes, own_slopes: np.ndarray, model: StateSpaceModel) -> np.ndarray:
-    """Rows of parameters as in `Memory`; at least one, because compiled code reads it."""
+def moves_of(slopes: ModelSlopes, own_slopes: np.ndarray, model: StateSpaceModel) -> np.ndarray:
+    """Rows of parameters as in `Memory`."""
     p, nn, mm = len(slopes.constants), model.n**2, model.m**2
     noise = slopes.process_noise_cov.reshape(p, nn), slopes.measurement_noise_cov.reshape(p, mm)
     prior = slopes.prior_mean, slopes.prior_cov.reshape(p, nn)
     of_constants = slopes.constants, _relative(slopes.constants, model)[:, None]
-    rows = np.concatenate([*noise, *of_constants, *prior, own_slopes], axis=1)
-    return rows if p else np.zeros((1, rows.shape[1]))
+    return np.concatenate([*noise, *of_constants, *prior, own_slopes], axis=1)
 
 
 def _relative(slopes: np.ndarray, model: StateSpaceModel) -> np.ndarray:

@@ -14,6 +14,7 @@ import filters
 import tuning
 from filters.models import NAMED, Scales, named_model
 from tuning.series.column import column_of
+from tuning.series.likelihood import ColumnLikelihood
 from tuning.series.paste import LANGUAGES
 
 NILE = """
@@ -63,7 +64,11 @@ def test_the_nile_has_the_variances_of_durbin_and_koopman(nile):
     """Durbin, Koopman (2012), section 2.10.3: 1469.1 and 15098.5."""
     drift, noise = nile.numbers
     assert drift.value == pytest.approx(1469.1, rel=1e-3) and nile.r == pytest.approx(15098.5, rel=1e-4)
-    assert nile.q[0, 0] == drift.value and drift.low < 1469.1 < drift.high and noise.unit == ""
+    assert (
+        nile.q[0, 0] == pytest.approx(drift.value, rel=1e-12)
+        and drift.low < 1469.1 < drift.high
+        and noise.unit == ""
+    )
     assert nile.gain[0] == pytest.approx(0.267, abs=1e-3)  # section 2.11
     assert nile.memory == pytest.approx(-1.0 / math.log(1.0 - nile.gain[0]), rel=1e-9)
     assert not nile.is_wrong and "white" in nile.sentences()[-1]
@@ -194,6 +199,16 @@ def test_the_filter_is_the_one_of_the_estimates(position):
     settled = position.estimates
     gain = settled.means[0, -1] - position.model.matrices()[0] @ settled.means[0, -2]
     np.testing.assert_allclose(gain / settled.innovations[0, -1, 0], position.gain, rtol=1e-9)
+
+
+def test_the_likelihood_is_that_of_the_filters_innovations_and_its_scale_the_best(position):
+    likelihood = ColumnLikelihood(named_model(position.name), position.column)
+    at = likelihood.coordinates.of([number.value for number in position.numbers])
+    terms = position.estimates.log_likelihoods[0, position.model.n :]
+    assert likelihood.value(at) == pytest.approx(terms.sum(), rel=1e-9)
+    value, scaled = likelihood.scaled(at + [1.5, 0.7])
+    here = likelihood(scaled)
+    assert here.value == pytest.approx(value, rel=1e-9) and abs(here.gradient.sum()) < 1e-4
 
 
 def test_lines_for_python_make_the_same_filter(position):

@@ -9,7 +9,7 @@ import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from errno import EACCES, EISDIR, ENOENT
 from importlib.util import find_spec
 from os import PathLike, strerror
@@ -57,6 +57,7 @@ class Table:
     clock: np.ndarray | None = None
     damage: tuple[str, ...] = ()
     remarks: Sequence[Remark] = ()
+    parsed: dict[str, np.ndarray | None] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -76,17 +77,15 @@ class Table:
         if isinstance(cells, np.ndarray) and cells.dtype.kind not in "OU":
             numbers = cells.astype(np.float64)
         else:
-            texts = _texts(cells)
-            try:
-                numbers = np.array(texts, dtype=np.float64)
-                if not _is_written("".join(texts)):
-                    raise ValueError
-            except ValueError:
+            parsed = self._parsed(column)
+            if parsed is None:
+                texts = _texts(cells)
                 row = next(row for row, text in enumerate(texts) if not _is_number(text))
                 has_comma = texts[row].count(",") == 1 and _is_number(texts[row].replace(",", "."))
                 rule = "columns must hold numbers" + ", with decimal points" * has_comma
                 where = self.location(row, column)
-                raise ValueError(f"{rule}, but got {short_repr(cells[row])} in {where}") from None
+                raise ValueError(f"{rule}, but got {short_repr(cells[row])} in {where}")
+            numbers = parsed.copy()
         if np.isinf(numbers).any():
             row = int(np.argmax(np.isinf(numbers)))
             raise ValueError(f"numbers must be finite, but got {numbers[row]} in {self.location(row, column)}")
@@ -99,9 +98,9 @@ class Table:
             return None
         if isinstance(cells, np.ndarray) and cells.dtype.kind in "mM":
             return since_first(cells)
-        texts = _texts(cells)
-        if all(map(_is_number, texts)):
+        if self._parsed(column) is not None:
             return None
+        texts = _texts(cells)
         try:
             seconds = seconds_of(texts)
         except ValueError as error:
@@ -112,6 +111,23 @@ class Table:
             if text != MISSING_TEXT and np.isnan(seconds[row]):
                 raise ValueError(f"{DATES}, but got {short_repr(text)} in {self.location(row, column)}")
         return seconds
+
+    def _parsed(self, column: str) -> np.ndarray | None:
+        """The texts of a column as numbers, which is done once; None if some are no numbers."""
+        if column not in self.parsed:
+            self.parsed[column] = _as_numbers(self.cells[column])
+        return self.parsed[column]
+
+
+def _as_numbers(cells: Sequence | np.ndarray) -> np.ndarray | None:
+    for texts in (cells, None):  # most columns lack nothing
+        texts = _texts(cells) if texts is None else texts
+        try:
+            if _is_written("".join(texts)):
+                return np.array(texts, dtype=np.float64)
+        except (ValueError, TypeError):
+            continue
+    return None
 
 
 def _texts(cells: Sequence | np.ndarray) -> list[str]:
@@ -162,6 +178,12 @@ def _read_csv(path: Path) -> Table:
         raise ValueError(f"a log must have a header and rows, but {path} is empty")
     first = text.lstrip().splitlines()[0]
     delimiter = max(DELIMITERS, key=first.count)
+    plain = _plain_columns(text, delimiter)
+    if plain is not None:
+        header, columns = plain
+        header[0] = header[0].lstrip("#%").strip()
+        _check_header(header, 1, path)
+        return _of_texts(path, text, header, columns, range(2, 2 + len(columns[0])))
     if delimiter not in first and len(first.split()) > 1:
         numbered = [(line, row.split()) for line, row in enumerate(text.splitlines(), 1) if row.strip()]
         numbered[0] = (numbered[0][0], first.removeprefix("#").split())
@@ -180,11 +202,35 @@ def _read_csv(path: Path) -> Table:
             raise ValueError(f"{rule}, but got {len(row)} in line {line} of {path}")
     if not rows:
         raise ValueError(f"a log must have a header and rows, but {path} has only a header")
-    columns = list(zip(*(row for _, row in rows), strict=True))
+    columns = [list(column) for column in zip(*(row for _, row in rows), strict=True)]
+    return _of_texts(path, text, header, columns, [line for line, _ in rows])
+
+
+def _plain_columns(text: str, delimiter: str) -> tuple[list[str], list[list[str]]] | None:
+    """Header and columns of a text without quotes and blank lines, whose rows have as many cells; None for others.
+
+    It takes a fifth of the time of a reader of CSV.
+    """
+    if '"' in text or "\r" in text or delimiter not in text:
+        return None
+    lines = text.removesuffix("\n").split("\n")
+    counts = {line.count(delimiter) for line in lines}
+    if len(counts) > 1 or len(lines) < 2:
+        return None
+    width = 1 + counts.pop()
+    cells = [*map(str.strip, delimiter.join(lines).split(delimiter))]
+    columns = [cells[j::width] for j in range(width)]
+    blank = any(not any(column[row] for column in columns) for row, cell in enumerate(columns[0]) if not cell)
+    return None if blank else ([column[0] for column in columns], [column[1:] for column in columns])
+
+
+def _of_texts(
+    path: Path, text: str, header: Sequence[str], columns: Sequence[Sequence[str]], lines: Sequence[int]
+) -> Table:
     named = {name: cells for name, cells in zip(header, columns, strict=True) if name}
-    damage = f"line {rows[-1][0]} of {path}, the last, has no end, its number the fewest digits: it may be cut"
+    damage = f"line {lines[-1]} of {path}, the last, has no end, its number the fewest digits: it may be cut"
     is_cut = not text.endswith(("\n", "\r")) and _is_shortest(columns[-1])
-    return Table(str(path), named, [line for line, _ in rows], damage=(damage,) * is_cut)
+    return Table(str(path), named, lines, damage=(damage,) * is_cut)
 
 
 def _is_shortest(cells: Sequence[str]) -> bool:

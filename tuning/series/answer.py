@@ -20,7 +20,8 @@ from thruster_env.core.text_tables import plain_text, table
 from thruster_env.model.affine import AffineModel
 from tuning.api.display import frame, html
 from tuning.series.column import Column
-from tuning.series.fit import Candidate, Number, behind, filtered, model_of
+from tuning.series.fit import Candidate, Number, behind, filtered
+from tuning.series.likelihood import model_of
 from tuning.series.paste import lines_of
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ Pawitan (2001), In All Likelihood, section 2.6, for intervals.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -26,15 +26,13 @@ from scipy.stats import chi2
 
 from filters.engine.batch import Estimates, run
 from filters.gaussian.kalman import KalmanFilter
-from filters.models import Scales, Sum, in_unit, named_model
-from filters.starts import Starts
+from filters.models import Scales, Sum, named_model
 from thruster_env.core.streams import filter_keys
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.objective import Ascent, Objective, climb
-from tuning.problems.data import Data
-from tuning.problems.problem import Coordinates, Parameter, squared
+from tuning.identification.objective import Ascent, climb
 from tuning.series.column import Column
+from tuning.series.likelihood import ColumnLikelihood, model_of
 
 AUTO = "auto"
 CANDIDATES = (
@@ -48,9 +46,6 @@ CANDIDATES = (
 BLOCKS = 20  # of the record, of which half are unseen at a time
 EVIDENCE = 3.0  # log-likelihood by which a simpler model may always be behind the best one
 MOST_ROWS = 20_000  # on which models are compared
-RUN = 4096  # rows of a run, into which a long record is cut: runs are filtered side by side
-R = "R"
-R_ENDS = 1e-6, 1e1  # range of R, in squares of the roughness
 SHARES = 0.01, 0.2, 0.9  # R from which searches begin, in squares of the roughness
 SEARCHES = 3
 EXACT = 1e-8  # predicted rise of the log-likelihood at which the last search ends
@@ -82,7 +77,7 @@ class Fitted(NamedTuple):
     """A model's maximum of the likelihood, and the function that it is the maximum of."""
 
     model: Sum
-    objective: Objective
+    objective: ColumnLikelihood
     ascent: Ascent
     rivals: tuple[Ascent, ...]  # maxima to which searches led from elsewhere, perhaps the same one
     held_out: np.ndarray  # (blocks,)
@@ -91,7 +86,7 @@ class Fitted(NamedTuple):
     def candidate(self) -> Candidate:
         """What is left of it for the answer: plain data."""
         values = self.objective.coordinates.named(self.ascent.at)
-        size = len(self.model.free), self.objective.model_at(self.ascent.at).n
+        size = len(self.model.free), self.objective.states
         return Candidate(self.model.name, values, self.ascent.found.value, self.held_out, size)
 
 
@@ -142,54 +137,6 @@ def choose(column: Column, names: Sequence[str], progress: Callable[[str], None]
     return Choice(chosen.candidate, candidates, _numbers(chosen))
 
 
-def model_of(candidate: Sum, column: Column, values: Mapping[str, float]) -> AffineModel:
-    """The model of a column for values of a candidate's free numbers and R."""
-    return candidate.model(
-        {name: value for name, value in values.items() if name != R},
-        values[R],
-        column.dt,
-        first=column.first,
-        spread=column.scales.spread,
-        offset=column.mean if candidate.about_mean else 0.0,
-        quantity=column.quantity,
-    )
-
-
-def _runs(values: np.ndarray) -> np.ndarray:
-    """The numbers as runs (B, K) of equal length, NaN at the end of the last one."""
-    count = max(1, round(len(values) / RUN))
-    padded = np.full(count * -(-len(values) // count), np.nan)
-    padded[: len(values)] = values
-    return padded.reshape(count, -1)
-
-
-def _objective(candidate: Sum, column: Column) -> Objective:
-    """The log-likelihood of the record, whose runs begin without a prior: their first rows do not count."""
-    scales, unit, runs = column.scales, column.quantity.unit, _runs(column.values)
-    free = [
-        Parameter(number.name, low, high, in_unit(number.unit, unit), default=number.values(scales)[0])
-        for number in candidate.free
-        for low, high in [number.range(scales)]
-    ]
-    low, high = (factor * scales.roughness**2 for factor in R_ENDS)
-    free.append(Parameter(R, low, high, squared(unit), default=SHARES[1] * scales.roughness**2))
-
-    def make(**values: float) -> AffineModel:
-        return model_of(candidate, column, values)
-
-    model, count = make(**{parameter.name: parameter.start for parameter in free}), len(runs)
-    measured = ~np.isnan(runs)
-    begins = np.where(measured.any(axis=1), runs[np.arange(count), measured.argmax(axis=1)], 0.0)
-    _, _, _, output, offset = model.matrices()
-    means = np.tile(model.prior_mean, (count, 1))
-    means[:, int(output[0].argmax())] = begins - offset
-    leads = np.array([np.searchsorted(rows, model.n) + 1 for rows in measured.cumsum(axis=1)])
-    starts = Starts(np.ones(count, dtype=bool), means, np.tile(model.prior_cov, (count, 1, 1)), leads)
-    inputs = np.zeros((count, runs.shape[1] - 1, 0))
-    data = Data(tuple(range(count)), inputs, runs[:, :, None], filter_keys(range(count)))
-    return Objective(data, make, Coordinates(free), filter="kf", starts=starts)
-
-
 def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
     """The candidate with the likeliest numbers, and its likelihood on blocks that it was not fitted on.
 
@@ -209,7 +156,7 @@ def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
 
 def _maximum(candidate: Sum, column: Column) -> Fitted:
     """The candidate with the likeliest numbers for a column."""
-    objective = _objective(candidate, column)
+    objective = ColumnLikelihood(candidate, column)
     bounds = objective.coordinates.low, objective.coordinates.high
     ascents = [climb(objective, at, *bounds) for at in _starts(objective, candidate, column.scales)]
     ascent = climb(objective, max(ascents, key=lambda end: end.found.value).at, *bounds, enough=EXACT)
@@ -220,7 +167,7 @@ def _maximum(candidate: Sum, column: Column) -> Fitted:
 
 def _on_all(chosen: Fitted, column: Column) -> Fitted:
     """A candidate that was fitted on a part of the record, on the whole of it."""
-    objective = _objective(chosen.model, column)
+    objective = ColumnLikelihood(chosen.model, column)
     coordinates = objective.coordinates
     begin = np.clip(coordinates.of(list(chosen.candidate.values.values())), coordinates.low, coordinates.high)
     ascent = climb(objective, begin, coordinates.low, coordinates.high)
@@ -242,18 +189,19 @@ def filtered(model: StateSpaceModel, column: Column) -> Estimates:
     return run(KalmanFilter(model=model), filter_keys([0]), inputs, column.values[None, :, None])
 
 
-def _starts(objective: Objective, candidate: Sum, scales: Scales) -> list[np.ndarray]:
+def _starts(objective: ColumnLikelihood, candidate: Sum, scales: Scales) -> list[np.ndarray]:
     """Points from which searches begin, of all combinations of values and shares of noise in the roughness.
 
-    They are the likeliest ones that differ in the first number: a likelihood may have several maxima along it.
+    Each is scaled to its largest likelihood. They are the likeliest ones that differ in the first number: a
+    likelihood may have several maxima along it.
     """
     first, *further = (number.values(scales) for number in candidate.free)
     noise = [share * scales.roughness**2 for share in SHARES]
     best = []
     for value in first:
         points = [objective.coordinates.of(point) for point in product([value], *further, noise)]
-        best.append(max(points, key=objective.value))
-    return sorted(best, key=objective.value)[-SEARCHES:]
+        best.append(max((objective.scaled(point) for point in points), key=lambda scaled: scaled[0]))
+    return [at for _, at in sorted(best, key=lambda scaled: scaled[0])[-SEARCHES:]]
 
 
 def behind(candidate: Candidate, best: Candidate) -> tuple[float, float]:
