@@ -1,4 +1,4 @@
-"""Which filter, which N for the vehicle: claims of docs/auv.md in a quick form, and on the page's own runs."""
+"""Which filter, which N for the vehicle: claims of docs/auv.md in a quick form, and by its tables."""
 
 import re
 from pathlib import Path
@@ -10,12 +10,12 @@ from docs.scripts.auv import EKF, FILTERS, MOTION, NAVIGATION, TABLES, about, re
 from filters.consistency.intervals import Interval
 from tuning.auv.scenario import find_scenario
 
-PAGE = (Path(__file__).parents[2] / "docs" / "auv.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "appendix" / "auv.md").read_text()
 BAND = (0.8, 1.25)  # of the mean NIS over what is right, as a study holds it
 
 
 def printed(name):
-    """Cells of a table of the page, a row each; "value ± half of right" becomes numbers."""
+    """Cells of a table of the page, a row each."""
     text = re.search(rf"<!-- table {name} -->\n(.*?)\n<!-- end -->", PAGE, flags=re.DOTALL)[1]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:]]
 
@@ -28,9 +28,8 @@ def numbers(cell):
 def by_label(name):
     """NEES with half of its interval, mean NIS over what is right, and score over the EKF's, by filter."""
     found = {}
-    for label, _, ratio, nees, nis in printed(name):
-        value, _, right = numbers(nis)
-        found[label] = numbers(nees)[:2], value / right, numbers(ratio)[0]
+    for label, ratio, nees, nis in printed(name):
+        found[label] = numbers(nees), float(nis), numbers(ratio)[0]
     return found
 
 

@@ -8,7 +8,8 @@ from thruster_env.auv.model import MODELS
 from thruster_env.auv.parameters import PRESETS, VehicleParameters
 from thruster_env.auv.plant import CHANNELS, INSTRUMENTS, SUITES, make_plant
 
-PAGE = (Path(__file__).resolve().parents[3] / "docs" / "auv.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+PAGE = "\n".join((DOCS / name).read_text(encoding="utf-8") for name in ("auv.md", "appendix/auv.md"))
 
 
 def test_the_page_names_every_preset_argument_suite_and_model():
