@@ -259,7 +259,7 @@ def _smoothed_rmse(filter_, runs, lag: int) -> float:
 CENTRE = 12.0  # [V]
 SHOWN_WIDTH = 12.0  # [V], of the run that is drawn
 WIDTHS = (1.0, 2.0, 4.0, 6.0, 9.0, SHOWN_WIDTH, 16.0, 20.0, 24.0)  # [V]
-TABLE_WIDTHS = (2.0, 6.0, 12.0)  # [V]
+TABLE_WIDTHS = (2.0, 6.0)  # [V]
 BLENDING_LOOKS = {
     "weights": STYLES["fuzzy"],
     "moments": {"color": SKY},

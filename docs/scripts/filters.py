@@ -14,7 +14,6 @@ from docs.scripts import by_name, digits, legend_below, log_ticks, subplots
 from docs.scripts.filter_gaussian import (
     FLOW,
     FLOW_RMSE,
-    PUBLISHED_NOISE,
     RUNS,
     SEED,
     STYLES,
@@ -27,7 +26,6 @@ from docs.scripts.filter_gaussian import (
 )
 from docs.scripts.filter_gaussian import PICTURES as GAUSSIAN
 from docs.scripts.filter_sampled import PICTURES as SAMPLED
-from docs.scripts.filter_sampled import SIGNLESS, signless_runs
 from filters import (
     FILTERS,
     ExtendedKalmanFilter,
@@ -252,14 +250,12 @@ class Situation(NamedTuple):
 
 def kinds() -> str:
     """All filters: assumptions, belief, calls of the model in a step, and when they fail."""
-    header = ["name", "class", "assumes", "belief", "P", "likelihood", "f, h a step", "time", "fails"]
+    header = ["name", "class", "assumes", "belief", "f, h a step", "time", "fails"]
     rows = []
     for name, kind in FILTERS.items():
         words = WORDS[name]
-        likelihood = "no" if not kind.has_covariance else "N(0, S)" if kind.gaussian_likelihood else "of a mixture"
         row = [f"`{name}`", f"`{kind.__name__}`", words.assumes, words.belief]
-        row += ["yes" if kind.has_covariance else "no", likelihood, calls(name)]
-        rows.append([*row, words.ratio, words.fails])
+        rows.append([*row, calls(name), words.ratio, words.fails])
     return markdown_table(header, rows)
 
 
@@ -308,10 +304,8 @@ def advice() -> str:
 
 
 def situations() -> list[Situation]:
-    """The cases of the decision list."""
-    plain, published, signless = thruster_model(), thruster_model(**PUBLISHED_NOISE), thruster_model(**SIGNLESS)
-    quiet, loud = plain, thruster_model(measurement_noise_cov=LOUD**2)
-    flow = augmented_model(plain, {"ambient_velocity": Unknown(std=0.5)})
+    """Cases of the decision list that the ranking does not have."""
+    plain, loud = thruster_model(), thruster_model(measurement_noise_cov=LOUD**2)
     wrong = thruster_model(parameter_factors={"voltage_gain": 0.95})
     wrong_twice = thruster_model(parameter_factors={"voltage_gain": 0.95, "lift_coefficient": 1.15})
     gain = {"voltage_gain": Unknown(std=0.1 * plain.constants.voltage_gain)}
@@ -330,36 +324,12 @@ def situations() -> list[Situation]:
             held_runs,
             named(plain, "kf")
             | {"`kf`, schedule of 9": make_filter("kf", plain, schedule=9)}
-            | named(plain, "ekf", "iekf", "ukf", "ckf", "enkf", "etkf", "pf", "gsf", "ekf-robust", "vb")
-            | named(plain, "open-loop", "inversion", "low-pass"),
-        ),
-        Situation(
-            "the same at the published noise",
-            partial(held_runs, **PUBLISHED_NOISE),
-            named(published, "ekf", "iekf", "ukf", "ckf", "enkf", "ienkf", "pf", "gsf", "vb", "sage-husa"),
-        ),
-        Situation(
-            "only the magnitude of the speed is measured, within 0.3 V of 0",
-            partial(signless_runs, 40),
-            named(signless, "ekf", "ukf", "enkf")
-            | {"`gsf`, component 0": make_filter("gsf", signless, component=0)}
-            | {f"`pf`, N = {size}": make_filter("pf", signless, ensemble_size=size) for size in (100, 5000)},
-        ),
-        Situation(
-            "one measurement in ten is off by 10 N",
-            partial(held_runs, **outliers(0.1)),
-            named(quiet, "ekf", "vb", "sage-husa", "ekf-robust", "imm"),
+            | named(plain, "ekf", "ukf", "enkf", "pf", "open-loop", "inversion", "low-pass"),
         ),
         Situation(
             "R is 16 times the assumed one",
             partial(held_runs, measurement_noise_cov=LOUD**2),
-            named(quiet, "ekf", "ekf-robust", "sage-husa", "vb") | {"`ekf`, right R": make_filter("ekf", loud)},
-        ),
-        Situation(
-            "flow of 0.6 m/s, unknown",
-            partial(held_runs, ambient_velocity=0.6),
-            named(plain, "ekf")
-            | {f"`{name}`, flow a state": make_filter(name, flow) for name in ("ekf", "enkf", "pf")},
+            named(plain, "ekf", "ekf-robust", "sage-husa", "vb") | {"`ekf`, right R": make_filter("ekf", loud)},
         ),
         Situation(
             "voltage gain assumed 5 % low",

@@ -77,6 +77,7 @@ MARKERS = {"low": "o", "medium": "s", "high": "^"}
 COST = "cost of an episode: minus the return [-]"
 
 # Of the page.
+NOT_ON_PAGE = "lowpass", "kf", "ukf"
 PAGE = "policies.md"
 CURVES, ERRORS = "policies_curves.png", "policies_errors.png"
 ROUGH = "**Rough**, by `--quick`: it shows that everything runs, not which policy is better."
@@ -393,7 +394,10 @@ def write_report(results: Sequence[Result], comparison: Comparison, page: Path, 
 
 
 def _noise_table(results: Sequence[Result], noise: str, rough: bool) -> str:
-    return markdown_table(HEADER, rows_of(results, noise)) + (f"\n\n{ROUGH}" if rough else "")
+    """The return of a policy and, at medium noise, its errors; without the observations that are left out."""
+    width = len(HEADER) if noise == VARIANT_NOISE else 3
+    rows = [row[:width] for row in rows_of(results, noise) if row[0].partition(": ")[2] not in NOT_ON_PAGE]
+    return markdown_table(HEADER[:width], rows) + (f"\n\n{ROUGH}" if rough else "")
 
 
 def _new_page(comparison: Comparison, names: Sequence[str]) -> str:
