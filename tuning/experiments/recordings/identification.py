@@ -481,7 +481,7 @@ def tables_from(recordings: Path, results: Path = RESULTS) -> dict[str, Callable
     runs = read_recordings(recordings)
     tasks = identify_all(runs, results, progress=lambda name, done, count: print(f"{done + 1}/{count} {name}"))
     keep(tasks[Task(CHOSEN).name], [run.name for run in runs])
-    left_out, on_all = estimates_of(runs, tasks), estimates_of(runs)
+    left_out = estimates_of(runs, tasks)
 
     def regime() -> str:
         rows = [
@@ -498,7 +498,6 @@ def tables_from(recordings: Path, results: Path = RESULTS) -> dict[str, Callable
     return {
         **tables,
         "ratios": lambda: "\n\n".join([ratios(), *sentences(left_out, runs)]),
-        "all_runs": lambda: markdown_table(*tables_of(runs, on_all)["ratios"]),
         "regime": regime,
     }
 
