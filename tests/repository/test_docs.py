@@ -17,6 +17,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from docs.scripts import filter_gaussian, filter_sampled, made_by
 from docs.scripts import main as make_page
+from filters.gaussian import extended
 from filters.registry import FILTERS
 from filters.wrappers.arguments import OBSERVATIONS
 from thruster_env.effects.sensors import SENSOR_EFFECTS
@@ -195,6 +196,11 @@ def test_the_table_of_all_filters_is_that_of_the_code():
     assert table in FILTER_PAGE
     assert [line.split("`")[1] for line in table.splitlines()[2:]] == list(FILTERS)
     assert all(f"`{kind.__name__}`" in table for kind in FILTERS.values())
+
+
+def test_the_page_on_design_has_the_update_of_the_ekf_as_it_is():
+    lines = [line for line in inspect.getsource(extended.update).splitlines() if '"""' not in line]
+    assert "\n".join(f"   {line}" for line in lines) in (ROOT / "docs" / "design.md").read_text()
 
 
 def test_the_chart_of_filters_names_filters_that_there_are():
