@@ -101,4 +101,4 @@ def test_a_process_puts_its_code_into_the_cache(tmp_path, monkeypatch):
     assert helper.wait(timeout=120) == 0, helper.stderr.read()
     end(helper)
     helper.stderr.close()
-    assert [*tmp_path.rglob("*run*.nbc")]
+    assert [*tmp_path.rglob("*.o")]

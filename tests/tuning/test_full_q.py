@@ -8,9 +8,9 @@ import optuna
 import pytest
 
 import thruster_env  # noqa: F401 - registers the env
+import tuning
 from filters import EstimateState
 from filters.tuned_file import read_tuned_file, sealed
-from tuning.cli.demo import tune
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, verify, write_tuned
 from tuning.reporting.terminal import choice_table
@@ -115,9 +115,9 @@ def test_a_consistent_twin_has_the_same_correlation():
         )
 
 
-def test_the_gradient_refuses_a_budget_with_one_clear_line(tmp_path):
+def test_the_gradient_refuses_a_budget_with_one_clear_line():
     with pytest.raises(ValueError, match="must come without a budget, but got budget"):
-        tune(PLAN._replace(budget=1.0), 1, out=tmp_path / "t.json", method="gradient")
+        tuning.tune("mismatch", "ekf", budget=1.0, method="gradient")
 
 
 @pytest.mark.parametrize("correlations", [[0.3, -0.6, 0.7, 0.0, 0.98, -0.2], [0.0] * 6])

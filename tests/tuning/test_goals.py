@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from filters import StateSpaceModel, run
-from tuning.cli.demo import tune
+from tuning.api.run import run_tuning
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import goal_of, tune_by_gradient
@@ -197,7 +198,7 @@ def test_correlated_sensors_are_found():
 def test_a_full_r_is_read_back_wherever_a_tuned_file_is(tmp_path):
     plan = Plan("ekf", (of_two_sensors(),), full_q=True, full_r=True).checked()
     file = tmp_path / "full.json"
-    result = tune(plan, 8, out=file, method="gradient")
+    result = run_tuning(plan, 8, Console(quiet=True), out=file, method="gradient")
     choice, *_ = read_tuned(file, plan.scenarios)
     assert np.array(choice.model["measurement_noise_cov"])[0, 1] > 0.5 and choice == result.result.choice
     assert choice_of("ekf", parameters_of(choice), plan.scenarios[0]).filter(plan.scenarios[0]).model.digest == (

@@ -141,7 +141,7 @@ def test_a_model_that_blows_up_is_told_its_substeps(folder):
         input_quantities=[("force", "u", "N")],
         measurements=[("log speed", "z", "m/s")],
     )
-    found = tuning.estimate(table(), model=model, filter="open-loop")
+    found = tuning.estimate(tuning.read_logs(table(), model=model), filter="open-loop")
     said = found.sentences()[-1]
     assert (
         "diverges between samples" in said
