@@ -98,7 +98,9 @@ def _machine() -> Any:
 
 @cache
 def _linker() -> Any:
-    return llvm.create_lljit_compiler(_machine(), use_jit_link=sys.platform == "darwin")
+    # LLVM's older linker asks the system for the memory of a module's instructions and of its numbers apart, and
+    # ends the process where they come to lie more than 2 GB from one another.
+    return llvm.create_lljit_compiler(_machine(), use_jit_link=sys.platform != "win32")
 
 
 @cache

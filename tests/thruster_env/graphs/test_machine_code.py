@@ -302,3 +302,47 @@ print([name for name in ("numba", "scipy", "gymnasium") if name in sys.modules])
 def test_a_filter_of_a_page_needs_no_numba():
     result = subprocess.run([sys.executable, "-c", FIRST_USE], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+# Memory above six gigabytes is full but for a page: a module's parts cannot lie together there.
+CROWDED = """
+import ctypes, os
+import numpy as np
+from thruster_env.graphs.loops import machine_code_of
+from thruster_env.graphs.machine_code import function_of
+
+libc = ctypes.CDLL(None)
+libc.mmap.restype, libc.mmap.argtypes = ctypes.c_size_t, [ctypes.c_size_t] * 6
+libc.munmap.argtypes = [ctypes.c_size_t] * 2
+
+def taken(size):
+    return libc.mmap(0, size, 0, 0x4022, 2**64 - 1, 0)  # private, of no file, no access, unreserved
+
+def scale(x):
+    for i in range(x.shape[0]):
+        x[i] = x[i] * 1.25 + 6.75
+
+def shift(x):
+    for i in range(x.shape[0]):
+        x[i] = x[i] + 0.3
+
+x = np.arange(5.0)
+function_of(machine_code_of(scale, ((None,),)))(x)  # LLVM has its own memory now
+large, page = taken(6 << 30), 0
+for size in (1 << 24, 1 << 20, 1 << 16, 1 << 12):
+    while (above := taken(size)) > large:
+        page = above
+    libc.munmap(above, size)
+libc.munmap(page, 1 << 12)
+function_of(machine_code_of(shift, ((None,),)))(x)
+print(x.tolist() == [7.05, 8.3, 9.55, 10.8, 12.05], page > large, flush=True)
+os._exit(0)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="takes memory as Linux gives it")
+def test_code_can_be_loaded_where_memory_is_crowded(tmp_path):
+    file, environment = tmp_path / "crowded.py", {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    file.write_text(CROWDED)  # `machine_code_of` reads it
+    result = subprocess.run([sys.executable, file], capture_output=True, text=True, env=environment)
+    assert result.stdout == "True True\n", result.stderr
