@@ -225,22 +225,26 @@ def operation_on(kernels: Kernels, given: tuple) -> Callable[[int], int]:
 
     Call this again after the first call: then numba has compiled it, and calls skip numba's dispatch.
     """
-    if kernels.vectors and not is_interpreting():
-        code = _operation_code(kernels)
-        if code is not None:
-            from thruster_env.graphs.machine_code import builtin_of
+    code = None if is_interpreting() else _code_one_by_one(kernels)
+    if code is not None:
+        from thruster_env.graphs.machine_code import builtin_of
 
-            return builtin_of(code, *given)
+        return builtin_of(code, *given)
     return partial(direct(operation(kernels), *given, PREDICT + UPDATE), *given)
 
 
-def batch(kernels: Kernels) -> CompiledOrPython:
+def batch(kernels: Kernels) -> Callable:
     """`batch(*memory, size, keys, inputs, measurements, numbers, noise, out, first, last)` on trajectories.
 
     noise = (qs, rs) has a row (Q, its root) for each step and a row (R, its root) for each measurement, in place
     of the model's, or no rows. They are written into `numbers`, so threads must not share these.
     """
-    return _runner(_build_batch, kernels, is_interpreting())
+    code = None if is_interpreting() else _code_one_by_one(kernels)
+    if code is None:
+        return _runner(_build_batch, kernels, is_interpreting())
+    from thruster_env.graphs.machine_code import function_of
+
+    return function_of(code)
 
 
 def vectors(kernels: Kernels) -> Callable:
@@ -259,23 +263,34 @@ def _runner(build: Callable, kernels: Kernels, interpreting: bool) -> CompiledOr
 
 
 @lru_cache(maxsize=64)
-def _operation_code(kernels: Kernels) -> Code | None:
-    memory = (row_length(kernels),), (0, 0), (0,)
-    from thruster_env.graphs.loops import machine_code_of
+def _code_one_by_one(kernels: Kernels) -> Code | None:
+    """Machine code of `operate`, and of `batch` if batches do not run side by side."""
+    from thruster_env.graphs.loops import Entry, common_code_of
 
-    return machine_code_of(build_operation(kernels), (*memory, None, (None,), (None,), None), as_builtin=True)
+    memory = (row_length(kernels),), (kernels.table_rows, None), (None,), None
+    entries = [Entry(build_operation(kernels), (*memory, (None,), (None,), None), as_builtin=True)]
+    if not kernels.vectors:
+        shapes = *memory, (None, 2), (None, None, None), *_shapes_of_data(kernels), None, None
+        entries.append(Entry(_build_batch(kernels), shapes))
+    return common_code_of(*entries)
 
 
 @lru_cache(maxsize=64)
 def _code_side_by_side(kernels: Kernels) -> Code | None:
     from thruster_env.graphs.loops import machine_code_of
 
-    n, m, length = kernels.n, kernels.m, row_length(kernels)
+    length, m = row_length(kernels), kernels.m
+    memory = [(length,), (GROUPS, length * LANES), (GROUPS, None), (GROUPS, m * LANES)]
+    shapes = (None, None, None), *_shapes_of_data(kernels), memory, None, None
+    return machine_code_of(build_side_by_side(kernels), shapes, unrolled=False)
+
+
+def _shapes_of_data(kernels: Kernels) -> tuple:
+    """Lengths of measurements, numbers, noise and estimates."""
+    n, m = kernels.n, kernels.m
     noise = [(None, 2 * n * n), (None, 2 * m * m)]
     out = [(None, None, *part) for part in ((n,), (n, n), (m,), (m, m), ())] + [(None,)]
-    memory = [(length,), (GROUPS, length * LANES), (GROUPS, None), (GROUPS, m * LANES)]
-    data = (None, None, None), (None, None, m), (None,)
-    return machine_code_of(build_side_by_side(kernels), (*data, noise, out, memory, None, None))
+    return (None, None, m), (None,), noise, out
 
 
 def row_length(kernels: Kernels) -> int:

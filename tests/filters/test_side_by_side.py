@@ -6,7 +6,8 @@ import pytest
 from filters import ExtendedKalmanFilter, SageHusaFilter, UnscentedKalmanFilter, run, thruster_model
 from filters.engine import compile as engine
 from filters.engine.compile import GROUPS
-from filters.registry import make_filter
+from filters.registry import FILTERS, make_filter
+from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.graphs.machine_code import NotLinked
@@ -39,15 +40,16 @@ def test_blocks_that_are_full_or_not_hold_the_same_estimates(kind):
         np.testing.assert_allclose(part, of_all[:5], rtol=1e-12, atol=1e-12)
 
 
-ON_PAGES = "kf kf-steady ekf iekf ukf ckf fading h-infinity schmidt sage-husa vb ekf-robust".split()
+WITH_NUMBA = {"rhf"}
 
 
-@pytest.mark.parametrize("name", ON_PAGES)
-def test_filters_on_pages_need_no_numba(name, monkeypatch):
-    monkeypatch.setattr("thruster_env.graphs.loops.code_of", lambda module, function: function)
+@pytest.mark.parametrize("name", slow_but(FILTERS, ("ekf", "enkf", "pf", "imm")))
+def test_filters_need_no_numba(name, monkeypatch):
+    monkeypatch.setattr("thruster_env.graphs.loops.code_of", lambda module, *names, unrolled: names)
     kernels = make_filter(name, thruster_model()).kernels()
-    assert engine._operation_code.__wrapped__(kernels) == "call"
-    assert engine._code_side_by_side.__wrapped__(kernels) == "run"
+    by_numba, entries = name in WITH_NUMBA, ("call",) if kernels.vectors else ("call", "run")
+    assert engine._code_one_by_one.__wrapped__(kernels) == (None if by_numba else entries)
+    assert not kernels.vectors or engine._code_side_by_side.__wrapped__(kernels) == ("run",)
 
 
 @pytest.mark.slow  # numba compiles the loops of two programs
@@ -62,16 +64,16 @@ def test_numba_compiles_the_same_loops_where_code_cannot_be_linked(monkeypatch):
 
     linked, refused = results(), []
 
-    def refuse(module, name):
-        refused.append(name)
+    def refuse(module, *names, unrolled=True):
+        refused.extend(names)
         raise NotLinked("Symbols not found: [ cos ]")
 
     monkeypatch.setattr("thruster_env.graphs.loops.code_of", refuse)
-    for build in (engine._operation_code, engine._code_side_by_side, engine._runner):
+    for build in (engine._code_one_by_one, engine._code_side_by_side, engine._runner):
         build.cache_clear()
     filter_ = ExtendedKalmanFilter(model=model)
     by_numba = results()
-    for build in (engine._operation_code, engine._code_side_by_side, engine._runner):
+    for build in (engine._code_one_by_one, engine._code_side_by_side, engine._runner):
         build.cache_clear()
     assert sorted(set(refused)) == ["call", "run"] and linked[5][5] >= 1
     for one, other in zip(linked, by_numba, strict=True):

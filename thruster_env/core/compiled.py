@@ -290,9 +290,9 @@ def compiled_in_place_of(function: Callable, find: Callable[[], Instead]) -> Cal
     return function
 
 
-def is_machine_code(function: Callable) -> bool:
-    """Whether a function marked by `compiled_in_place_of` is traced; of others numba knows when it is asked."""
-    return not _instead[function]().reason
+def instead_of(function: Callable) -> Instead | None:
+    """What compiled functions have in place of a function, without a reason if traced; None if nothing else."""
+    return _instead[function]() if function in _instead else None
 
 
 def _teach_other(function: Callable) -> None:

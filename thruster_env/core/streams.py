@@ -337,7 +337,7 @@ def fill_normals(out, count, step, stream, key_0, key_1):
     Python it draws the normals of several steps at once, which takes about as long as one step's.
     """
     if out.dtype != np.float64:  # numbers that count what is done to them
-        return _fill_in_loop(out, count, step, stream, key_0, key_1)
+        return fill_in_loop(out, count, step, stream, key_0, key_1)
     blocks = (count + GROUP - 1) // GROUP * (GROUP // 4)
     steps_at_once = max(AT_ONCE // max(blocks, 1), 1)
     rows = _normals_of_steps(blocks, step // steps_at_once, steps_at_once, stream, key_0, key_1)
@@ -351,7 +351,8 @@ def _normals_of_steps(blocks, begin, count, stream, key_0, key_1):
     return np.stack(normal_block(np.arange(blocks), steps, stream, key_0, key_1), axis=-1).reshape(count, -1)
 
 
-def _fill_in_loop(out, count, step, stream, key_0, key_1):
+def fill_in_loop(out, count, step, stream, key_0, key_1):
+    """`fill_normals`, block after block."""
     for block in range((count + GROUP - 1) // GROUP * (GROUP // 4)):
         z0, z1, z2, z3 = normal_block(block, step, stream, key_0, key_1)
         out[4 * block] = z0
@@ -368,7 +369,7 @@ def _teach_fill_normals():
 
     @overload(fill_normals, jit_options=options, strict=False)
     def _of_arrays(out, count, step, stream, key_0, key_1):
-        return overloaded(_fill_in_loop)
+        return overloaded(fill_in_loop)
 
 
 def draw_key(generator: np.random.Generator) -> np.ndarray:

@@ -3,7 +3,8 @@
 graphs, folding  numbers that record operations, their derivatives, and simplification
 tracing          the graph of a function; branches: of a function that decides
 programs         a graph as a program for some runs side by side, or for members, cut into loops; its C99
-instructions     a program as instructions of LLVM; loops: the loops around programs, from their Python source
+instructions     a program as instructions of LLVM
+loops            the loops around programs, from their source; expressions, forms, arithmetic: what they compute
 machine_code     instructions of LLVM as functions of Python, compiled, kept on disk and freed
 python_floats    functions that run as Python
 

@@ -312,12 +312,12 @@ def teach_loops(work: Callable, program: Program, width: int, scratch: int) -> N
         columns = builder.extract_value(arrays[OF_MEMBERS.index("table")].shape, 1)
         size = context.cast(builder, arguments[-1], kind, types.int64)
         data = dict(zip(OF_MEMBERS, (array.data for array in arrays), strict=False))
-        _LoopWriter(context, builder, data, width, columns, size).write(cut(program, scratch))
+        LoopWriter(context, builder, data, width, columns, size).write(cut(program, scratch))
         return context.get_dummy_value()
 
 
-class _LoopWriter:
-    """Writes what is done once, and loops."""
+class LoopWriter:
+    """Writes what is done once, and loops; `columns` of the table, and `size` members."""
 
     def __init__(
         self, context, builder: ir.IRBuilder, arrays: dict, width: int, columns: ir.Value, size: ir.Value
@@ -332,6 +332,7 @@ class _LoopWriter:
         return self._builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(INT, 0))
 
     def write(self, parts: Cut) -> None:
+        """All turns of a program."""
         self._once.read(parts.reads)
         for turn in parts.turns:
             self._once.work(turn.works)

@@ -59,8 +59,11 @@ class NotLinked(RuntimeError):
 class Code:
     """Machine code in memory, for as long as this object lives."""
 
-    def __init__(self, object_code: bytes, name: str):
-        builder = llvm.JITLibraryBuilder().add_object_img(object_code).add_current_process().export_symbol(name)
+    def __init__(self, object_code: bytes, names: Iterable[str]):
+        """Link object code; `names` are those of the functions to be called."""
+        builder = llvm.JITLibraryBuilder().add_object_img(object_code).add_current_process()
+        for name in names:
+            builder.export_symbol(name)
         for symbol in OF_PYTHON:
             builder.import_symbol(symbol, ctypes.cast(getattr(ctypes.pythonapi, symbol), ctypes.c_void_p).value)
         linker = _linker()
@@ -68,20 +71,23 @@ class Code:
             self._library = builder.link(linker, f"code {next(_number)}")
         except RuntimeError as error:
             raise NotLinked(str(error)) from error
-        self.address = self._library[name]
+        self.addresses = {name: self._library[name] for name in names}
 
 
-def code_of(module: ir.Module, name: str) -> Code:
-    """Compile a module, or load its object code, unless it is in memory; `name` is the function to be called.
+def code_of(module: ir.Module, *names: str, unrolled: bool = True) -> Code:
+    """Compile a module, or load its object code, unless it is in memory; `names` are the functions to be called.
+
+    Loops are unrolled, or not: those whose bodies are wide vectors gain nothing, and take three times as long to
+    compile.
 
     Raises NotLinked if this system's libraries lack a function, and RuntimeError for a module that LLVM refuses.
     """
     text = str(module)
-    digest = hashlib.sha256(f"{_host()}\n{name}\n{text}".encode()).hexdigest()
+    digest = hashlib.sha256(f"{_host()}\n{names} {unrolled}\n{text}".encode()).hexdigest()
     with _compiling:
         code = _loaded.get(digest)
         if code is None:
-            code = _loaded[digest] = Code(_kept(digest) or _keep(digest, _compiled(text)), name)
+            code = _loaded[digest] = Code(_kept(digest) or _keep(digest, _compiled(text, unrolled)), names)
     return code
 
 
@@ -111,14 +117,16 @@ def _host() -> str:
     return f"{llvmlite.__version__} {version} {llvm.get_process_triple()} {processor} {PASSES} {SELECTION}"
 
 
-def _compiled(text: str) -> bytes:
+def _compiled(text: str, unrolled: bool) -> bytes:
     context = llvm.create_context()  # of its own, so that all of it can be freed
     module = llvm.parse_assembly(text, context)
     try:
         module.verify()  # the parser takes values that are read where they may not have been computed
         machine = _machine()
         module.data_layout, module.triple = str(machine.target_data), machine.triple
-        passes = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(PASSES))
+        options = llvm.create_pipeline_tuning_options(PASSES)
+        options.loop_unrolling = options.loop_interleaving = unrolled
+        passes = llvm.create_pass_builder(machine, options)
         passes.getModulePassManager().run(module, passes)
         return machine.emit_object(module)
     finally:
@@ -188,11 +196,11 @@ class _MethodDefinition(ctypes.Structure):
 
 
 def function_of(code: Code) -> Callable[..., int]:
-    """Return `call(*arguments)` of a function i64 (words), which releases the interpreter lock.
+    """Return `call(*arguments)` of a function i64 run(words), which releases the interpreter lock.
 
     Its arguments are arrays of float64 in C order, and whole numbers.
     """
-    run = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(code.address)
+    run = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(code.addresses["run"])
 
     def call(*arguments) -> int:
         words = np.array(words_of(arguments), dtype=np.int64)
@@ -203,12 +211,12 @@ def function_of(code: Code) -> Callable[..., int]:
 
 
 def builtin_of(code: Code, *arguments) -> Callable[[int], int]:
-    """Return `call(last)` of a function ptr (words, last), as `add_builtin` writes it; a call costs some 70 ns.
+    """Return `call(last)` of a function ptr call(words, last), of `add_builtin`; a call costs some 70 ns.
 
     The arrays stay where they are, and live as long as `call`.
     """
     words = np.array([*words_of(arguments), 0], dtype=np.int64)
-    definition = _MethodDefinition(b"call", code.address, METH_O, None)
+    definition = _MethodDefinition(b"call", code.addresses["call"], METH_O, None)
     new = ctypes.pythonapi.PyCFunction_NewEx
     new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.py_object, ctypes.py_object]
     return new(ctypes.addressof(definition), words.ctypes.data, (code, words, arguments, definition))

@@ -108,6 +108,7 @@ def _evaluation(program: Program, arguments: str, sizes: Sequence[int], shape: S
             return tuple(results) if len(shape) == 1 else tuple(map(tuple, results.reshape(shape)))
         out[...] = results.reshape(shape)
 
+    evaluate.evaluation = work, shape, sizes  # type: ignore[attr-defined]  # of which `loops` makes a call
     overloaded(evaluate, lambda evaluate: _teach(evaluate, work, program, sizes, shape))
     large = is_array(*shape)
     lines = [f"out = np.empty({shape})", f"evaluate(({arguments}, ), out)"] if large else []

@@ -13,8 +13,8 @@ from thruster_env.core.compiled import (
     CompiledOrPython,
     function_fingerprint,
     inlined,
+    instead_of,
     is_interpreting,
-    is_machine_code,
 )
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.core.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
@@ -126,8 +126,8 @@ def seconds_as_python(model: StateSpaceModel) -> float:
 
     Of functions that are not traced numba is asked, which warns if it takes them neither.
     """
-    functions = model.functions
-    if is_interpreting() or is_machine_code(functions.transition) and is_machine_code(functions.observe):
+    replacements = [instead_of(function) for function in (model.functions.transition, model.functions.observe)]
+    if is_interpreting() or not any(instead is None or instead.reason for instead in replacements):
         return 0.0
     key, inputs = np.zeros((1, 2)), np.zeros((1, 1, model.inputs))
     simulate(model, key, inputs)
