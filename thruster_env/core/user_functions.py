@@ -158,7 +158,7 @@ def _is_empty(cell: types.CellType) -> bool:
         return True
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=128)
 def caught(code: types.CodeType) -> tuple[tuple[int, int], ...]:
     """Parts (first, end) of code whose exceptions an `except` catches, without mere clean-up."""
     listed = dis.Bytecode(code)

@@ -206,7 +206,7 @@ def in_python(function: Callable, arguments: Sequence) -> Any:
     raise failure
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=128)
 def _kind_for(function: Callable) -> type[float]:
     codes = [part.__code__ for part in functions_in(function)]
     return np.float64 if any(map(inverts, codes)) else Float if any(map(takes_roots, codes)) else float

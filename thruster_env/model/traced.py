@@ -38,7 +38,7 @@ def traced_function(function: Callable, *about) -> TracedFunction:
     return _traced_once(stands_for(function), *about)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=128)
 def _traced_once(*arguments) -> TracedFunction:
     return TracedFunction(*arguments)
 
