@@ -102,9 +102,10 @@ class Benchmark(NamedTuple):
         return ["filter", self.theirs, f"ours, {self.score}", "ratio", "median run", "pooled", WHY]
 
     def markdown(self) -> str:
-        """The table of rows, and the remarks."""
+        """The rows without pooled errors, with a reason only where a score differs, and the remarks."""
         remarks = "\n".join(f"- {remark}" for remark in self.remarks)
-        return f"{markdown_table(self.header, [row.cells() for row in self.reproduce()])}\n\n{remarks}"
+        rows = [[*row.cells()[:-2], "" if abs(row.ratio - 1.0) <= CLOSE else row.why] for row in self.reproduce()]
+        return f"{markdown_table([*self.header[:-2], WHY], rows)}\n\n{remarks}"
 
     def reproduce(self, runs: int = RUNS, seed: int = 0, on_row: OnRow = lambda row: None) -> list[Row]:
         """All rows over so many seeds from `seed` on; ValueError for fewer than two."""

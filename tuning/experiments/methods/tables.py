@@ -36,6 +36,7 @@ BLIND = (
 SEARCHES = ("nelder-mead", "coordinate-steps", "tpe-only", "gp-only", "cma-es-only", "random-only")
 ENOUGH, ENOUGH_NATS = 0.005, 0.02  # of log ratios and log scores, up to which the cheaper method is taken
 NO_METHODS = (START, ORACLE)  # nobody has these
+NOT_ON_PAGE = ", 3 runs", ", 10 runs"  # ends of names of cases
 LEAST, MOST = 1e-4, 3.0  # of log ratios, at which points are clipped
 MARKS = dict(zip(RUNS, (("o", "0.75"), ("o", "C0"), ("o", "C3")), strict=True))
 
@@ -150,16 +151,21 @@ def percent(ratio: float) -> str:
 
 
 def group_table(results: Sequence[Result], protocol: Protocol, groups: str) -> str:
-    """Regrets [%] of all methods in the cases of some groups; in italics if significantly worse than the best."""
+    """Regrets [%] of all methods in the cases of some groups; in italics if significantly worse than the best.
+
+    NEES / n is the range over all cases, also those that have no column.
+    """
     cases = [case for case in protocol.cases if case.group in groups]
-    columns = [{regret.method: regret for regret in regrets(results, case)} for case in cases]
+    by_name = {case.name: {regret.method: regret for regret in regrets(results, case)} for case in cases}
+    on_page = [case for case in cases if not case.name.endswith(NOT_ON_PAGE)]
+    columns = [by_name[case.name] for case in on_page]
     methods = dict.fromkeys(method for column in columns for method in column)
     rows = []
     for method in sorted(methods, key=lambda method: _rank(columns, method)):
         name = f"**{method}**" if method in (STUDY, STUDY_LOG_SCORE) else method
-        values = [column[method].nees for column in columns if method in column]
+        values = [column[method].nees for column in by_name.values() if method in column]
         rows.append([name, *(_cell(column.get(method)) for column in columns), spread(values)])
-    heads = ["method", *(f"{case.group}: `{case.name}`" for case in cases), "NEES / n"]
+    heads = ["method", *(f"{case.group}: `{case.name}`" for case in on_page), "NEES / n"]
     return markdown_table(heads, rows)
 
 

@@ -51,6 +51,7 @@ NO_POSTERIOR_BOUND = (
     "differences of Jacobians for information: a pitch to 3 mrad, where a consistent filter has 10."
 )
 NOT_ON_PAGE = "N=100", "N=200", "0..1 offsets"  # ends of labels
+SHOWN = [0, 3, 4]  # of the velocities: u, whose errors those of v, w and r equal, and p and q
 RUNS_OF = {"ngatini2019": 50, "ngatini2017": 10}
 
 
@@ -398,14 +399,14 @@ def _velocities(result: PathResult, base: str = "") -> str:
     for label, scores in result.scores.items():
         if label.endswith(NOT_ON_PAGE):
             continue
-        errors = np.concatenate([scores.rmse("velocities"), scores.rmse("attitude")])
+        errors = np.concatenate([scores.rmse("velocities")[SHOWN], scores.rmse("attitude")])
         last = [with_interval(scores.nees_interval)]
         if base:
             last.append(_ratio(scores, result.scores[base]))
         rows.append([label, *(digits(1e3 * value) for value in errors), *last])
-    bound = np.concatenate([result.bound.velocities, result.bound.attitude])
+    bound = np.concatenate([result.bound.velocities[SHOWN], result.bound.attitude])
     rows.append(["bound", *(digits(1e3 * value) for value in bound), *([""] * (2 if base else 1))])
-    columns = ["", "u", "v", "w", "p", "q", "r", "phi", "theta", "NEES"]
+    columns = ["", "u", "p", "q", "phi", "theta", "NEES"]
     return markdown_table([*columns, f"position over {base}"] if base else columns, rows)
 
 
