@@ -1,4 +1,4 @@
-"""The tables of docs/filters.md, and pictures of unknown noise, wrong models and missing measurements."""
+"""The tables of docs/appendix/filters.md, and pictures of unknown noise, wrong models and missing measurements."""
 
 from __future__ import annotations
 

@@ -212,7 +212,7 @@ def test_an_ensemble_without_a_truth_is_the_smallest_whose_estimates_are_close_t
 
 
 def test_the_page_has_the_table_of_its_script_and_says_what_the_truth_is_worth():
-    page = (Path(__file__).parents[2] / "docs" / "logs.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "appendix" / "logs.md").read_text()
     lines = page.partition("<!-- table hidden_truth -->")[2].partition("<!-- end -->")[0].strip().splitlines()
     rows = {(row[1].strip(" `"), row[2].strip(" `")): row for row in (line.split("|") for line in lines[2:])}
     assert set(rows) == set(hidden_truth.CASES)
