@@ -30,9 +30,9 @@ from thruster_env.thruster.parameters import PRESETS
 ROOT = Path(__file__).parents[2]
 
 
-def with_appendix(page):
+def with_appendix(page, folder=ROOT / "docs"):
     """A page of the docs and the page of measurements behind it, if it has one."""
-    paths = ROOT / "docs" / f"{page}.md", ROOT / "docs" / "appendix" / f"{page}.md"
+    paths = folder / f"{page}.md", folder / "appendix" / f"{page}.md"
     return "\n".join(path.read_text() for path in paths if path.exists())
 
 
@@ -234,9 +234,11 @@ def test_pictures_and_tables_are_those_of_the_code(page, tmp_path, monkeypatch):
     monkeypatch.setattr(filter_sampled, "SIZES", (20, 50))  # of a picture alone, which takes minutes otherwise
     monkeypatch.setattr(filter_sampled, "LENGTHS", (5, 10))
     monkeypatch.setattr(filter_gaussian, "RUNS", 4)
-    shutil.copy(ROOT / "docs" / f"{page}.md", tmp_path)
+    (tmp_path / "appendix").mkdir()
+    for name in (f"{page}.md", f"appendix/{page}.md"):
+        shutil.copy(ROOT / "docs" / name, tmp_path / name)
     make_page([page, "--out", str(tmp_path)])
-    anew, here = (re.split(NUMBER, text) for text in ((tmp_path / f"{page}.md").read_text(), PAGES[page]))
+    anew, here = (re.split(NUMBER, with_appendix(page, folder)) for folder in (tmp_path, ROOT / "docs"))
     assert anew[::2] == here[::2]
     assert [float(n) for n in here[1::2]] == pytest.approx([float(n) for n in anew[1::2]], rel=0.03)
     assert {path.name for path in tmp_path.glob("*.png")} == set(made_by(page, "FIGURES"))
