@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from filters.adaptive import RobustExtendedKalmanFilter, SageHusaFilter, VariationalBayesFilter
 from filters.augmented import Unknown, augmented_model, transformed_model
 from filters.baselines import Inversion, LowPass, OpenLoop
+from filters.converters import from_control, from_filterpy, from_pykalman, from_statsmodels, to_filterpy
 from filters.engine.batch import Estimates
 from filters.engine.belief import Belief, Innovation
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
@@ -90,12 +91,17 @@ __all__ = [
     "VariationalBayesFilter",
     "affine_model",
     "augmented_model",
+    "from_control",
+    "from_filterpy",
+    "from_pykalman",
+    "from_statsmodels",
     "linearize",
     "make_filter",
     "restarts_of",
     "run",
     "smooth",
     "smooth_modes",
+    "to_filterpy",
     "torch",
     "transformed_model",
 ]

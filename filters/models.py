@@ -16,18 +16,19 @@ Filter, sections 2.3 (local levels and trends, cycles); van Loan (1978) for Q.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from functools import lru_cache
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
 from filters.gaussian.kalman import KalmanFilter
-from thruster_env.core.checks import one_of, positive, short_repr
+from thruster_env.core.checks import at_least, one_of, positive, short_repr
 from thruster_env.model.affine import AffineModel, affine_model
 from thruster_env.model.continuous import noise_of_densities
 from thruster_env.model.quantities import Quantity
 
+MOST_HARMONICS = 6
 WIDE = 100.0  # spreads of the data in the prior's deviation: a start that knows nothing
 
 
@@ -303,6 +304,44 @@ NAMED = {
 }
 
 
+HARMONIC = "harmonic"
+NAMES = (*NAMED, HARMONIC)
+
+
+def harmonics(drift: float, period: float, count: int) -> Signal:
+    """A periodic signal about the mean whose shape drifts: a daily or yearly course.
+
+        x_k'' = -(2 pi k/period)^2 x_k,  k = 1 ... count;  cosine and sine of each drift as random walks
+
+    Args:
+        drift: density of the noise on each cosine and sine [U^2/s].
+        period: [s].
+        count: harmonics; half the samples in a period describe any seasonal pattern.
+
+    Source: Harvey (1989), section 2.3.4.
+    """
+    w = 2.0 * math.pi / period
+    slope = np.kron(np.diag(np.arange(1.0, count + 1.0)), [[0.0, w], [-w, 0.0]])
+    states = [(f"{word}_{k + 1}", "U") for k in range(count) for word in ("harmonic", "quadrature")]
+    output = np.tile([1.0, 0.0], count)
+    return Signal(slope, drift * np.eye(2 * count), output, tuple(states), (0,) * (2 * count))
+
+
+def _harmonic_model(settings: str) -> NamedModel:
+    """`harmonics` with a period and a number from text such as "period=24,harmonics=3"."""
+    rule = f"{HARMONIC} must have a period [s], as {HARMONIC}:period=24, and may have harmonics=N"
+    try:
+        pairs = dict(setting.split("=") for setting in settings.split(","))
+        period, count = float(pairs.pop("period")), int(pairs.pop("harmonics", "1"))
+    except (KeyError, ValueError):
+        raise ValueError(f"{rule}, but got {settings!r}") from None
+    if pairs or not (0.0 < period < math.inf) or not 1 <= count <= MOST_HARMONICS:
+        raise ValueError(f"{rule} of at most {MOST_HARMONICS}, but got {settings!r}")
+    free = (_density("drift", "density of the drift of its shape", 1),)
+    about, signal = f"a course of period {period:g} s", partial(harmonics, period=period, count=count)
+    return NamedModel(f"{HARMONIC}:{settings}", about, free, signal, about_mean=True)
+
+
 class Sum(NamedTuple):
     """A named model, or a sum of several, with the names of its free numbers."""
 
@@ -344,53 +383,60 @@ class Sum(NamedTuple):
         noise: float,
         dt: float,
         *,
-        first: float = 0.0,
+        first: float | Sequence[float] | np.ndarray = 0.0,
         spread: float = 1.0,
-        offset: float = 0.0,
-        quantity: Quantity = Quantity("measurement", "z"),  # noqa: B008 - a value that nothing changes
+        offset: float | Sequence[float] | np.ndarray = 0.0,
+        quantities: Sequence[Quantity] = (Quantity("measurement", "z"),),
     ) -> AffineModel:
-        """The model of a step of dt.
+        """The model of a step of dt, with a signal of its own and the same numbers for each axis.
 
         Args:
             values: of the free numbers.
             noise: R, the variance of the measurement noise [U^2].
             dt: sample time [s].
-            first: the first measurement, where the filter begins.
+            first: the first measurement of each axis, where the filter begins, or one for all.
             spread: of the data [U]; the prior is a hundred times as wide, and as fast as that within a step.
-            offset: the mean of the data, about which the signal varies.
-            quantity: name, symbol and unit of the measurement.
+            offset: the mean of the data on each axis, about which the signal varies, or one for all.
+            quantities: name, symbol and unit of the measurement on each axis.
         """
-        signal, unit = self.signal(values), quantity.unit
-        n, orders = len(signal.output), np.array(signal.orders)
-        level = int(np.argmax(signal.output))
+        signal, axes = self.signal(values), len(quantities)
+        n, orders, each = len(signal.output), np.array(signal.orders), np.eye(axes)
+        offset = np.broadcast_to(np.asarray(offset, dtype=np.float64), axes)
+        level = np.eye(n)[int(np.argmax(signal.output))]
+        states = [
+            Quantity(name, name, in_unit(text, axis.unit))
+            for axis in quantities
+            for symbol, text in signal.states
+            for name in [symbol if axes == 1 else f"{symbol}_{axis.symbol}"]
+        ]
         return affine_model(
-            a=signal.transition(positive("dt", dt)),
-            b=np.zeros((n, 0)),
-            c=signal.output[None],
-            process_noise_cov=signal.noise(dt),
-            measurement_noise_cov=[noise],
-            prior_mean=np.eye(n)[level] * (first - offset),
-            prior_cov=(WIDE * spread / dt**orders) ** 2,
-            measurement_offset=[offset],
-            states=[Quantity(symbol, symbol, in_unit(text, unit)) for symbol, text in signal.states],
+            a=np.kron(each, signal.transition(positive("dt", dt))),
+            b=np.zeros((axes * n, 0)),
+            c=np.kron(each, signal.output[None]),
+            process_noise_cov=np.kron(each, signal.noise(dt)),
+            measurement_noise_cov=[noise] * axes,
+            prior_mean=np.kron(np.broadcast_to(first, axes) - offset, level),
+            prior_cov=np.tile((WIDE * spread / dt**orders) ** 2, axes),
+            measurement_offset=offset,
+            states=states,
             input_quantities=[],
-            measurements=[quantity],
+            measurements=list(quantities),
         )
 
 
 def is_named(name: str) -> bool:
     """Whether a text is the name of a model, or a sum of such names."""
-    return all(part.strip().lower() in NAMED for part in name.split("+"))
+    return all(part.partition(":")[0].strip().lower() in NAMES for part in name.split("+"))
 
 
 def named_model(name: str) -> Sum:
-    """A model by name, such as "constant-velocity", or a sum, such as "constant + oscillator".
+    """A model by name, such as "constant-velocity", or a sum, such as "constant + harmonic:period=24,harmonics=2".
 
     Raises:
         ValueError: for an unknown name; the message has the known ones.
     """
-    parts = tuple(NAMED[one_of("a model", part.strip().lower(), tuple(NAMED))] for part in name.split("+"))
-    if len(set(parts)) < len(parts):
+    parts = tuple(_part(part.strip().lower()) for part in name.split("+"))
+    if len({part.name.partition(":")[0] for part in parts}) < len(parts):
         raise ValueError(f"parts of a sum must differ, but got {name!r}")
     if sum(not part.about_mean for part in parts) > 1:
         rule = "a sum must have at most one part with a level, since data determine the sum of two levels alone"
@@ -398,7 +444,18 @@ def named_model(name: str) -> Sum:
     return Sum(" + ".join(part.name for part in parts), parts)
 
 
-def kalman_filter(name: str, dt: float, noise: float, **values: float) -> KalmanFilter:
+def _part(text: str) -> NamedModel:
+    """A model by its name, with settings behind a colon."""
+    name, _, settings = text.partition(":")
+    one_of("a model", name, NAMES)
+    if name == HARMONIC:
+        return _harmonic_model(settings)
+    if settings:
+        raise ValueError(f"settings must be those of {HARMONIC}, but got {settings!r} for {name}")
+    return NAMED[name]
+
+
+def kalman_filter(name: str, dt: float, noise: float, *, axes: int = 1, **values: float) -> KalmanFilter:
     """The Kalman filter of a named model, for data whose numbers are known.
 
         from filters.models import kalman_filter
@@ -409,12 +466,15 @@ def kalman_filter(name: str, dt: float, noise: float, **values: float) -> Kalman
         name: of the model (`named_model`).
         dt: sample time [s].
         noise: R, the variance of the measurement noise.
+        axes: number of measurements, each of a signal of its own: 2 for a position in a plane.
         **values: the model's numbers.
 
     Raises:
         ValueError: for an unknown name or number.
     """
-    return KalmanFilter(model=named_model(name).model(values, noise, dt))
+    symbols = ["z"] if at_least("axes", axes, 1) == 1 else [f"z_{i + 1}" for i in range(axes)]
+    quantities = [Quantity("measurement", symbol) for symbol in symbols]
+    return KalmanFilter(model=named_model(name).model(values, noise, dt, quantities=quantities))
 
 
 def in_unit(text: str, unit: str) -> str:
@@ -427,7 +487,8 @@ def in_unit(text: str, unit: str) -> str:
 
 
 def _unique(part: str, name: str, names: list[str]) -> str:
-    return f"{part.replace('-', '_')}_{name}" if names.count(name) > 1 else name
+    part = part.partition(":")[0].replace("-", "_")
+    return f"{part}_{name}" if names.count(name) > 1 else name
 
 
 def _added(signals: list[Signal]) -> Signal:

@@ -40,6 +40,7 @@ NOT_RUN = {  # programs, by page and what is in them
     ("extending.md", "fading"): "the same, of a filter that there is: tests/filters",
     ("extending.md", "Tank"): "the same, of a plant: tests/thruster_env",
     ("extending.md", "tank_model"): "the same",
+    ("other_packages.md", "UnobservedComponents"): "needs statsmodels: tests/filters/test_converters.py",
     ("size.md", "lorenz_96"): "a fragment of a model",
     ("policies.md", "VecNormalize"): "needs Stable-Baselines3, as howto/stable_baselines.md does, which runs",
 }

@@ -255,7 +255,7 @@ def test_an_index_of_dates_and_a_file_are_the_same_numbers(position, tmp_path):
     of_file = column_of(file)
     for column in (of_series, of_file):
         np.testing.assert_array_equal(column.values, z)
-        assert column.dt == pytest.approx(0.1) and column.quantity[:3] == ("depth", "depth", "m")
+        assert column.dt == pytest.approx(0.1) and column.quantities[0][:3] == ("depth", "depth", "m")
     assert column_of(list(z)).dt == 1.0 and column_of([*z[:30], None]).measured.sum() == 30
 
 
@@ -273,6 +273,41 @@ def test_tune_names_fit_for_a_log_that_is_a_column_of_numbers(tmp_path):
         tuning.fit(file)
 
 
+def test_the_axes_of_a_track_have_the_same_numbers(position, tmp_path):
+    z = position.column.values
+    track = np.column_stack([z, simulated("constant-velocity", 600, seed=7) - 90.0])
+    track[5:9, 1] = np.nan
+    fit = tuning.fit(track, 0.1, model="constant-velocity")
+    alone = [tuning.fit(axis, 0.1, model="constant-velocity") for axis in track.T]
+    assert min(f.r for f in alone) < fit.r < max(f.r for f in alone)  # of all 1196 numbers
+    sizes = [np.log(f.numbers[1].high / f.numbers[1].low) for f in (fit, *alone)]
+    assert sizes[0] == pytest.approx(sizes[1] / math.sqrt(2.0), rel=0.1)
+    assert fit.gain.shape == (4, 2) and fit.gain[:2, 0] == pytest.approx(fit.gain[2:, 1], rel=1e-6)
+    assert [state.symbol for state in fit.model.states][2:] == ["position_z_2", "velocity_z_2"]
+    assert "float z1, float z2" in fit.code("arduino") and len(fit.plot().axes) == 4
+    assert fit.axes_differ() > 1e-3 and not fit.is_wrong
+    noisy = track + [[0.0, 2.0]] * np.random.default_rng(3).normal(size=(600, 2))
+    assert "The axes differ" in str(tuning.fit(noisy, 0.1, model="constant-velocity"))
+    file = tmp_path / "track.csv"
+    file.write_text(
+        "t,x [m],y [m]\n" + "".join(f"{0.1 * k:.1f},{a!r},{b!r}\n" for k, (a, b) in enumerate(track.tolist()))
+    )
+    assert tuning.fit(file, column="x [m],y [m]", model="constant-velocity").r == pytest.approx(fit.r, rel=1e-9)
+
+
+def test_a_daily_course_and_steps_between_numbers():
+    rng, hours = np.random.default_rng(5), np.arange(240.0)
+    z = 12.0 + 4.0 * np.cos(2.0 * np.pi * hours / 24.0) + np.sin(4.0 * np.pi * hours / 24.0)
+    z += np.cumsum(0.1 * rng.normal(size=240)) + 0.3 * rng.normal(size=240)
+    fit = tuning.fit(z, model="constant + harmonic:period=24,harmonics=2")
+    assert fit.r == pytest.approx(0.09, rel=0.35) and not fit.is_wrong
+    assert {number.name for number in fit.numbers} == {"constant_drift", "harmonic_drift", "R"}
+    steps = np.ones(239)
+    steps[100] = 3.0
+    column = column_of(z, steps)
+    assert len(column.values) == 242 and np.isnan(column.values[101:103]).all()
+
+
 @pytest.mark.parametrize(
     ("z", "options", "message"),
     [
@@ -280,7 +315,8 @@ def test_tune_names_fit_for_a_log_that_is_a_column_of_numbers(tmp_path):
         ([1.0, 2.0], {}, "at least 20 numbers"),
         ([math.nan] * 50, {}, "at least 20 numbers, but has 0"),
         (["a"] * 30, {}, "z must be numbers"),
-        (np.zeros((30, 2)), {}, "one column of numbers"),
+        (np.zeros((30, 9)), {}, "a column of numbers"),
+        (np.arange(30.0), {"model": "harmonic"}, "must have a period"),
         (np.arange(30.0), {"times": np.arange(30.0)[::-1]}, "times must increase"),
         (np.arange(30.0), {"model": "constant-speed"}, "a model must be one of"),
         (np.arange(30.0), {"dt": -1.0}, "dt must be positive"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,43 @@ class AffineModel(StateSpaceModel):
         return parts[0].reshape(n, n), parts[1].reshape(n, p), parts[2], parts[3].reshape(m, n), parts[4]
 
 
+LETTERS = {
+    "A": "a",
+    "F": "a",
+    "B": "b",
+    "G": "b",
+    "C": "c",
+    "H": "c",
+    "D": "d",
+    "Q": "process_noise_cov",
+    "R": "measurement_noise_cov",
+    "x0": "prior_mean",
+    "P0": "prior_cov",
+}  # by which people know the arguments of `affine_model`
+
+
+def _by_letters(make: Callable) -> Callable[..., AffineModel]:
+    """`affine_model` with the letters of `LETTERS`, too, and defaults for B and the initial state."""
+
+    @wraps(make)
+    def with_letters(**arguments: Any) -> AffineModel:
+        for letter in LETTERS.keys() & arguments.keys():
+            name, value = LETTERS[letter], arguments.pop(letter)
+            if name in arguments:
+                raise ValueError(f"{name} must be given once, but got {letter}, too")
+            arguments[name] = value
+        if "a" in arguments:
+            size = len(np.atleast_2d(arguments["a"]))
+            arguments.setdefault("b", np.zeros((size, 0)))
+            arguments.setdefault("prior_mean", np.zeros(size))
+        if not np.any(arguments.get("d", 0.0)):
+            arguments.pop("d", None)
+        return make(**arguments)
+
+    return with_letters
+
+
+@_by_letters
 def affine_model(
     *,
     a,
@@ -91,15 +129,16 @@ def affine_model(
 
         x' = A x + B u + state_offset + w,  w ~ N(0, Q);   z = C x + measurement_offset + v,  v ~ N(0, R)
 
-    Covariances are per step and do not scale with dt.
+    Covariances are per step and do not scale with dt. Arguments may also be named F or A, B or G, H or C, Q, R, x0
+    and P0: `affine_model(F=F, H=H, Q=Q, R=R, P0=P0)`.
 
     Args:
         a: A, (n, n).
-        b: B, (n, p).
+        b: B, (n, p); without inputs by default.
         c: C, (m, n).
         process_noise_cov: Q, (n, n) or n variances.
         measurement_noise_cov: R, (m, m) or m variances.
-        prior_mean: mean of the initial state, (n,).
+        prior_mean: mean of the initial state, (n,); zero by default.
         prior_cov: covariance of the initial state, (n, n) or n variances.
         state_offset: (n,), zero if None.
         measurement_offset: (m,), zero if None.

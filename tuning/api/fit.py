@@ -17,19 +17,20 @@ from tuning.series.paste import LANGUAGES
 
 def fit(
     z: Annotated[Any, Argument(INPUT, ("--log",), "FILE", str, file=READ)],
-    dt: Annotated[float | None, Option(INPUT)] = None,
+    dt: Annotated[Any, Option(INPUT, type=float)] = None,
     *,
     times: Annotated[Any, PythonOnly()] = None,
-    column: Annotated[str | None, Option(INPUT, metavar="HEADER")] = None,
+    column: Annotated[Any, Option(INPUT, metavar="HEADER", type=str)] = None,
     model: Annotated[str, Option(INPUT)] = AUTO,
     plot: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
     code: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
     progress: Progress = None,
 ) -> SeriesFit:
-    """Find the model, Q and R of one column of numbers by maximum likelihood.
+    """Find the model, Q and R of a column of numbers, or of a track with several axes, by maximum likelihood.
 
     Each model is a plant that everybody knows, driven by white noise: constant, constant-velocity,
-    constant-acceleration, local-trend, ornstein-uhlenbeck, singer or oscillator. Of the models that predict unseen
+    constant-acceleration, local-trend, ornstein-uhlenbeck, singer, oscillator or harmonic:period=24. Axes are
+    independent and have the same numbers. Of the models that predict unseen
     blocks of the record as well as the best one, the simplest is chosen. If innovations are correlated, the first
     line says that no model fits.
 
@@ -43,11 +44,11 @@ def fit(
     Example: thruster fit acc.csv --model constant-velocity --plot acc.png --code acc.md
 
     Args:
-        z: a log with one column of numbers, and times. In Python also an array or list, a pandas Series or table,
-            whose index may have times or dates; NaN or None where a number is missing.
-        dt: sample time [s], where there are no times; 1 by default.
+        z: a log with one column of numbers, and times. In Python also an array (K,) or (K, axes) or list, a pandas
+            Series or table, whose index may have times or dates; NaN or None where a number is missing.
+        dt: sample time [s], where there are no times; 1 by default. In Python also the steps between numbers.
         times: of an array's numbers [s], (K,).
-        column: header of the numbers, where there are several.
+        column: header of the numbers, where there are several; x,y for the axes of a track.
         model: name of a model, or a sum such as "constant-velocity + oscillator"; auto tries the small ones.
         plot: also draw the data, the estimate with its band, and the innovations: .png, .svg or .pdf.
         code: also write the filter as lines to paste, for Python, FilterPy, pykalman, MATLAB, a controller: .md.

@@ -112,7 +112,8 @@ def read_logs(
             .h5. In Python also a pandas.DataFrame, a mapping from headers to arrays, a `Log`, or a list.
         preset: the thruster of the problem or of the runs.
         model: instead of a thruster, a StateSpaceModel, or a function that returns one (called with dt if it has
-            that argument). In Python also an object that offers one, or a thruster's preset.
+            that argument), one of `filters.plants`, such as pendulum, or a FILE.toml with matrices F, H, Q, R, P0.
+            In Python also an object that offers one, or a thruster's preset.
         sensors: a thruster's sensor that the filter sees, thrust by default.
         columns: the column of an input, measurement, state or output; may be repeated. In Python headers by name,
             such as {"speed": "motor_rpm", "thrust": "loadcell[kgf]"}.

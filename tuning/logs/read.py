@@ -11,13 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from filters.models import is_named
+from filters.plants import PLANTS
 from filters.tuned_file import check_preset_file, read_tuned_file, tune_options
 from thruster_env.core.checks import finite, short_repr
+from thruster_env.core.files import read_toml
 from thruster_env.core.modules import is_code, object_named
 from thruster_env.env.record import ANY_DT, read_for
 from thruster_env.logs.log import Log
 from thruster_env.logs.recorders.registry import ENDINGS
 from thruster_env.logs.table import SUFFIXES
+from thruster_env.model.affine import LETTERS, AffineModel, affine_model
 from thruster_env.model.continuous import ContinuousModel, in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.plant_packages import logs_package
@@ -177,17 +180,36 @@ def model_of_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any
         if model is not None:
             raise ValueError(f"a pair (model, logs) must come without another model, but got {short_repr(model)}")
         model, logs = logs
+    if str(model) in PLANTS:
+        return logs, f"{PLANTS[str(model)].__module__}:{PLANTS[str(model)].__name__}", preset
     if not isinstance(model, str | Path) or is_code(str(model)):
         return logs, model, preset
+    if Path(model).suffix == ".toml" and Path(model).is_file():
+        matrices = read_toml(model, "a model's file")
+        if LETTERS.keys() & matrices.keys():
+            return logs, _model_of_matrices(matrices, model), preset
     if preset is not None:
         raise ValueError(
             f"give either a model or a preset, but got both, {short_repr(model)} and {short_repr(preset)}"
         )
     if not logs_package().is_preset(model):
-        rule = "a model must be an object, 'module:object' or a thruster's preset"
+        rule = f"a model must be an object, 'module:object', one of {', '.join(PLANTS)}, or a thruster's preset"
         way_out = " (thruster fit takes models of one column of numbers by name)" if is_named(str(model)) else ""
         raise ValueError(f"{rule}, but got {short_repr(model)}{way_out}")
     return logs, None, model
+
+
+def _model_of_matrices(content: Mapping[str, Any], path: str | Path) -> AffineModel:
+    """The model of a file with F, H, Q, R, P0, perhaps B, x0, and quantities, each [name, symbol, unit]."""
+    names = {"inputs": "input_quantities"}
+    named = {names.get(key, key): value for key, value in content.items()}
+    for key in ("states", "input_quantities", "measurements"):
+        if key in named:
+            named[key] = [tuple(entry) if isinstance(entry, list) else entry for entry in named[key]]
+    try:
+        return affine_model(**named)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{error} (in {path})") from None
 
 
 def _is_model(candidate: Any) -> bool:
@@ -195,7 +217,7 @@ def _is_model(candidate: Any) -> bool:
     if isinstance(candidate, str | Path):
         if Path(candidate).suffix in (*SUFFIXES, *ENDINGS):  # a log in a folder of Windows has a colon, too
             return False
-        return is_code(str(candidate)) or logs_package().is_preset(candidate)
+        return is_code(str(candidate)) or str(candidate) in PLANTS or logs_package().is_preset(candidate)
     return (
         isinstance(candidate, StateSpaceModel | ContinuousModel)
         or hasattr(candidate, "state_space_model")

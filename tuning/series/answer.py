@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
+from scipy.stats import chi2
 
 from filters.bounds import steady_state
 from filters.consistency.nees import LAGS, Whiteness, whiteness
@@ -19,9 +20,10 @@ from filters.models import named_model
 from thruster_env.core.text_tables import plain_text, table
 from thruster_env.model.affine import AffineModel
 from tuning.api.display import frame, html
+from tuning.identification.objective import climb
 from tuning.series.column import Column
 from tuning.series.fit import Candidate, Number, behind, filtered
-from tuning.series.likelihood import model_of
+from tuning.series.likelihood import ColumnLikelihood, model_of
 from tuning.series.paste import lines_of
 
 if TYPE_CHECKING:
@@ -70,20 +72,24 @@ class SeriesFit:
 
     @property
     def r(self) -> float:
-        """R."""
+        """R, of each axis."""
         return float(self.model.measurement_noise_cov[0, 0])
 
     @cached_property
     def gain(self) -> np.ndarray:
-        """The steady-state gain, (n,), of x + K (z - C x)."""
+        """The steady-state gain, (n,) or (n, axes), of x + K (z - C x)."""
+        gain = self._gains()
+        return gain[:, 0] if gain.shape[1] == 1 else gain
+
+    def _gains(self) -> np.ndarray:
         a, _, _, c, _ = self.model.matrices()
-        return steady_state(a, c, self.q, self.model.measurement_noise_cov)[1][:, 0]
+        return steady_state(a, c, self.q, self.model.measurement_noise_cov)[1]
 
     @property
     def memory(self) -> float:
         """Time in which the filter forgets an error of its state but for 1/e [s]."""
         a, _, _, c, _ = self.model.matrices()
-        slowest = np.abs(np.linalg.eigvals(a - np.outer(self.gain, c @ a))).max()
+        slowest = np.abs(np.linalg.eigvals(a - self._gains() @ c @ a)).max()
         return math.inf if slowest >= 1.0 else -self.column.dt / math.log(max(slowest, 1e-300))
 
     @cached_property
@@ -94,33 +100,48 @@ class SeriesFit:
     @cached_property
     def whiteness(self) -> Whiteness:
         """Whether the innovations are white."""
-        present = self.column.measured & (np.cumsum(self.column.measured) > self.model.n)
-        lags = min(LAGS, len(self.column.values) // 4)
-        return whiteness(
-            self.estimates.innovations, self.estimates.innovation_covs, present[None, :, None], lags=lags
-        )
+        present, lags = self.column.counted(self.model)[None], min(LAGS, len(self.column.values) // 4)
+        return whiteness(self.estimates.innovations, self.estimates.innovation_covs, present, lags=lags)
 
     @property
     def is_wrong(self) -> bool:
         """Whether innovations are correlated so much that the model misses something in the data."""
-        correlations = np.abs(self.whiteness.correlations[:, 0, 0])
+        correlations = np.abs(self.whiteness.correlations)
         return self.whiteness.p_value < WHITE and float(correlations.max()) > LARGE
+
+    def axes_differ(self) -> float:
+        """Probability of so large a likelihood ratio, if all axes have the same numbers; 1 for one axis."""
+        axes, candidate = len(self.column.quantities), named_model(self.name)
+        if axes == 1:
+            return 1.0
+        values, gain = list(self.chosen.values.values()), 0.0
+        for column in map(self.column.axis, range(axes)):
+            likelihood = ColumnLikelihood(candidate, column)
+            low, high = likelihood.coordinates.low, likelihood.coordinates.high
+            begin = np.clip(likelihood.coordinates.of(values), low, high)
+            alone = climb(likelihood, begin, low, high).found.value
+            gain += alone - likelihood.value(begin)
+        return float(chi2.sf(2.0 * gain, (axes - 1) * len(values)))
 
     def sentences(self) -> list[str]:
         """What a reader has to know, most important first."""
         white, sentences = self.whiteness, []
-        correlations = white.correlations[:, 0, 0]
-        lag = int(np.argmax(np.abs(correlations)))
+        largest = np.unravel_index(int(np.argmax(np.abs(white.correlations))), white.correlations.shape)
+        lag = int(largest[0])
         if self.is_wrong:
+            correlation, time = white.correlations[largest], (lag + 1) * self.column.dt
             sentences.append(
-                f"No model that was tried fits: innovations are correlated ({correlations[lag]:.2f} at a lag of "
-                f"{(lag + 1) * self.column.dt:.3g} s), so Q and R make up for what the model misses."
+                f"No model that was tried fits: innovations are correlated ({correlation:.2f} at a lag of "
+                f"{time:.3g} s), so Q and R make up for what the model misses."
             )
         sentences += [
             f"The data do not determine {number.name}: {number.low:.3g} to {number.high:.3g} are as likely."
             for number in self.numbers
             if not number.determined
         ]
+        apart = self.axes_differ()
+        if apart < WHITE:
+            sentences.append(f"The axes differ (p = {apart:.2g}): fit each of them alone.")
         if not self.is_wrong:
             sentences.append(f"The innovations are white (p = {white.p_value:.2g}).")
         return [*sentences, *self.column.remarks]
@@ -137,14 +158,14 @@ class SeriesFit:
         return {
             "model": self.name,
             "rows": len(self.column.values),
-            "measured": int(self.column.measured.sum()),
+            "measured": int(self.column.measured.any(axis=1).sum()),
             "dt": self.column.dt,
             "numbers": {number.name: number._asdict() for number in self.numbers},
             "F": f,
             "H": h,
             "Q": self.q,
             "R": self.r,
-            "offset": float(offset[0]),
+            "offset": offset,
             "gain": self.gain,
             "forgets_in": self.memory,
             "white": {"p": self.whiteness.p_value, "wrong_model": self.is_wrong},
@@ -157,9 +178,10 @@ class SeriesFit:
     def tables(self) -> list[RenderableType]:
         """Half a page for the terminal: the model, its numbers with intervals, and what they mean."""
         column, first = self.column, []
-        count = int(column.measured.sum())
+        count = int(column.measured.any(axis=1).sum())
         missing = len(column.values) - count
-        heading = f"{column.quantity.short_label}: {count} numbers, one each {column.dt:.4g} s"
+        names = ", ".join(quantity.short_label for quantity in column.quantities)
+        heading = f"{names}: {count} numbers, one each {column.dt:.4g} s"
         sentences = self.sentences()
         if self.is_wrong:
             first, sentences = [sentences[0]], sentences[1:]
@@ -180,7 +202,7 @@ class SeriesFit:
         )
         lines = [
             f"Q per step = {_matrix(self.q)}",
-            f"R = {self.r:.6g}",
+            f"R = {self.r:.6g}" + " of each axis" * (self.model.m > 1),
             f"Steady-state gain = {_matrix(self.gain)}: the filter forgets in {self.memory:.3g} s",
         ]
         rivals = [
@@ -219,20 +241,28 @@ class SeriesFit:
         """The data with the estimate and its 95 % band, and the normalised innovations."""
         from matplotlib.figure import Figure
 
-        quantity, column = self.column.quantity, self.column
-        times = column.dt * np.arange(len(column.values))
-        a, _, _, c, d = self.model.matrices()
-        means = self.estimates.means[0] @ c[0] + d[0]
-        deviations = np.sqrt(np.einsum("i,kij,j->k", c[0], self.estimates.covs[0], c[0]))
-        normalised = self.estimates.innovations[0, :, 0] / np.sqrt(self.estimates.innovation_covs[0, :, 0, 0])
+        axes = self.model.m
         figure = Figure(figsize=(8.0, 5.0), layout="constrained")
-        top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
-        top.plot(times, column.values, ".", markersize=2.5, color="0.6", label="measured")
+        plots = figure.subplots(2, axes, sharex=True, height_ratios=[2, 1], squeeze=False)
+        for axis in range(axes):
+            self._plot_axis(axis, *plots[:, axis])
+        return figure
+
+    def _plot_axis(self, axis: int, top: Any, bottom: Any) -> None:
+        quantity, values, measured = self.column.quantities[axis], self.column.table[:, axis], self.column.measured
+        times = self.column.dt * np.arange(len(values))
+        c, d = (part[axis] for part in self.model.matrices()[3:])
+        means = self.estimates.means[0] @ c + d
+        deviations = np.sqrt(np.einsum("i,kij,j->k", c, self.estimates.covs[0], c))
+        normalised = self.estimates.innovations[0, :, axis] / np.sqrt(
+            self.estimates.innovation_covs[0, :, axis, axis]
+        )
+        top.plot(times, values, ".", markersize=2.5, color="0.6", label="measured")
         top.plot(times, means, color="C0", linewidth=1.2, label=f"estimate, {self.name}")
         top.fill_between(
             times, means - 1.96 * deviations, means + 1.96 * deviations, color="C0", alpha=0.25, label="95 % band"
         )
-        inside = column.values[column.measured]
+        inside = values[measured[:, axis]]
         margin = 0.1 * np.ptp(inside)
         top.set_ylim(inside.min() - margin, inside.max() + margin)
         top.set_ylabel(quantity.short_label)
@@ -241,7 +271,6 @@ class SeriesFit:
         bottom.axhspan(-1.96, 1.96, color="C0", alpha=0.15)
         bottom.set_ylabel("innovation\n[standard deviations]")
         bottom.set_xlabel("time [s]")
-        return figure
 
     def code(self, language: str = "python") -> str:
         """Lines to paste: "python" (ours), "filterpy", "pykalman", "matlab" or "arduino".
@@ -249,7 +278,7 @@ class SeriesFit:
         Raises:
             ValueError: for another language.
         """
-        return lines_of(language, self.model, self.gain)
+        return lines_of(language, self.model, self._gains())
 
 
 def _matrix(values: np.ndarray) -> str:

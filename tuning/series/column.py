@@ -1,10 +1,10 @@
-"""One column of numbers with its times, read as logs are, on a grid."""
+"""One column of numbers with its times, or the columns of a track's axes, read as logs are, on a grid."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,54 +13,70 @@ from typing import Any
 import numpy as np
 
 from filters.models import Scales, named_model
-from thruster_env.core.checks import listed, one_of, short_repr
-from thruster_env.logs.columns import DATE_NAMES, TIME_NAMES, parted, simple
+from thruster_env.core.checks import as_floats, listed, one_of, short_repr
+from thruster_env.logs.columns import DATE_NAMES, TIME, TIME_NAMES, parted, simple
 from thruster_env.logs.findings import sentences
 from thruster_env.logs.read import read_log
 from thruster_env.logs.recorders.registry import format_of
 from thruster_env.logs.table import Table, read_table, table_of
 from thruster_env.model.quantities import Quantity
+from thruster_env.model.state_space import StateSpaceModel
 
 LEAST_ROWS = 20  # with a number
+MOST_AXES = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """Numbers on a grid of times, NaN where there is none.
+    """Numbers on a grid of times, NaN where there is none: one column, or one for each axis of a track.
 
     Attributes:
-        values: (K,).
+        values: (K,), or (K, axes).
         dt: sample time [s].
-        quantity: name, symbol and unit of the numbers.
+        quantities: name, symbol and unit of the numbers of each axis.
         remarks: what was found while they were read, in sentences.
     """
 
     values: np.ndarray
     dt: float
-    quantity: Quantity
+    quantities: tuple[Quantity, ...]
     remarks: tuple[str, ...] = ()
+
+    @property
+    def table(self) -> np.ndarray:
+        """The numbers, (K, axes)."""
+        return self.values.reshape(len(self.values), -1)
 
     @cached_property
     def measured(self) -> np.ndarray:
-        """Which rows have a number, (K,)."""
-        return ~np.isnan(self.values)
+        """Where there is a number, (K, axes)."""
+        return ~np.isnan(self.table)
+
+    def counted(self, model: StateSpaceModel) -> np.ndarray:
+        """Numbers that come after those from which a model's filter learns its state, (K, axes)."""
+        return self.measured & (np.cumsum(self.measured, axis=0) > model.n // model.m)
 
     @cached_property
-    def first(self) -> float:
-        """The first number."""
-        return float(self.values[np.argmax(self.measured)])
+    def first(self) -> np.ndarray:
+        """The first number of each axis, (axes,)."""
+        return self.table[self.measured.argmax(axis=0), range(len(self.quantities))]
 
     @cached_property
-    def mean(self) -> float:
-        """The mean of the numbers."""
-        return float(np.nanmean(self.values))
+    def mean(self) -> np.ndarray:
+        """The mean of the numbers of each axis, (axes,)."""
+        return np.nanmean(self.table, axis=0)
 
     @cached_property
     def scales(self) -> Scales:
-        """The data's spread, times and strongest frequency."""
-        duration = self.dt * (len(self.values) - 1)
-        spread = float(np.nanstd(self.values))
-        return Scales(spread, _roughness(self.values, spread), self.dt, duration, _peak(self.values, self.dt))
+        """The spread of the data, root mean squares of the axes, their times and strongest frequency."""
+        spreads, duration = np.nanstd(self.table, axis=0), self.dt * (len(self.values) - 1)
+        roughness = [_roughness(*axis) for axis in zip(self.table.T, spreads.tolist(), strict=True)]
+        peak = _peak(self.table[:, int(spreads.argmax())], self.dt)
+        return Scales(_root_mean_square(spreads), _root_mean_square(roughness), self.dt, duration, peak)
+
+    def axis(self, index: int) -> Column:
+        """One axis alone."""
+        return replace(self, values=self.table[:, index], quantities=self.quantities[index : index + 1])
 
     def middle(self, most: int) -> Column:
         """The column itself, or its middle rows if it has more than `most`."""
@@ -68,39 +84,54 @@ class Column:
         return self if excess <= 0 else replace(self, values=self.values[excess // 2 : excess // 2 + most])
 
 
-def column_of(z: Any, dt: float | None = None, *, times: Any = None, column: str | None = None) -> Column:
+def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequence[str] | None = None) -> Column:
     """The numbers on a grid, with NaN where there is none, as the reader of logs puts them there.
 
     Args:
-        z: numbers (K,), a pandas Series or table, a mapping from headers to arrays, or the path of a log.
-        dt: sample time [s], for numbers without times, or of the grid.
+        z: numbers (K,) or (K, axes), a pandas Series or table, a mapping from headers to arrays, or the path of
+            a log.
+        dt: sample time [s], for numbers without times, or of the grid; or the steps between numbers, (K - 1,).
         times: of an array's numbers [s], (K,).
-        column: header of the numbers in a table with several columns.
+        column: header of the numbers in a table with several columns, or one for each axis, also as "x,y".
 
     Raises:
         ValueError: states the rule and the value.
     """
+    if np.ndim(dt) == 1:
+        dt, times = None, np.cumsum([0.0, *as_floats(dt)])
     source: Any = z if isinstance(z, str | Path | Mapping) or hasattr(z, "columns") else _as_columns(z, times)
     is_file = isinstance(source, str | Path)
     recorded = is_file and format_of(source) is not None
+    named = column.split(",") if isinstance(column, str) else column
     if recorded:
-        if column is None:
+        if named is None:
             rule = "the column of a recorder's file must be named (column=, --column TOPIC.FIELD)"
             raise ValueError(f"{rule}, but got none for {source}: `thruster log {source}` lists them")
-        header, time = column, None
+        headers, time = list(named), None
     else:
         table = read_table(source) if is_file else table_of(source, "a table")
-        header, time = _headers(table, column)
-        _check_numbers(header, table.numbers(header))
+        named = [column] if isinstance(column, str) and column in table.names else named
+        if named is None and source is not z and isinstance(source, Mapping):
+            named = [name for name in source if name != TIME]
+        headers, time = _headers(table, named)
+        for header in headers:
+            _check_numbers(header, table.numbers(header))
+    quantities = tuple(map(_quantity, headers))
+    reader = named_model("constant").model({"drift": 1.0}, 1.0, 1.0, quantities=quantities)
+    columns = {quantity.symbol: header for quantity, header in zip(quantities, headers, strict=True)}
+    columns |= {} if time is None else {TIME: time}
+    log = read_log(source, reader, columns, dt=1.0 if dt is None and time is None and not recorded else dt)
+    for header, values in zip(headers, log.measurements.T, strict=True):
+        _check_numbers(header, values)
+    values = log.measurements[:, 0] if len(headers) == 1 else log.measurements
+    return Column(values, log.dt, quantities, tuple(sentences(log.findings)))
+
+
+def _quantity(header: str) -> Quantity:
+    """Name, symbol and unit that a header states."""
     base, unit = parted(header)
     symbol = re.sub(r"[^A-Za-z0-9_-]+", "_", base).strip("_") or "z"
-    quantity = Quantity(base.strip(), symbol, simple(unit or "")[0] if unit and unit.isalnum() else unit or "")
-    reader = named_model("constant").model({"drift": 1.0}, 1.0, 1.0, quantity=quantity)
-    columns = {symbol: header} | ({} if time is None else {"time": time})
-    log = read_log(source, reader, columns, dt=1.0 if dt is None and time is None and not recorded else dt)
-    values = log.measurements[:, 0]
-    _check_numbers(header, values)
-    return Column(values, log.dt, quantity, tuple(sentences(log.findings)))
+    return Quantity(base.strip(), symbol, simple(unit or "")[0] if unit and unit.isalnum() else unit or "")
 
 
 def _check_numbers(header: str, values: np.ndarray) -> None:
@@ -140,23 +171,26 @@ def _as_columns(z: Any, times: Any) -> Mapping[str, Any]:
         raise ValueError(f"z must be numbers, but got {short_repr(z)}") from None
     if values.ndim == 2 and 1 in values.shape:
         values = values.ravel()
-    if values.ndim != 1:
-        raise ValueError(f"z must be one column of numbers, (K,), but has shape {values.shape}: fit each alone")
-    return {"z": values} if times is None else {"time": np.asarray(times), "z": values}
+    if values.ndim not in (1, 2) or values.ndim == 2 and values.shape[1] > MOST_AXES:
+        rule = f"z must be a column of numbers, (K,), or one for each of at most {MOST_AXES} axes, (K, axes)"
+        raise ValueError(f"{rule}, but has shape {values.shape}: fit each column alone")
+    columns = {"z": values} if values.ndim == 1 else {f"z_{i + 1}": axis for i, axis in enumerate(values.T)}
+    return columns if times is None else {TIME: np.asarray(times), **columns}
 
 
-def _headers(table: Table, column: str | None) -> tuple[str, str | None]:
-    """The header of the numbers, and that of the times; ValueError for several columns of numbers."""
+def _headers(table: Table, named: Sequence[str] | None) -> tuple[list[str], str | None]:
+    """The headers of the numbers and that of the times; ValueError for several columns without names."""
     times = [name for name in table.names if parted(name)[0].strip().lower() in (*TIME_NAMES, *DATE_NAMES)]
     times += [name for name in table.names if name not in times and table.dates(name) is not None]
-    time = next((name for name in times if name != column), None)
+    time = next((name for name in times if name not in (named or ())), None)
     numbers = [name for name in table.names if name not in times]
-    if column is not None:
-        return one_of(f"a column of {table.file}", column, table.names), time
+    if named is not None:
+        return [one_of(f"a column of {table.file}", header.strip(), table.names) for header in named], time
     if len(numbers) != 1:
-        rule = "a file must have one column of numbers beside its times, or the column must be named"
-        raise ValueError(f"{rule} (column=, --column HEADER), but {table.file} has {listed(numbers)}")
-    return numbers[0], time
+        rule = "a file must have one column of numbers beside its times, or columns must be named"
+        way = "column=, --column HEADER, or --column X,Y for the axes of a track"
+        raise ValueError(f"{rule} ({way}), but {table.file} has {listed(numbers)}")
+    return numbers, time
 
 
 def _roughness(values: np.ndarray, spread: float) -> float:
@@ -167,6 +201,10 @@ def _roughness(values: np.ndarray, spread: float) -> float:
         if np.count_nonzero(~np.isnan(differences)) >= LEAST_ROWS // 2:
             deviations.append(float(np.nanstd(differences)) / math.sqrt(math.comb(2 * order, order)))
     return max(min(deviations), 1e-9 * spread)
+
+
+def _root_mean_square(values: Any) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _peak(values: np.ndarray, dt: float) -> float:

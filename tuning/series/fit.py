@@ -148,7 +148,7 @@ def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
     blocks = np.arange(len(column.values)) * BLOCKS // len(column.values)
     held_out = np.empty(BLOCKS)
     for fold in range(2):
-        visible = replace(column, values=np.where(blocks % 2 == fold, np.nan, column.values))
+        visible = replace(column, values=np.where((blocks % 2 == fold)[:, None], np.nan, column.table))
         values = _maximum(candidate, visible).candidate.values
         held_out[fold::2] = _by_blocks(model_of(candidate, visible, values), column, blocks)[fold::2]
     return fitted._replace(held_out=held_out[1:])
@@ -177,16 +177,15 @@ def _on_all(chosen: Fitted, column: Column) -> Fitted:
 def _by_blocks(model: AffineModel, column: Column, blocks: np.ndarray) -> np.ndarray:
     """Log-likelihood of each block of the record, filtered from its beginning, (BLOCKS,)."""
     estimates = filtered(model, column)
-    v, s = estimates.innovations[0, :, 0], estimates.innovation_covs[0, :, 0, 0]
-    terms = -0.5 * (np.log(2.0 * math.pi * s) + v**2 / s)
-    counted = column.measured & (np.cumsum(column.measured) > model.n)
-    return np.bincount(blocks[counted], weights=terms[counted], minlength=BLOCKS)
+    v, s = estimates.innovations[0], np.diagonal(estimates.innovation_covs[0], axis1=1, axis2=2)
+    terms = np.where(column.counted(model), -0.5 * (np.log(2.0 * math.pi * s) + v**2 / s), 0.0)
+    return np.bincount(blocks, weights=terms.sum(axis=1), minlength=BLOCKS)
 
 
 def filtered(model: StateSpaceModel, column: Column) -> Estimates:
     """The estimates of the Kalman filter on a column."""
     inputs = np.zeros((1, len(column.values) - 1, 0))
-    return run(KalmanFilter(model=model), filter_keys([0]), inputs, column.values[None, :, None])
+    return run(KalmanFilter(model=model), filter_keys([0]), inputs, column.table[None])
 
 
 def _starts(objective: ColumnLikelihood, candidate: Sum, scales: Scales) -> list[np.ndarray]:

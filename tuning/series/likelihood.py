@@ -1,7 +1,8 @@
 """The log-likelihood of a column of numbers under a named model, with gradient and Fisher information.
 
 It is that of the innovations of a Kalman filter that begins without a prior: the first rows, from which it learns
-its state, do not count. A long record is cut into runs, which are filtered side by side.
+its state, do not count. A long record is cut into runs, which are filtered side by side, as are several axes: they
+are independent and have the same numbers.
 
 Sources: Harvey (1989), Forecasting, Structural Time Series Models and the Kalman Filter, section 3.4, also for
 the scale in closed form; Durbin and Koopman (2012), Time Series Analysis by State Space Methods, section 5.2, for
@@ -41,14 +42,14 @@ def model_of(candidate: Sum, column: Column, values: Mapping[str, float]) -> Aff
         first=column.first,
         spread=column.scales.spread,
         offset=column.mean if candidate.about_mean else 0.0,
-        quantity=column.quantity,
+        quantities=column.quantities,
     )
 
 
 class ColumnLikelihood:
     """The log-likelihood as a function of coordinates, the logarithms of the free numbers and of R, (p,).
 
-    A model is not made for each point: of its numbers only A, Q and R move.
+    A model is not made for each point: of its numbers only A, Q and R change.
 
     Args:
         candidate: the named model.
@@ -57,12 +58,14 @@ class ColumnLikelihood:
     Attributes:
         coordinates: of the free numbers and R, with their ranges.
         amplitude: (p,), along which Q and R grow by a common factor e: 1 for a variance, 1/2 for a deviation.
-        states: n.
+        states: n of one axis.
         counted: number of innovations that count.
     """
 
     def __init__(self, candidate: Sum, column: Column):
-        scales, runs, unit = column.scales, _runs(column.values), column.quantity.unit
+        scales, unit = column.scales, column.quantities[0].unit
+        about = column.mean if candidate.about_mean else 0.0
+        runs = np.concatenate([_runs(axis) for axis in (column.table - about).T])
         free = [
             Parameter(number.name, low, high, in_unit(number.unit, unit), default=number.values(scales)[0])
             for number in candidate.free
@@ -74,7 +77,9 @@ class ColumnLikelihood:
         self.coordinates = Coordinates(free)
         self.amplitude = np.array([*(_power(number.unit) for number in candidate.free), 1.0])
         self._candidate, self._dt = candidate, column.dt
-        self._model = model_of(candidate, column, {parameter.name: parameter.start for parameter in free})
+        values = {parameter.name: parameter.start for parameter in free}
+        noise = values.pop(R)
+        self._model = candidate.model(values, noise, column.dt, spread=scales.spread)
         self.states = self._model.n
         self._numbers, self._layout = self._model.numbers, number_offsets(self._model.n, 1)
         starts = _starts(self._model, runs)
@@ -113,8 +118,8 @@ class ColumnLikelihood:
             return -math.inf, at
         factor = squares / self.counted
         best = here.value - 0.5 * self.counted * math.log(factor) + 0.5 * (squares - self.counted)
-        moved = at + self.amplitude * math.log(factor)
-        return best, np.clip(moved, self.coordinates.low, self.coordinates.high)
+        scaled = at + self.amplitude * math.log(factor)
+        return best, np.clip(scaled, self.coordinates.low, self.coordinates.high)
 
     def _slopes(self, parameters: int) -> ModelSlopes:
         still = np.zeros((parameters, len(self._model.constants)))
@@ -158,8 +163,7 @@ def _starts(model: AffineModel, runs: np.ndarray) -> Starts:
     """Each run begins at its first number with the model's wide prior, and counts once the state is known."""
     count, measured = len(runs), ~np.isnan(runs)
     begins = np.where(measured.any(axis=1), runs[np.arange(count), measured.argmax(axis=1)], 0.0)
-    _, _, _, output, offset = model.matrices()
-    means = np.tile(model.prior_mean, (count, 1))
-    means[:, int(output[0].argmax())] = begins - offset
+    means = np.zeros((count, model.n))
+    means[:, int(model.matrices()[3][0].argmax())] = begins
     leads = np.array([np.searchsorted(rows, model.n) + 1 for rows in measured.cumsum(axis=1)])
     return Starts(np.ones(count, dtype=bool), means, np.tile(model.prior_cov, (count, 1, 1)), leads)

@@ -11,12 +11,12 @@ from thruster_env.model.affine import AffineModel
 
 
 def lines_of(language: str, model: AffineModel, gain: np.ndarray) -> str:
-    """The filter of a model without inputs and with one measurement as lines of a language.
+    """The filter of a model without inputs as lines of a language.
 
     Args:
         language: a key of `LANGUAGES`.
         model: F, H, Q, R, the first state and its covariance; the measurement's offset is subtracted from z.
-        gain: K (n,), the steady-state gain.
+        gain: K (n, m), the steady-state gain.
 
     Raises:
         ValueError: for another language.
@@ -46,7 +46,7 @@ def _filterpy(model: AffineModel, gain: np.ndarray) -> str:
     return f"""import numpy as np
 from filterpy.kalman import KalmanFilter
 
-kf = KalmanFilter(dim_x={model.n}, dim_z=1)
+kf = KalmanFilter(dim_x={model.n}, dim_z={model.m})
 kf.F = np.array({_rows(a)})
 kf.H = np.array({_rows(c)})
 kf.Q = np.array({_rows(model.process_noise_cov)})
@@ -76,21 +76,23 @@ means, covs = kf.filter(z)"""
 
 def _matlab(model: AffineModel, gain: np.ndarray) -> str:
     a, _, _, c, d = model.matrices()
+    z, offset = "z(:, k)" if model.m > 1 else "z(k)", _matlab_rows(d[:, None]) if model.m > 1 else _number(d[0])
+    less = f" - {offset}" if d.any() else ""
     return f"""F = {_matlab_rows(a)};
 H = {_matlab_rows(c)};
 Q = {_matlab_rows(model.process_noise_cov)};
 R = {_matlab_rows(model.measurement_noise_cov)};
 x = {_matlab_rows(model.prior_mean[:, None])};
 P = {_matlab_rows(model.prior_cov)};
-for k = 1:numel(z)
+for k = 1:{"size(z, 2)" if model.m > 1 else "numel(z)"}
     if k > 1
         x = F*x;
         P = F*P*F' + Q;
     end
-    if ~isnan(z(k))
+    if ~any(isnan({z}))
         S = H*P*H' + R;
         K = P*H'/S;
-        x = x + K*(z(k) - H*x{_less(d)});
+        x = x + K*({z} - H*x{less});
         P = (eye({model.n}) - K*H)*P*(eye({model.n}) - K*H)' + K*R*K';
     end
 end"""
@@ -100,13 +102,20 @@ def _arduino(model: AffineModel, gain: np.ndarray) -> str:
     a, _, _, c, d = model.matrices()
     names = [f"x{i + 1}" for i in range(model.n)]
     predicted = [_products(row, names) for row in a]
-    measured = _products(c[0], [f"p{i + 1}" for i in range(model.n)], float(d[0]))
+    inputs = [f"z{j + 1}" for j in range(model.m)] if model.m > 1 else ["z"]
+    p, v = [f"p{i + 1}" for i in range(model.n)], [f"v{j + 1}" for j in range(model.m)]
     state = ", ".join(f"{name} = {_c(value)}" for name, value in zip(names, model.prior_mean, strict=True))
     lines = ["// steady-state Kalman filter: call once each sample with the measurement z", f"float {state};"]
-    lines.append("void filter(float z) {")
+    lines.append(f"void filter({', '.join(f'float {z}' for z in inputs)}) {{")
     lines += [f"  float p{i + 1} = {terms};" for i, terms in enumerate(predicted)]
-    lines.append(f"  float v = z - ({measured});")
-    lines += [f"  {name} = p{i + 1} + {_c(k)} * v;" for i, (name, k) in enumerate(zip(names, gain, strict=True))]
+    lines += [
+        f"  float {difference} = {z} - ({_products(row, p, float(offset))});"
+        for difference, z, row, offset in zip(v, inputs, c, d, strict=True)
+    ]
+    lines += [
+        f"  {x} = {_products(np.array([1.0, *row]), [before, *v])};"
+        for x, before, row in zip(names, p, gain, strict=True)
+    ]
     return "\n".join([*lines, "}"])
 
 
@@ -136,8 +145,9 @@ def _matlab_rows(matrix: np.ndarray) -> str:
 
 
 def _less(offset: np.ndarray) -> str:
-    """The subtraction of an offset, or nothing for zero."""
-    return "" if offset[0] == 0.0 else f" - {_number(offset[0])}"
+    """The subtraction of an offset in Python, or nothing for zero."""
+    text = _number(offset[0]) if len(offset) == 1 else f"np.array({_numbers(offset)})"
+    return f" - {text}" if offset.any() else ""
 
 
 def _c(value: float) -> str:
