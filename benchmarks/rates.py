@@ -364,7 +364,7 @@ def step_of_env(env: gym.Env) -> Counter[str]:
         copies.begin(np.array([[1.0, 2.0]]))
     with counting() as graph:
         memory, out = graph.variables(copies.memory), np.zeros((copies.reported, 2, 1))
-        copies.advance(0, 1, memory, copies.numbers, copies.lines, out, False)
+        copies.advance.on_result((memory, copies.numbers, copies.lines, False), out)()
     return graph.operations(memory, out)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -17,16 +17,20 @@ from filters.engine.compile import (
     build_operation,
     memory_side_by_side,
     new_memory,
+    row_length,
     vectors,
 )
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from thruster_env.core.checks import as_floats, covariance, short_repr
-from thruster_env.core.compiled import CompiledOrPython, inlined, is_interpreting
+from thruster_env.core.compiled import inlined, is_interpreting
 from thruster_env.core.streams import filter_keys
-from thruster_env.core.threads import in_parts, spread, worker_threads
+from thruster_env.core.threads import spread
 from thruster_env.model.shape import LANES, with_root
 from thruster_env.model.state_space import StateSpaceModel
+
+if TYPE_CHECKING:
+    from thruster_env.graphs.workers import InParts
 
 
 class Estimates(NamedTuple):
@@ -243,7 +247,9 @@ class Beliefs:
         self._rows = np.zeros((count, len(row)))
         self._tables = np.zeros((count, self._kernels.kept_rows, table.shape[1]))
         self._u, self._z = np.zeros((count, filter_.kernel_model.inputs)), np.zeros((count, self._kernels.m))
-        self._operate = _operation(self._kernels, is_interpreting())
+        operation = _operation(self._kernels, self._u.shape[1], is_interpreting())
+        beliefs = self._rows, self._tables, self._u, self._z, self._numbers
+        self._operate = operation.on(count, (*self._own, self._size, *beliefs), (count,))
 
     def __getstate__(self) -> tuple:
         """The filter and the beliefs; machine code is looked up again."""
@@ -258,13 +264,13 @@ class Beliefs:
         """Set the prior in some copies with keys (len(which), 2), and update it with measurements z (N, m)."""
         self._rows[which, self._places.key_0] = keys[:, 0]
         self._rows[which, self._places.key_1] = keys[:, 1]
-        tasks = np.full(len(self._rows), IDLE)
+        tasks = np.full(len(self._rows), float(IDLE))
         tasks[which] = BEGIN
         self._do(tasks, self._u, z)
 
     def step(self, u: np.ndarray, z: np.ndarray, idle: np.ndarray | None = None) -> None:
         """Predict with inputs u (N, p), then update with measurements z (N, m); NaN marks a missing channel."""
-        tasks = np.full(len(self._rows), STEP)
+        tasks = np.full(len(self._rows), float(STEP))
         if idle is not None:
             tasks[idle] = IDLE
         self._do(tasks, u, z)
@@ -278,9 +284,7 @@ class Beliefs:
             if predicts[i]:
                 vector_like(f"u of copy {i}", self._u[i], self._u[i], missing_allowed=False)
             vector_like(f"z of copy {i}", self._z[i], self._z[i], missing_allowed=True)
-        arrays = tasks, self._rows, self._tables, self._u, self._z
-        arguments = *self._own, self._size, *arrays, self._numbers
-        worker_threads().run(self._operate, len(tasks), *arguments, alone=len(tasks) < THREADED_COPIES)
+        self._operate(tasks)
 
     def part(self, name: str, *shape: int) -> np.ndarray:
         """A copy of a part of all memories, such as "mean": (N, *shape)."""
@@ -290,17 +294,18 @@ class Beliefs:
 
 
 @lru_cache(maxsize=128)
-def _operation(kernels: Kernels, interpreting: bool) -> CompiledOrPython:
-    operate = inlined(build_operation(kernels))
-    kept_rows = kernels.kept_rows
+def _operation(kernels: Kernels, inputs: int, interpreting: bool) -> InParts:
+    from thruster_env.graphs.workers import InParts
 
-    def operate_many(first, last, row, table, draws, size, tasks, rows, tables, inputs, measurements, numbers):
+    operate = inlined(build_operation(kernels))
+    kept_rows, m, p = kernels.kept_rows, kernels.m, inputs
+
+    def operate_many(first, last, row, table, draws, size, rows, tables, us, zs, numbers, tasks):
         # Each thread has its own memory: slices of shared arrays cost contended reference counts.
-        row, table, draws = np.zeros_like(row), np.zeros_like(table), np.zeros_like(draws)
-        p, m = inputs.shape[1], measurements.shape[1]
+        row, table, draws = np.zeros(row.shape), np.zeros(table.shape), np.zeros(draws.shape)
         values = np.zeros(p + m)
         for b in range(first, last):
-            task = tasks[b]
+            task = int(tasks[b])
             if task == IDLE:
                 continue
             for i in range(row.shape[0]):
@@ -310,9 +315,9 @@ def _operation(kernels: Kernels, interpreting: bool) -> CompiledOrPython:
                     for j in range(tables.shape[2]):
                         table[i, j] = tables[b, i, j]
             for i in range(p):
-                values[i] = inputs[b, i]
+                values[i] = us[b, i]
             for i in range(m):
-                values[p + i] = measurements[b, i]
+                values[p + i] = zs[b, i]
             operate(row, table, draws, size, values, numbers, task)
             for i in range(row.shape[0]):
                 rows[b, i] = row[i]
@@ -320,4 +325,17 @@ def _operation(kernels: Kernels, interpreting: bool) -> CompiledOrPython:
                 for j in range(tables.shape[2]):
                     tables[b, i, j] = table[i, j]
 
-    return in_parts(operate_many)
+    length = row_length(kernels)
+    shapes = (
+        (length,),
+        (kernels.table_rows, None),
+        (None,),
+        None,
+        (None, length),
+        (None, None, None),
+        (None, p),
+        (None, m),
+        (None,),
+        (None,),
+    )
+    return InParts(operate_many, shapes, few=THREADED_COPIES)

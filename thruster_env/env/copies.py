@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from itertools import repeat
 from typing import Any, NamedTuple
 
@@ -14,14 +15,12 @@ from thruster_env.core.compiled import inlined, is_interpreting
 from thruster_env.core.memory import KEY_0, KEY_1, gathered, new_memory, scatter, set_row
 from thruster_env.core.results import as_array
 from thruster_env.core.sources import tuple_of, written_out
-from thruster_env.core.threads import worker_threads
 from thruster_env.env.page import LANES, compiled_page, packed, programs_of
 from thruster_env.env.plant_data import checked_state
 from thruster_env.graphs.graphs import where
 from thruster_env.graphs.values import built, shape_of
 from thruster_env.model.quantities import Quantity
 
-THREADED_BLOCKS = 8  # fewer blocks are done before a second thread has woken up
 PICKLED = ("page_of", "plant", "task", "count", "memory")
 
 
@@ -33,8 +32,6 @@ class PlantCopies:
         reported: the row after the last one that a step reports.
         commands: rows of the memory that hold the inputs of the next step.
     """
-
-    advance: Callable
 
     def __init__(self, page_of: Callable, plant: Any, task: Any, count: int):
         """Allocate the memory of `count` copies; call `begin` next.
@@ -58,7 +55,7 @@ class PlantCopies:
         self.parameters, self.numbers = parameters, packed(parameters)
         self.report_rows, self.reported = programs.report, programs.reported
         self.commands, self.lines = programs.action, programs.lines
-        self.advance, self._advance_in_parts = compiled_page(page, shape, self.count == 1, is_interpreting())
+        self.advance = compiled_page(page, shape, self.count == 1, is_interpreting())
         return programs.rows
 
     @property
@@ -103,10 +100,11 @@ class PlantCopies:
         memory = self.memory if which is None else gathered(self.memory, which, self._lanes)
         set_row(memory, KEY_0, keys[:, 0])
         set_row(memory, KEY_1, keys[:, 1])
-        out = self._run(memory, numbers, True)
+        out = np.empty(self._shape(memory))
+        self._advance(memory, numbers, True)(out)
         if which is not None:
             scatter(memory, self.memory, which)
-        return out[:, : len(keys)]
+        return out.reshape(self.reported, -1)[:, : len(keys)]
 
     def step(self, commands: np.ndarray) -> np.ndarray:
         """Apply commands (N,) of one input, or (N, p), for one sample time; return the report."""
@@ -115,23 +113,34 @@ class PlantCopies:
         else:
             for row, values in zip(self.commands, commands.T, strict=True):
                 set_row(self.memory, row, values)
-        return self._run(self.memory, self.numbers, False)[:, : self.count]
+        out = np.empty(self._shape(self.memory))
+        self._step(out)
+        return out.reshape(self.reported, -1)[:, : self.count]
 
     def report(self) -> np.ndarray:
         """The report of the last step, without a step."""
         reported = self.memory[:, : self.reported].transpose(1, 0, 2)
         return reported.reshape(self.reported, -1)[:, : self.count].copy()
 
-    def _run(self, memory: np.ndarray, numbers: np.ndarray, begin: bool) -> np.ndarray:
+    def step_into(self, out: np.ndarray) -> Callable[[], Any]:
+        """`step()` of a single copy whose episode has begun; its report is put into out (reported, 1, 1)."""
+        return self.advance.on_result((self.memory, self.numbers, self.lines, False), out)
+
+    def _shape(self, memory: np.ndarray) -> tuple[int, int, int]:
+        """Shape of a report by blocks.
+
+        It has a block more than there are: rows that lie a power of two apart would drive one another out of the
+        cache.
+        """
         blocks, _, width = memory.shape
-        # A block more than there are: rows that lie a power of two apart would drive one another out of the cache.
-        out = np.empty((self.reported, blocks + 1, width))
-        arguments = memory, numbers, self.lines, out, begin
-        if blocks < THREADED_BLOCKS:
-            self.advance(0, blocks, *arguments)
-        else:
-            worker_threads().run(self._advance_in_parts, blocks, *arguments)
-        return out.reshape(self.reported, -1)
+        return self.reported, blocks + 1, width
+
+    def _advance(self, memory: np.ndarray, numbers: np.ndarray, begin: bool) -> Callable[[np.ndarray], Any]:
+        return self.advance.on(len(memory), (memory, numbers, self.lines, begin), self._shape(memory))
+
+    @cached_property
+    def _step(self) -> Callable[[np.ndarray], Any]:
+        return self._advance(self.memory, self.numbers, False)
 
 
 # What pages are written with.

@@ -16,7 +16,6 @@ from gymnasium.vector.utils import batch_space
 
 from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.checks import seed as checked_seed
-from thruster_env.core.compiled import direct
 from thruster_env.core.memory import REWARD, TERMINATED, TIME
 from thruster_env.core.sources import written_out
 from thruster_env.core.streams import EpisodeKeys, draw_key, reset_mask
@@ -152,7 +151,7 @@ def infos_of(report: np.ndarray, rows: ReportRows, mask: np.ndarray) -> dict[str
 
 
 # What `_set_views` makes.
-VIEWS = ("_memory", "_command", "_arguments", "_advance", "_report", "_outcome", "_views", "_info")
+VIEWS = ("_command", "_advance", "_report", "_outcome", "_views", "_info")
 
 
 class PlantEnv(gym.Env):
@@ -275,13 +274,16 @@ class PlantEnv(gym.Env):
     def _set_views(self) -> None:
         """Views into the memory of the one copy, because a step has to be fast."""
         copies = self._copies
-        self._advance: Callable = copies.advance
-        self._memory = copies.memory
-        self._arguments = (0, 1, self._memory, copies.numbers, copies.lines, self._out, False)
-        self._command = self._memory[0, copies.commands.start : copies.commands.stop, 0]
+        self._advance: Callable = self._advance_first
+        self._command = copies.memory[0, copies.commands.start : copies.commands.stop, 0]
         self._report = self._out.reshape(-1)
         self._outcome = self._report[REWARD : TERMINATED + 1]
         self._views, self._info = views_of(self._report, self._rows), info_maker(self._rows)
+
+    def _advance_first(self) -> None:
+        """The first step; later ones call machine code itself."""
+        self._advance = self._copies.step_into(self._out)
+        self._advance()
 
     def __getstate__(self) -> dict:
         """The state without its views, for copies and pickles, which continue with the same numbers."""
@@ -327,7 +329,6 @@ class PlantEnv(gym.Env):
         numbers = self._copies.numbers_from(options)
         super().reset(seed=checked_seed(seed))
         self._report[:] = self._copies.begin(draw_key(self.np_random)[None], numbers=numbers)[:, 0]
-        self._advance = direct(self._copies.advance, *self._arguments)  # `step` has to be quick
         if self.render_mode is not None:
             self._show(self._report.tolist(), begin=True)
         return self._observation(), self._info(self._report, self._views)
@@ -341,7 +342,7 @@ class PlantEnv(gym.Env):
             self._command[0] = one_number(action, self.inputs[0])
         else:
             self._command[:] = some_numbers(action, self.inputs)
-        self._advance(*self._arguments)
+        self._advance()
         if self.render_mode is not None:
             self._show(self._report.tolist())
         reward, terminated = self._outcome.tolist()

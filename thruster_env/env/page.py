@@ -13,11 +13,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import count
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined
+from thruster_env.core.compiled import function_fingerprint, inlined
 from thruster_env.core.memory import (
     FIRST_REPORTED,
     FRONT,
@@ -29,14 +29,17 @@ from thruster_env.core.memory import (
     TIME,
     WIDTH,
 )
-from thruster_env.core.threads import in_parts
 from thruster_env.effects.effects import Moment, unrolled
 from thruster_env.graphs.draws import Draws
 from thruster_env.graphs.graphs import Graph, Number, uncollected, where
 from thruster_env.graphs.programs import OF_COPIES, Place, Program, callable_of, program_of
 from thruster_env.graphs.values import NUMBER, Line, built, leaves, shape_of
 
+if TYPE_CHECKING:
+    from thruster_env.graphs.workers import InParts
+
 LANES = 16  # copies side by side: two of the widest registers, whose instructions the processor overlaps
+FEW_BLOCKS = 8  # fewer are done before a second thread has woken up
 MOST = 50_000  # operations of a program
 MOST_UNROLLED = 8  # repetitions, above which a program is a loop
 OF_ALL = {"reward": REWARD, "terminated": TERMINATED, "time": TIME}  # rows that all plants have
@@ -211,7 +214,7 @@ class _Tracer:
             self._rows[outlet.place] = Place("memory", rows)
             lines.append((self._rows[last.place].at, rows, rows + 1, size))
             rows += 1 + size
-        return np.array(lines, dtype=np.int64).reshape(-1, 4), rows
+        return np.array(lines, dtype=np.float64).reshape(-1, 4), rows
 
     def _program(self, stores: list[tuple[Place, Number]]) -> Program:
         changed = [(target, number) for target, number in stores if self._lies(number) != target]
@@ -232,14 +235,12 @@ class _Loop(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def compiled_page(
-    page: Page, shape: Any, single: bool, interpreting: bool
-) -> tuple[CompiledOrPython, CompiledOrPython]:
-    """The compiled `advance(first, last, memory, numbers, lines, out, begin)`, and the same for several threads.
+def compiled_page(page: Page, shape: Any, single: bool, interpreting: bool) -> InParts:
+    """The compiled step of blocks, `on(blocks, (memory, numbers, lines, begin), out.shape)(out)`.
 
-    It works on blocks first ... last - 1 of a memory (blocks, rows, width): with `begin` it starts an episode of
-    every copy from its key, otherwise it applies the actions for one sample time. Reports are copied to out
-    (reported, blocks, width).
+    It works on all blocks of a memory (blocks, rows, width): with `begin` it starts an episode of every copy from
+    its key, otherwise it applies the actions for one sample time. Reports are copied to out (reported, blocks,
+    width).
 
     Args:
         page: a plant's functions.
@@ -253,7 +254,7 @@ def compiled_page(
     move = _repeated(steps, programs.repetitions) if programs.repetitions else steps[0]
     fingerprint = function_fingerprint(start, *steps, within=__name__)
 
-    def step(first, last, memory, numbers, lines, out, begin):
+    def step(first, last, memory, numbers, lines, begin, out):
         fingerprint  # noqa: B018 - part of the cache's key
         for b in range(first, last):
             block = memory[b]
@@ -267,14 +268,18 @@ def compiled_page(
                 for j in range(block.shape[1]):
                     out[i, b, j] = block[i, j]
 
-    return CompiledOrPython(step), in_parts(step)
+    from thruster_env.graphs.workers import InParts
+
+    of_memory = (None, programs.rows, 1 if single else None)
+    shapes = of_memory, (None,), programs.lines.shape, None, (reported, None, None)
+    return InParts(step, shapes, single=single, few=FEW_BLOCKS)
 
 
 @inlined
 def move_lines(block, lines):
     """Put what goes into each line behind the others, and take out what comes out in the next step."""
     for k in range(lines.shape[0]):
-        last, outlet, first, size = lines[k, 0], lines[k, 1], lines[k, 2], lines[k, 3]
+        last, outlet, first, size = int(lines[k, 0]), int(lines[k, 1]), int(lines[k, 2]), int(lines[k, 3])
         for j in range(block.shape[1]):
             step = int(block[STEP, j])
             block[first + step % size, j] = block[last, j]

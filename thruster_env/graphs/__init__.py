@@ -6,6 +6,7 @@ programs         a graph as a program for some runs side by side, or for members
 instructions     a program as instructions of LLVM
 loops            the loops around programs, from their source; expressions, forms, arithmetic: what they compute
 machine_code     instructions of LLVM as functions of Python, compiled, kept on disk and freed
+workers          such functions in parts, shared by worker threads
 python_floats    functions that run as Python
 
 What can be traced, and the arithmetic of programs: docs/machine_code.md. A program is compared with its function

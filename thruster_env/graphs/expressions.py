@@ -414,6 +414,16 @@ BUILTINS: dict[Any, Callable] = {
 }
 
 
+def instruction(write: Callable) -> Callable:
+    """What translated functions may call to have `write(builder, *numbers)` write instructions of LLVM."""
+
+    def call(*_):
+        raise NotImplementedError(f"{write.__name__} is machine code alone")
+
+    BUILTINS[call] = lambda translator, *values: write(translator._builder, *map(as_value, values))
+    return call
+
+
 def new_function(module: ir.Module, kind: ir.FunctionType, name: str) -> ir.Function:
     """Add a function to a module, for its own calls."""
     function = ir.Function(module, kind, module.get_unique_name(f"_{name}"))  # no name of an entry

@@ -45,7 +45,8 @@ def machine_code_of(
 ) -> Code | None:
     """Machine code of a function, or None if it cannot be translated or linked; see `add_function`.
 
-    Called from Python as a builtin function it has the last argument of the function; the words have the others.
+    Called from Python as a builtin function it has the last argument of the function, of an array the address; the
+    words have the others.
     Its loops are `unrolled` or not, see `machine_code.code_of`.
     """
     return common_code_of(Entry(function, shapes, as_builtin), unrolled=unrolled)
@@ -60,7 +61,7 @@ def common_code_of(*entries: Entry, unrolled: bool = True) -> Code | None:
             target, word_count = add_function(module, name, entry.function, entry.shapes, functions)
             if entry.as_builtin:
                 target.linkage = "internal"
-                add_builtin(module, "call", target, word_count - 1)
+                add_builtin(module, "call", target, word_count - 1 - len(entry.shapes[-1] or ()))
             names.append("call" if entry.as_builtin else "run")
     except TypeError:
         return None

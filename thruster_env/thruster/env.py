@@ -181,7 +181,7 @@ class BowThrusterEnv(ModelledThruster, PlantEnv):
     @property
     def parameters(self) -> ThrusterParameters:
         """The parameters of this episode, which differ from the plant's where these are uncertain."""
-        key = self._memory[0, [KEY_0, KEY_1], 0]
+        key = self._copies.memory[0, [KEY_0, KEY_1], 0]
         uncertain = {name: (type(kind), kind.numbers) for name, kind in self.plant.uncertainty.items()}
         drawn = drawn_parameters(self.plant.parameters, uncertain, Draws(tuple(key), 0))
         values: dict[str, Any] = {name: float(getattr(drawn, name)) for name in uncertain}

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from thruster_env.core import threads
-from thruster_env.core.threads import VARIABLE, new_flags, spin_for_call, waiting
+from thruster_env.core.threads import VARIABLE, waiting
 
 
 @pytest.fixture(params=[None, "active", "passive"])
@@ -49,11 +49,3 @@ def test_another_word_is_refused(monkeypatch):
         threads.wait_policy()
     with pytest.raises(ValueError, match="policy must be one of active, passive, but got 0"), waiting(0):
         pass
-
-
-@pytest.mark.parametrize("rounds", [0, 5])
-def test_a_helper_waits_for_so_many_rounds_and_no_longer(rounds, monkeypatch):
-    passed = []
-    monkeypatch.setattr(threads, "yield_core", lambda: passed.append(1))
-    spin_for_call(new_flags(1), 0, rounds)
-    assert len(passed) == rounds
