@@ -252,24 +252,50 @@ def tail_mass(edge, spread, tail, z):
 
 
 @inlined
+def sort_order(y, order, merged, size):
+    """Set `order` (N,) to the indices of y (N,) from the least on, by merging sorted runs in `merged` (N,)."""
+    for j in range(size):
+        order[j] = j
+    width = 1
+    while width < size:
+        for first in range(0, size, 2 * width):
+            left, right = first, min(first + width, size)
+            middle, end = right, min(first + 2 * width, size)
+            for k in range(first, end):
+                if left < middle and (right == end or y[int(order[left])] <= y[int(order[right])]):
+                    merged[k] = order[left]
+                    left += 1
+                else:
+                    merged[k] = order[right]
+                    right += 1
+        for j in range(size):
+            order[j] = merged[j]
+        width *= 2
+
+
+@inlined
 def ranked_moves(y, v, tail, moves, size):
     """Moves of a channel's y (N,), with R = 1, for a measurement v: to the quantiles of its posterior."""
-    order, squares = np.argsort(y), 0.0
+    order, squares = np.empty(size), 0.0
+    sort_order(y, order, moves, size)
     for j in range(size):
         squares += y[j] ** 2
         moves[j] = 0.0
     spread = (squares / (size - 1)) ** 0.5
     if not 0.0 < spread < np.inf:
         return
+    least, largest = int(order[0]), int(order[size - 1])
     share = math.log(size + 1.0)  # of the prior's bins between members
     masses = np.empty(size + 1)
-    masses[0], left, left_deviation = tail_mass(y[order[0]], spread, tail, v)
-    masses[size], right, right_deviation = tail_mass(-y[order[size - 1]], spread, tail, -v)
+    masses[0], left, left_deviation = tail_mass(y[least], spread, tail, v)
+    masses[size], right, right_deviation = tail_mass(-y[largest], spread, tail, -v)
     for i in range(1, size):
-        a, b = -0.5 * (y[order[i - 1]] - v) ** 2, -0.5 * (y[order[i]] - v) ** 2
+        a, b = -0.5 * (y[int(order[i - 1])] - v) ** 2, -0.5 * (y[int(order[i])] - v) ** 2
         most = max(a, b)
         masses[i] = most + math.log(0.5 * (math.exp(a - most) + math.exp(b - most))) - share
-    most, total = masses.max(), 0.0
+    most, total = masses[0], 0.0
+    for i in range(1, size + 1):
+        most = max(most, masses[i])
     for i in range(size + 1):
         masses[i] = math.exp(masses[i] - most)
         total += masses[i]
@@ -281,16 +307,17 @@ def ranked_moves(y, v, tail, moves, size):
             bin_ += 1
         part = wanted - before
         if bin_ == 0:
-            z = quantile(part / masses[0] * below((y[order[0]] - left) / left_deviation))
+            z = quantile(part / masses[0] * below((y[least] - left) / left_deviation))
             new = left + left_deviation * z
         elif bin_ == size:
             rest = max(masses[size] - part, 0.0) / masses[size]
-            z = quantile(rest * below((-y[order[size - 1]] - right) / right_deviation))
+            z = quantile(rest * below((-y[largest] - right) / right_deviation))
             new = -(right + right_deviation * z)
         else:
-            low, high = y[order[bin_ - 1]], y[order[bin_]]
+            low, high = y[int(order[bin_ - 1])], y[int(order[bin_])]
             new = low + (high - low) * part / masses[bin_]
-        moves[order[rank]] = new - y[order[rank]]
+        member = int(order[rank])
+        moves[member] = new - y[member]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

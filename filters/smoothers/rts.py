@@ -37,7 +37,7 @@ from filters.pages.kernels import Stage, as_tuple, programs_of, stored
 from filters.pages.page import Equations, Page, RowMemory
 from filters.pages.page_filter import PageFilter
 from thruster_env.core.angles import difference
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
 from thruster_env.core.threads import spread
 from thruster_env.model.shape import Functions, Shape, number_offsets
 
@@ -134,8 +134,9 @@ def passes(filter_: PageFilter, relation: Relation) -> Callable[..., tuple]:
         filtered: Given, inputs: np.ndarray, lag: int, numbers: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         numbers = of_filter if numbers is None else numbers
-        means, covs = np.empty_like(filtered[0]), np.empty_like(filtered[1])
-        work = partial(run_part, filtered, inputs, numbers, lag, means, covs)
+        arrays = tuple(np.ascontiguousarray(part, dtype=np.float64) for part in (*filtered, inputs))
+        means, covs = np.empty_like(arrays[0]), np.empty_like(arrays[1])
+        work = partial(run_part, arrays[:3], arrays[3], numbers, lag, means, covs)
         work(0, 1) if len(means) == 1 else spread(work, len(means))
         return means, covs
 
@@ -143,9 +144,7 @@ def passes(filter_: PageFilter, relation: Relation) -> Callable[..., tuple]:
 
 
 @lru_cache(maxsize=64)
-def _smoother(
-    relation: Relation, page: Page, functions: Functions, shape: Shape, interpreting: bool
-) -> CompiledOrPython:
+def _smoother(relation: Relation, page: Page, functions: Functions, shape: Shape, interpreting: bool) -> Callable:
     """The compiled passes over runs, for a relation."""
 
     def stages(memory: RowMemory, model: Equations) -> list[Stage]:
@@ -208,7 +207,7 @@ def _smoother(
                 total = 0.0
                 for i in range(belief):
                     total += abs(row[link_offset + i])
-                if restarted[b, k + 1] or not total < 1e300:
+                if restarted[b, k + 1] > 0.0 or not total < 1e300:
                     for i in range(belief):
                         row[link_offset + i] = 0.0
                     copy(row, link_offset + belief, row, mean_offset + n, n * n)
@@ -228,7 +227,11 @@ def _smoother(
                             for j in range(n):
                                 out_covs[b, k, i, j] = row[later_offset + n + i * n + j]
 
-    return CompiledOrPython(smooth)
+    estimates = [(None, None, n), (None, None, n, n), (None, None)]
+    shapes = estimates, (None, None, None), (None, None), None, *estimates[:2], None, None
+    from thruster_env.graphs.loops import Loops
+
+    return Loops(smooth, shapes)
 
 
 def link_unscented(model, x, P, X):

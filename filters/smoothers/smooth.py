@@ -27,7 +27,7 @@ from filters.smoothers.modes import smoothed_modes
 from filters.smoothers.rts import passes, relation_of, smooth_backwards
 from filters.starts import warn_of_restarts
 from thruster_env.core.checks import at_least
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
 from thruster_env.core.sources import joiner, vector_part, written_out
 from thruster_env.core.threads import spread
 from thruster_env.model.shape import number_offsets
@@ -106,7 +106,7 @@ def _paired_functions(transition: Callable, observe: Callable, n: int) -> tuple[
 
 
 @lru_cache(maxsize=64)
-def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> CompiledOrPython:
+def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> Callable:
     n, m = kernels.n, kernels.m
     start, predict, update, restart = kernels.start, kernels.predict, kernels.update, restart_if_lost(kernels)
     layout, pair_offsets = memory_offsets(n, m), memory_offsets(2 * n, m)
@@ -172,7 +172,12 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
                     for j in range(n):
                         covs[b, k, i, j] = row[cov + i * n + j]
 
-    return CompiledOrPython(smooth)
+    memory, squares = [(None,), (None, None), (None,)], ((None, 2 * n * n), (None, 2 * m * m))
+    data = [(None, 2), (None, None, None), (None, None, m), *squares]
+    out = [(None, None, n), (None, None, n, n), (None,)]
+    from thruster_env.graphs.loops import Loops
+
+    return Loops(smooth, (memory, memory, (None, None), None, data, [(None,), (None,)], None, out, None, None))
 
 
 class Smoothed(NamedTuple):

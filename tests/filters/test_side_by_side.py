@@ -40,15 +40,12 @@ def test_blocks_that_are_full_or_not_hold_the_same_estimates(kind):
         np.testing.assert_allclose(part, of_all[:5], rtol=1e-12, atol=1e-12)
 
 
-WITH_NUMBA = {"rhf"}
-
-
 @pytest.mark.parametrize("name", slow_but(FILTERS, ("ekf", "enkf", "pf", "imm")))
 def test_filters_need_no_numba(name, monkeypatch):
     monkeypatch.setattr("thruster_env.graphs.loops.code_of", lambda module, *names, unrolled: names)
     kernels = make_filter(name, thruster_model()).kernels()
-    by_numba, entries = name in WITH_NUMBA, ("call",) if kernels.vectors else ("call", "run")
-    assert engine._code_one_by_one.__wrapped__(kernels) == (None if by_numba else entries)
+    entries = ("call",) if kernels.vectors else ("call", "run")
+    assert engine._code_one_by_one.__wrapped__(kernels) == entries
     assert not kernels.vectors or engine._code_side_by_side.__wrapped__(kernels) == ("run",)
 
 

@@ -24,6 +24,16 @@ LONGEST = 4096  # numbers of an array that a function makes for itself, on the s
 POINTER = DOUBLE.as_pointer()
 
 
+class Functions(dict):
+    """The functions and programs of a module, by what they are made of.
+
+    Attributes:
+        programs_apart: whether programs are never inlined: within a loop they would take other last digits.
+    """
+
+    programs_apart = True
+
+
 class Expressions:
     """Translates expressions: names stand for values of LLVM, arrays, tuples, or objects of Python that are known.
 
@@ -32,7 +42,7 @@ class Expressions:
         has_loops: whether there are loops or calls of programs, also in what is called.
     """
 
-    def __init__(self, builder: ir.IRBuilder, functions: dict):
+    def __init__(self, builder: ir.IRBuilder, functions: Functions):
         self.numbers, self._builder, self._functions = Arithmetic(builder), builder, functions
         self.has_loops = False
         self._names: dict[str, Any] = {}
@@ -329,7 +339,7 @@ class Expressions:
     # Calls.
 
     def _call_program(self, function: Any, arguments: Sequence) -> None:
-        """Call a program, which is a function of its own: within a loop it would take other last digits."""
+        """Call a program, which is a function of its own."""
         self.has_loops = True
         program, width, names, scratch = function.program
         arrays = [argument for argument in arguments if isinstance(argument, Array)]
@@ -339,11 +349,14 @@ class Expressions:
         if names == OF_MEMBERS:
             more = [arrays[names.index("table")].shape[1], arguments[-1]]
         called = self._functions.get(function)
-        if called is None:
+        if called is not None:
+            called.attributes.add("noinline")
+        else:
             kind = ir.FunctionType(ir.VoidType(), [POINTER] * len(arrays) + [LONG] * len(more))
             called = new_function(self._builder.module, kind, "program")
             self._functions[function] = called
-            called.attributes.add("noinline")
+            if self._functions.programs_apart:
+                called.attributes.add("noinline")
             builder, data = ir.IRBuilder(called.append_basic_block()), dict(zip(names, called.args, strict=False))
             if names == OF_MEMBERS:
                 LoopWriter(None, builder, data, width, *called.args[-2:]).write(cut(program, scratch))

@@ -16,6 +16,7 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
+import threading
 import types
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -24,12 +25,13 @@ from typing import Any, NamedTuple
 
 from llvmlite import ir  # type: ignore[import-untyped]
 
+from thruster_env.core.compiled import CompiledOrPython, is_interpreting
 from thruster_env.core.optimising import WIDE
 from thruster_env.graphs.arithmetic import Untranslated, is_known
-from thruster_env.graphs.expressions import POINTER, Expressions
+from thruster_env.graphs.expressions import POINTER, Expressions, Functions
 from thruster_env.graphs.forms import changing_form, common_form, has_array
 from thruster_env.graphs.instructions import LONG
-from thruster_env.graphs.machine_code import Code, NotLinked, add_builtin, code_of
+from thruster_env.graphs.machine_code import Code, NotLinked, add_builtin, code_of, function_of
 
 
 class Entry(NamedTuple):
@@ -53,8 +55,12 @@ def machine_code_of(
 
 
 def common_code_of(*entries: Entry, unrolled: bool = True) -> Code | None:
-    """Machine code of functions that share those they call, or None; at most one builtin function and another."""
-    module, names, functions = ir.Module(), list[str](), dict[Any, Any]()
+    """Machine code of functions that share those they call, or None; at most one builtin function and another.
+
+    If there are two, programs may become part of the functions that both call.
+    """
+    module, names, functions = ir.Module(), list[str](), Functions()
+    functions.programs_apart = len(entries) == 1
     try:
         for entry in entries:
             name = "operate" if entry.as_builtin else "run"
@@ -72,7 +78,7 @@ def common_code_of(*entries: Entry, unrolled: bool = True) -> Code | None:
 
 
 def add_function(
-    module: ir.Module, name: str, function: Callable, shapes: Sequence, functions: dict | None = None
+    module: ir.Module, name: str, function: Callable, shapes: Sequence, functions: Functions | None = None
 ) -> tuple[ir.Function, int]:
     """Add `i64 name(words)`, a Python function of arrays and whole numbers; return it and its number of words.
 
@@ -91,7 +97,7 @@ def add_function(
     """
     target = ir.Function(module, ir.FunctionType(LONG, [LONG.as_pointer()]), name)
     builder, word = ir.IRBuilder(target.append_basic_block("entry")), 0
-    translator = _Translator(builder, {} if functions is None else functions)
+    translator = _Translator(builder, Functions() if functions is None else functions)
 
     def next_word() -> ir.Value:
         nonlocal word
@@ -113,10 +119,39 @@ def add_function(
     return target, word
 
 
+class Loops:
+    """A function of arrays and whole numbers that is translated at its first call, else compiled, else in Python.
+
+    Its arguments are arrays of float64 in C order, whole numbers, and tuples of these.
+    """
+
+    def __init__(self, function: Callable, shapes: Sequence, *, unrolled: bool = True):
+        """Take a function and the shapes of its arguments, see `add_function`."""
+        self._function, self._shapes, self._unrolled = function, shapes, unrolled
+        self._run: Any = CompiledOrPython(function) if is_interpreting() else None
+        self._first = threading.Lock()
+
+    def __call__(self, *arguments):
+        """Call the function."""
+        if self._run is None:
+            with self._first:
+                self._run = self._run or self._first_run()
+        return self._run(*arguments)
+
+    def _first_run(self) -> Callable:
+        code = machine_code_of(self._function, self._shapes, unrolled=self._unrolled)
+        return CompiledOrPython(self._function) if code is None else function_of(code)
+
+    @property
+    def in_python(self) -> bool:
+        """Whether calls run as Python, as far as is known before the first."""
+        return getattr(self._run, "in_python", False)
+
+
 class _Translator(Expressions):
     """Translates functions."""
 
-    def __init__(self, builder: ir.IRBuilder, functions: dict):
+    def __init__(self, builder: ir.IRBuilder, functions: Functions):
         super().__init__(builder, functions)
         self._changing: set[str] = set()  # names of what changes
         self._returns: list[tuple[ir.Block, Any]] = []

@@ -10,7 +10,6 @@ import numpy as np
 
 from thruster_env.core.checks import as_floats
 from thruster_env.core.compiled import (
-    CompiledOrPython,
     function_fingerprint,
     inlined,
     instead_of,
@@ -98,6 +97,8 @@ def truth_steps_of(model: StateSpaceModel):
 
 @lru_cache(maxsize=64)
 def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
+    from thruster_env.graphs.loops import Loops
+
     fingerprint = function_fingerprint(begin, advance, measure, within=__name__)
     room = padded(max(n, m), GROUP)
 
@@ -118,7 +119,8 @@ def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
                 for i in range(m):
                     measurements[b, k, i] = z[i]
 
-    return CompiledOrPython(simulate)
+    shapes = (None, 2), (None, None, None), (None,), (None, None, n), (None, None, m)
+    return Loops(simulate, shapes)
 
 
 def seconds_as_python(model: StateSpaceModel) -> float:

@@ -17,7 +17,7 @@ from filters.consistency.report import rounded
 from filters.filter import Filter
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import correlation_flaws
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from thruster_env.core.compiled import function_fingerprint, is_interpreting
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.model.shape import Functions, Shape, constants_reader, number_offsets
 from thruster_env.model.state_space import StateSpaceModel
@@ -262,9 +262,10 @@ def residuals(model: StateSpaceModel, data: Data) -> Residuals:
 
 def predicted(model: StateSpaceModel, states: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """F along states (B, T, n) and inputs (B, T - 1, p), (B, T - 1, n), and h, (B, T, m)."""
-    expected, outputs = np.empty_like(states[:, 1:]), np.empty((*states.shape[:2], model.m))
+    states, inputs = (np.ascontiguousarray(rows, dtype=np.float64) for rows in (states, inputs))
+    expected, outputs = np.empty(states[:, 1:].shape), np.empty((*states.shape[:2], model.m))
     steps = _steps(model.functions, model.shape, is_interpreting())
-    steps(np.ascontiguousarray(states), inputs, model.numbers, expected, outputs)
+    steps(states, inputs, model.numbers, expected, outputs)
     return expected, outputs
 
 
@@ -401,4 +402,7 @@ def _steps(functions: Functions, shape: Shape, interpreting: bool):
                     for i in range(n):
                         expected[b, k, i] = x[i]
 
-    return CompiledOrPython(steps)
+    shapes = (None, None, n), (None, None, None), (None,), (None, None, n), (None, None, m)
+    from thruster_env.graphs.loops import Loops
+
+    return Loops(steps, shapes)
