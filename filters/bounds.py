@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from filters.engine.batch import run
 from filters.gaussian.extended import ExtendedKalmanFilter
 from thruster_env.core.checks import as_floats, at_least, correlations, covariance_root, with_progress
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
 from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.matrices import multiplier, quadratic_form
 from thruster_env.core.sources import Source, matrix_reader, vector_reader, vector_writer
@@ -32,6 +33,9 @@ from thruster_env.model.shape import (
 )
 from thruster_env.model.simulate import noise_step, simulate, truth_steps
 from thruster_env.model.state_space import StateSpaceModel
+
+if TYPE_CHECKING:
+    from thruster_env.graphs.loops import Loops
 
 STIFF = 1e8  # S over R, from which an update of covariances loses half of their digits: roots keep them
 
@@ -246,7 +250,7 @@ def posterior_variances(
     return wrapped_variances(variances, model.shape.state_angles)
 
 
-def gathering_code(model: StateSpaceModel) -> tuple[CompiledOrPython, str]:
+def gathering_code(model: StateSpaceModel) -> tuple[Loops, str]:
     """What sums up Jacobians for the bound of a model, and a hash of all code that determines the bound."""
     functions = model.functions
     fingerprint = function_fingerprint(*functions, within=__name__)
@@ -278,7 +282,8 @@ def _posterior_bound(model: StateSpaceModel, inputs: np.ndarray, keys: np.ndarra
     (count, steps, _), n = inputs.shape, model.n
     f_mean, spread_of_f, information = (np.zeros((count, steps + 1, n, n)) for _ in range(3))
     q_inverse, r_inverse = _inverse(model.process_noise_cov), _inverse(model.measurement_noise_cov)
-    fixed = inputs, model.numbers, q_inverse.ravel(), r_inverse.ravel(), f_mean, spread_of_f, information
+    weights, sums = (q_inverse.ravel(), r_inverse.ravel()), (f_mean, spread_of_f, information)
+    fixed = np.ascontiguousarray(inputs), model.numbers, *weights, *sums
     add, done = _gatherer(model.functions, model.shape, is_interpreting()), 0
     # Some truths at a time, in the same order: Ctrl-C is heard in between.
     size = max(int(WORK_AT_ONCE / (max(count, 1) * (steps + 1) * n**3)), 1)
@@ -358,7 +363,9 @@ def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
 
     def gather(keys, before, inputs, numbers, q_inverse, r_inverse, f_mean, spread_of_f, information, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
-        x, u, draws, eye = np.zeros(n), np.zeros(inputs.shape[2]), np.zeros(room), np.eye(n).ravel()
+        x, u, draws, eye = np.zeros(n), np.zeros(inputs.shape[2]), np.zeros(room), np.zeros(n * n)
+        for i in range(n):
+            eye[i * (n + 1)] = 1.0
         c, s = constants(numbers), scales(numbers)
         weight_q, weight_r = read_weight_n(q_inverse), read_weight_m(r_inverse)
         for b in range(first, last):
@@ -380,7 +387,11 @@ def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
                     store_state(x, predicted)
                     disturb(x, draws, k + 1, key_0, key_1, numbers)
 
-    return CompiledOrPython(gather)
+    from thruster_env.graphs.loops import Loops
+
+    matrices, weights = [(None, None, n, n)] * 3, ((n * n,), (m * m,))
+    shapes = (None, None, 2), None, (None, None, None), (None,), *weights, *matrices, None, None
+    return Loops(gather, shapes)
 
 
 def _into(line: str, n: int):

@@ -192,7 +192,7 @@ def test_a_bound_is_computed_once_for_the_same_inputs(monkeypatch):
     import tuning.problems.bound as module
 
     monkeypatch.setattr("tuning.problems.bound._known", {})
-    monkeypatch.setattr("thruster_env.core.compiled.CompiledOrPython.folder", None)  # nothing on the disk
+    monkeypatch.setattr("thruster_env.graphs.loops.Loops.folder", None)  # nothing on the disk
     asked, computed = [], module.posterior_variances
     monkeypatch.setattr(
         module, "posterior_variances", lambda *given, **named: asked.append(1) or computed(*given, **named)

@@ -104,15 +104,6 @@ class Stores:
 
 
 @cache
-def made_by() -> str:
-    """The versions and the processor that machine code is made for: others may compute different last digits."""
-    import numba
-    from numba.core.registry import cpu_target
-
-    return f"{numba.__version__} {np.__version__} {cpu_target.target_context.codegen().magic_tuple()}"
-
-
-@cache
 def _tell(where: str) -> None:
     warnings.warn(f"{RULE}{where}", stacklevel=2)
 

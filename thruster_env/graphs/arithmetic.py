@@ -31,6 +31,7 @@ OF_WHOLE = {"Add": "add", "Sub": "sub", "Mult": "mul", "BitAnd": "and_", "BitOr"
 OF_WHOLE |= {"LShift": "shl", "RShift": "ashr"}
 OF_FLOATS = {"Add": "fadd", "Sub": "fsub", "Mult": "fmul", "Div": "fdiv"}
 COMPARISONS = {"Lt": "<", "LtE": "<=", "Gt": ">", "GtE": ">=", "Eq": "==", "NotEq": "!="}
+BIAS, EXPONENTS = 1023, 2047  # of a float64's exponent: what is added to it, and its bits
 MOST_FACTORS = 8  # of a power that is written as a product
 
 
@@ -51,7 +52,7 @@ def as_value(value: Any) -> ir.Value:
     for kind, known in kinds:
         if isinstance(value, known):
             return ir.Constant(kind, float(value) if kind == DOUBLE else int(value))
-    raise Untranslated(f"a number must be known, or one of LLVM, but got {value!r}")
+    raise Untranslated(f"a number must be known, or one of LLVM, but got a {type(value).__name__}")
 
 
 class Arithmetic:
@@ -165,6 +166,18 @@ class Arithmetic:
                 first = self.builder.select(self.of_two(name, value, first), value, first)
         return first
 
+    def exponent(self, x: Any) -> tuple[ir.Value, ir.Value]:
+        """`math.frexp` of a normal number."""
+        bits, of_two = self.bits_as(LONG, self.as_float(x)), self.of_two
+        exponent = of_two("Sub", of_two("BitAnd", of_two("RShift", bits, 52), EXPONENTS), BIAS - 1)
+        mantissa = of_two("BitOr", of_two("BitAnd", bits, ~(EXPONENTS << 52)), (BIAS - 1) << 52)
+        return self.bits_as(DOUBLE, mantissa), exponent
+
+    def with_exponent(self, x: Any, exponent: Any) -> Any:
+        """`math.ldexp`, of a power of two that is a normal number."""
+        power = self.bits_as(DOUBLE, self.of_two("LShift", self.of_two("Add", self.as_whole(exponent), BIAS), 52))
+        return self.of_two("Mult", x, power)
+
     def bits_as(self, kind: ir.Type, value: Any) -> ir.Value:
         """The bits of a number as another number."""
         return self.builder.bitcast(as_value(value), kind)
@@ -187,13 +200,25 @@ def _as_known_float(arithmetic: Arithmetic, x: Any) -> Any:
     return float(x) if is_known(x) else arithmetic.as_float(x)
 
 
+def _is_finite(arithmetic: Arithmetic, x: Any) -> ir.Value:
+    return arithmetic.of_two("Lt", arithmetic.function("abs", x), math.inf)
+
+
+def _is_nan(arithmetic: Arithmetic, x: Any) -> ir.Value:
+    return arithmetic.of_two("NotEq", as_value(x), as_value(x))
+
+
 FUNCTIONS: dict[Any, Callable] = {
+    **{module.isfinite: _is_finite for module in (math, np)},
+    **{module.isnan: _is_nan for module in (math, np)},
     **{getattr(np, name): _of_floats(name) for name in NAMES},
     **{getattr(math, MATH_NAMES.get(name, name)): _of_floats(name) for name in NAMES if name not in ROUNDED},
     math.floor: lambda arithmetic, x: arithmetic.cut(arithmetic.function("floor", x)),
     math.ceil: lambda arithmetic, x: arithmetic.cut(arithmetic.function("ceil", x)),
     math.erf: _of_floats("erf"),
     math.erfc: _of_floats("erfc"),
+    math.frexp: Arithmetic.exponent,
+    math.ldexp: Arithmetic.with_exponent,
     abs: _magnitude,
     np.abs: _magnitude,
     nearest_whole: lambda arithmetic, x: arithmetic.function("floor", arithmetic.of_two("Add", x, 0.5)),

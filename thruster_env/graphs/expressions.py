@@ -173,7 +173,10 @@ class Expressions:
         raise Untranslated(f"the method {name}")
 
     def _binop(self, node: ast.BinOp) -> Any:
-        return self.numbers.of_two(type(node.op).__name__, self._value(node.left), self._value(node.right))
+        a, b = self._value(node.left), self._value(node.right)
+        if isinstance(node.op, ast.Add) and type(a) is type(b) is tuple:
+            return a + b
+        return self.numbers.of_two(type(node.op).__name__, a, b)
 
     def _unaryop(self, node: ast.UnaryOp) -> Any:
         value = self._value(node.operand)

@@ -21,6 +21,7 @@ import types
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from llvmlite import ir  # type: ignore[import-untyped]
@@ -31,7 +32,7 @@ from thruster_env.graphs.arithmetic import Untranslated, is_known
 from thruster_env.graphs.expressions import POINTER, Expressions, Functions
 from thruster_env.graphs.forms import changing_form, common_form, has_array
 from thruster_env.graphs.instructions import LONG
-from thruster_env.graphs.machine_code import Code, NotLinked, add_builtin, code_of, function_of
+from thruster_env.graphs.machine_code import Code, NotLinked, add_builtin, code_folder, code_of, function_of
 
 
 class Entry(NamedTuple):
@@ -146,6 +147,11 @@ class Loops:
     def in_python(self) -> bool:
         """Whether calls run as Python, as far as is known before the first."""
         return getattr(self._run, "in_python", False)
+
+    @property
+    def folder(self) -> Path | None:
+        """Where its machine code is kept; None where none is."""
+        return None if self.in_python else code_folder()
 
 
 class _Translator(Expressions):

@@ -84,7 +84,7 @@ def code_of(module: ir.Module, *names: str, unrolled: bool = True) -> Code:
     Raises NotLinked if this system's libraries lack a function, and RuntimeError for a module that LLVM refuses.
     """
     text = str(module)
-    digest = hashlib.sha256(f"{_host()}\n{names} {unrolled}\n{text}".encode()).hexdigest()
+    digest = hashlib.sha256(f"{host()}\n{names} {unrolled}\n{text}".encode()).hexdigest()
     with _compiling:
         code = _loaded.get(digest)
         if code is None:
@@ -111,8 +111,8 @@ def _linker() -> Any:
 
 
 @cache
-def _host() -> str:
-    """What object code depends on beside the text."""
+def host() -> str:
+    """What object code depends on beside the text: others may compute different last digits."""
     version = ".".join(map(str, llvm.llvm_version_info))
     processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
     return f"{llvmlite.__version__} {version} {llvm.get_process_triple()} {processor} {PASSES} {SELECTION}"
@@ -155,8 +155,13 @@ def _folder_in(root: str | None) -> Path | None:
         return None
 
 
+def code_folder() -> Path | None:
+    """Where object code is kept; None if nowhere."""
+    return _folder(os.environ.get("NUMBA_CACHE_DIR", ""))
+
+
 def _file(digest: str) -> Path | None:
-    folder = _folder(os.environ.get("NUMBA_CACHE_DIR", ""))
+    folder = code_folder()
     return None if folder is None else folder / f"{digest}.o"
 
 

@@ -7,15 +7,18 @@ import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from filters.bounds import gathering_code, posterior_variances, sequences_taken
-from thruster_env.core.compiled import CompiledOrPython, made_by
 from thruster_env.core.files import write_whole
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.digest import digest_of
+
+if TYPE_CHECKING:
+    from thruster_env.graphs.loops import Loops
 
 _known: dict[str, tuple[float, ...]] = {}  # of this process
 
@@ -49,12 +52,10 @@ def average_bound(model: StateSpaceModel, data: Data, truths: int = 100) -> np.n
     return cached_numbers("bound", model.n, follows_from, code, compute)
 
 
-def cached_numbers(
-    name: str, count: int, follows_from: bytes, code: CompiledOrPython, compute: Callable
-) -> np.ndarray:
+def cached_numbers(name: str, count: int, follows_from: bytes, code: Loops, compute: Callable) -> np.ndarray:
     """Return the vector compute(), from the cache if it was computed from the same inputs before.
 
-    Numbers lie as JSON where the code is compiled to (`thruster_env.core.compiled`), for one kind of
+    Numbers lie as JSON where machine code is kept (`thruster_env.graphs.machine_code`), for one kind of
     processor, and go with it. A file that is damaged is as if it were not there, a folder that takes none is as it
     is.
 
@@ -65,8 +66,10 @@ def cached_numbers(
         code: what computes them, or most of them.
         compute: a function that returns finite numbers (n,); others are not kept.
     """
+    from thruster_env.graphs.machine_code import host
+
     folder = code.folder
-    key = hashlib.sha256(follows_from + (made_by() if folder else "Python").encode()).hexdigest()
+    key = hashlib.sha256(follows_from + (host() if folder else "Python").encode()).hexdigest()
     if key not in _known:
         file = None if folder is None else Path(folder) / f"{name}-{key[:32]}.json"
         numbers = None if file is None else _read(file, count)
