@@ -27,6 +27,7 @@ PAGES: Mapping[str, tuple[str, ...]] = {  # and the modules that make their tabl
     ),
     "explore_scenes": ("docs.scripts.explore",),
     "filters": ("docs.scripts.filters",),
+    "gallery": ("docs.scripts.gallery",),
     "logs": ("tuning.experiments.hidden_truth",),
     "machine_code": ("docs.scripts.machine_code",),
     "methods": ("tuning.experiments.lidar",),

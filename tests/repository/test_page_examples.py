@@ -62,7 +62,10 @@ def reason(page, code):
     return next((why for (where, part), why in NOT_RUN.items() if where == page and part in code), "")
 
 
-LONG, SLOW = {"problems.md", "auv.md", "learned.md"}, pytest.mark.slow  # they compile models of their own
+LONG, SLOW = (
+    {"problems.md", "auv.md", "learned.md", "gallery.md"},
+    pytest.mark.slow,
+)  # they compile models of their own
 OWN = [page for page in PAGES if page not in ELSEWHERE and any(not reason(page, code) for code in programs(page))]
 
 
