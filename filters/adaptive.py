@@ -142,7 +142,8 @@ class VariationalBayesFilter(PageFilter):
     def estimated_noise(self, belief: Belief) -> np.ndarray:
         """The estimate V/nu of R (m, m) in a belief."""
         m = self.model.m
-        return belief.extras[: m * m].reshape(m, m) / belief.extras[m * m]
+        extras = belief.extras[self.model.shape.feed :]
+        return extras[: m * m].reshape(m, m) / extras[m * m]
 
 
 # A robust extended Kalman filter: Student-t measurement noise, so that outliers have little weight.
@@ -296,9 +297,10 @@ class SageHusaFilter(PageFilter):
     def estimated_noise(self, belief: Belief) -> np.ndarray:
         """The estimate of R (m, m) in a belief."""
         m = self.model.m
-        return belief.extras[: m * m].reshape(m, m).copy()
+        first = self.model.shape.feed
+        return belief.extras[first : first + m * m].reshape(m, m).copy()
 
     def estimated_process_noise(self, belief: Belief) -> np.ndarray:
         """The estimate of Q (n, n) in a belief."""
-        n, first = self.model.n, self.model.m**2
+        n, first = self.model.n, self.model.shape.feed + self.model.m**2
         return belief.extras[first : first + n * n].reshape(n, n).copy()

@@ -183,10 +183,10 @@ def _augmented_functions(
         "parameters": vector_part(added, n + added, n),
         "join": joiner(n, added),
     }
-    begin = ("s = states(x)", "t = parameters(x)")
+    begin, u = ("s = states(x)", "t = parameters(x)"), "u, " * shape.feeds
     functions = {
         "transition": written_out("transition", "x, u, c", *begin, "join(f(s, u, fill(t, c)), t)", **names),
-        "observe": written_out("observe", "x, c", "h(states(x), fill(parameters(x), c))", **names),
+        "observe": written_out("observe", f"x, {u}c", f"h(states(x), {u}fill(parameters(x), c))", **names),
         "transition_jacobian": None,
         "observe_jacobian": None,
     }
@@ -227,7 +227,7 @@ def _augmented_functions(
         )
     if observe_jacobian is not None:
         functions["observe_jacobian"] = jacobian(
-            "observe_jacobian", "h", observe_jacobian, m, "", shape.measurement_angles, False
+            "observe_jacobian", "h", observe_jacobian, m, u, shape.measurement_angles, False
         )
     return functions
 
@@ -275,7 +275,7 @@ def embedded_model(
     if operating is not None:
         operating[list(positions)] = model.operating_state
     return StateSpaceModel(
-        **_embedded_functions(*model.functions, model.n, model.m, n, positions),
+        **_embedded_functions(*model.functions, model.n, model.m, n, positions, model.shape.observe_arguments),
         **parts,
         inputs=model.inputs,
         constants=model.constants,
@@ -311,13 +311,13 @@ def _embedded_matrices(
     model: AffineModel, positions: tuple[int, ...], n: int, parts: Mapping[str, Any]
 ) -> AffineModel:
     """The embedded model of an affine model: affine itself, so its filters need no operating point."""
-    a, b, offset, c, shift = model.matrices()
+    (a, b, offset, c, shift), d = model.matrices(), model.feedthrough
     whole_a, whole_b = np.eye(n), np.zeros((n, b.shape[1]))
     whole_offset, whole_c = np.zeros(n), np.zeros((model.m, n))
     at = list(positions)
     whole_a[np.ix_(at, at)], whole_b[at], whole_offset[at], whole_c[:, at] = a, b, offset, c
     return affine_model(
-        a=whole_a, b=whole_b, c=whole_c, state_offset=whole_offset, measurement_offset=shift, **parts
+        a=whole_a, b=whole_b, c=whole_c, d=d, state_offset=whole_offset, measurement_offset=shift, **parts
     )
 
 
@@ -331,6 +331,7 @@ def _embedded_functions(
     m: int,
     n: int,
     positions: tuple[int, ...],
+    arguments_of_h: str,
 ) -> dict[str, Callable | None]:
     """Functions of the embedded model; its `count` own states have these positions among n."""
     part_of_x = tuple_of(f"x[{position}]" for position in positions)
@@ -358,7 +359,7 @@ def _embedded_functions(
 
     functions: dict[str, Callable | None] = {
         "transition": written_out("transition", "x, u, c", f"y = f({part}, u, c)", tuple_of(after), **names),
-        "observe": written_out("observe", "x, c", f"h({part}, c)", **names),
+        "observe": written_out("observe", f"x, {arguments_of_h}", f"h({part}, {arguments_of_h})", **names),
         "transition_jacobian": None,
         "observe_jacobian": None,
     }
@@ -366,8 +367,8 @@ def _embedded_functions(
         lines = f"a = df({part}, u, c)", *matrix(n, positions, f"found = np.eye({n})")
         functions["transition_jacobian"] = written_out("transition_jacobian", "x, u, c", *lines, **names)
     if observe_jacobian is not None:
-        lines = f"a = dh({part}, c)", *matrix(m, tuple(range(m)), f"found = np.zeros(({m}, {n}))")
-        functions["observe_jacobian"] = written_out("observe_jacobian", "x, c", *lines, **names)
+        lines = f"a = dh({part}, {arguments_of_h})", *matrix(m, tuple(range(m)), f"found = np.zeros(({m}, {n}))")
+        functions["observe_jacobian"] = written_out("observe_jacobian", f"x, {arguments_of_h}", *lines, **names)
     return functions
 
 
@@ -402,7 +403,8 @@ def transformed_model(model: StateSpaceModel, bounds: Mapping[str | int, tuple] 
         kind, word = ("logit", "logit") if np.isfinite([low, high]).all() else ("log", "logarithm")
         state = states[i]
         states[i] = Quantity(f"{word} of {state.name}", f"{kind}_{state.symbol}")
-    functions = dict(_functions(model.functions.transition, model.functions.observe, n, all_bounds))
+    of_model, arguments_of_h = model.functions, model.shape.observe_arguments
+    functions = dict(_functions(of_model.transition, of_model.observe, n, all_bounds, arguments_of_h))
     to_new, to_old = functions.pop("to_new"), functions.pop("to_old")
     outputs = {
         symbol: Output(output.quantity, _OfStates(to_old, output.function))
@@ -458,7 +460,9 @@ class _OfStates:
 
 
 @makes_functions
-def _functions(transition: Callable, observe: Callable, n: int, bounds: tuple[Bound, ...]) -> dict[str, Callable]:
+def _functions(
+    transition: Callable, observe: Callable, n: int, bounds: tuple[Bound, ...], arguments_of_h: str
+) -> dict[str, Callable]:
     bound_of = {bound.place: bound for bound in bounds}
 
     def entry(logit: str, above: str, below: str) -> Callable:
@@ -482,5 +486,5 @@ def _functions(transition: Callable, observe: Callable, n: int, bounds: tuple[Bo
         "to_new": to_new,
         "to_old": to_old,
         "transition": written_out("transition", "x, u, c", "new(f(old(x), u, c))", **names),
-        "observe": written_out("observe", "x, c", "h(old(x), c)", **names),
+        "observe": written_out("observe", f"x, {arguments_of_h}", f"h(old(x), {arguments_of_h})", **names),
     }

@@ -16,8 +16,15 @@ from filters.pages.kernels import nothing_to_summarise
 from thruster_env.core.angles import wrapped
 from thruster_env.core.checks import at_least, positive, short_repr
 from thruster_env.core.compiled import inlined
-from thruster_env.core.sources import Source, vector_reader, vector_writer, zeros_of
-from thruster_env.model.shape import Functions, Shape, constants_reader, innovation_of, number_offsets
+from thruster_env.core.sources import Source, vector_reader, vector_writer, written_out, zeros_of
+from thruster_env.model.shape import (
+    Functions,
+    Shape,
+    constants_reader,
+    for_any_input,
+    innovation_of,
+    number_offsets,
+)
 
 INTERVALS = 100  # on either side, that are searched for a sign change
 HALVINGS = 60  # of an interval; also the steps of the golden section, which each shorten it to 0.618
@@ -100,12 +107,15 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
         shape: of the model.
         inverted: (component, channel), or None for the open loop.
 
-    Extras: the open loop's state (n,), the output of the low-pass filter, and 1 once that has a value.
+    Extras: the open loop's state (n,), the output of the low-pass filter, and 1 once that has a value; if h takes
+    the input, that of the last step and that of the last measurement.
     """
-    n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
+    n, m, transition, observe = shape.n, shape.m, functions.transition, for_any_input(functions.observe, shape)
     layout, source, first_parameter = memory_offsets(n, m), number_offsets(n, m), filter_offset(shape)
     substeps_offset, step_offset, likelihood_offset = source.substeps, layout.step, layout.log_likelihood
-    smooth_offset, known_offset = layout.extras + n, layout.extras + n + 1
+    smooth_offset, known_offset, acting = (layout.extras + n + i for i in range(3))
+    feed, acts = shape.feed, vector_reader(shape.feed, acting)
+    at_last = vector_reader(feed, acting + feed)
     reach_offset, share_offset = first_parameter, first_parameter + 1
     read_open, store_open = vector_reader(n, layout.extras), vector_writer(n, layout.extras)
     (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
@@ -114,7 +124,8 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     measured, difference = vector_reader(m), innovation_of(shape)
     component, channel = inverted or (0, 0)
     angle, inverts = shape.measurement_angles[channel], inverted is not None
-    solve = component_solver(observe, n, component, channel, angle)
+    of_both = written_out("of_both", "x, both", "observe(x, both[0], both[1])", observe=observe)
+    solve = component_solver(of_both, n, component, channel, angle)
     no_cov, no_s = zeros_of(n, n), zeros_of(m, m)
 
     @inlined
@@ -125,7 +136,7 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     def estimate(row, numbers):
         x = read_open(row)
         if inverts and row[known_offset] > 0.0:
-            x = solve(x, row[smooth_offset], constants(numbers), numbers[reach_offset])
+            x = solve(x, row[smooth_offset], (at_last(row), constants(numbers)), numbers[reach_offset])
         store_mean(row, x)
 
     @inlined
@@ -133,6 +144,8 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
         row, _, _ = memory
         store_open(row, prior_mean(numbers))
         row[smooth_offset] = row[known_offset] = 0.0
+        for i in range(feed):
+            row[acting + i] = 0.0
         estimate(row, numbers)
         store_cov(row, no_cov())
 
@@ -142,6 +155,8 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
         x, v, c = read_open(row), control(u), constants(numbers)
         for _ in range(int(numbers[substeps_offset])):
             x = transition(x, v, c)
+        for i in range(feed):
+            row[acting + i] = u[i]
         store_open(row, x)
         estimate(row, numbers)
         row[step_offset] += 1.0
@@ -149,16 +164,19 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
-        store_innovation(row, difference(measured(z), observe(read_mean(row), constants(numbers))))
+        store_innovation(row, difference(measured(z), observe(read_mean(row), acts(row), constants(numbers))))
         store_s(row, no_s())
         row[likelihood_offset] = 0.0
         if inverts and z[channel] == z[channel]:
             share = numbers[share_offset] * row[known_offset]
             row[smooth_offset] = blend(row[smooth_offset], z[channel], share)
             row[known_offset] = 1.0
+            for i in range(feed):
+                row[acting + feed + i] = row[acting + i]
             estimate(row, numbers)
 
-    return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, extras=n + 2)
+    works, offsets = (start, predict, update, nothing_to_summarise), tuple(range(acting, acting + feed))
+    return Kernels(n, m, n, 0, *works, extras=n + 2 + 2 * feed, acting=offsets)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -26,6 +26,7 @@ from thruster_env.model.shape import (
     Functions,
     Shape,
     constants_reader,
+    for_any_input,
     number_offsets,
     observation_slopes,
     padded,
@@ -339,7 +340,7 @@ def _square(root: np.ndarray) -> np.ndarray:
 def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
     n, m, transition = shape.n, shape.m, functions.transition
     transition_matrix = transition_slopes(functions, shape)
-    observation_matrix = observation_slopes(functions, shape)
+    observation_matrix = for_any_input(observation_slopes(functions, shape), shape, "x, scales")
     (begin, _, _), disturb = truth_steps(functions, shape), noise_step(n, m)
     state, store_state = vector_reader(n), vector_writer(n)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
@@ -373,8 +374,10 @@ def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
                 key_0, key_1 = keys[b, truth, 0], keys[b, truth, 1]
                 share = 1.0 / (before + truth + 1.0)  # of this truth in the mean, as Welford (1962) has it
                 begin(x, draws, key_0, key_1, numbers)
+                for i in range(u.shape[0]):
+                    u[i] = 0.0
                 for k in range(f_mean.shape[1]):
-                    measured = quadratic_m(observation_matrix(state(x), s, c), weight_r)
+                    measured = quadratic_m(observation_matrix(state(x), s, control(u), c), weight_r)
                     accumulate(information, b, k, measured, 1.0)
                     if k == inputs.shape[1]:
                         break

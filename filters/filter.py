@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from filters.engine.belief import Belief, Innovation, Kernels
+from filters.engine.belief import Belief, Innovation, Kernels, OwnBelief
+from filters.engine.compile import PREDICT, UPDATE
 from filters.engine.session import GatedSession, Running, Session
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.modules import object_named
@@ -88,6 +89,10 @@ class Filter:
         Raises ValueError for an input that is not p finite numbers, and for a belief of another filter type, not
         finite, or with a covariance that is not positive semidefinite.
         """
+        if process_noise_cov is None and type(belief) is OwnBelief:
+            result = self._quickly(belief, PREDICT, u)
+            if result is not None:
+                return result
         session = self._borrow()
         session.load(belief)
         if process_noise_cov is not None:
@@ -97,17 +102,26 @@ class Filter:
         self._put_back(session)
         return predicted
 
-    def update(self, belief: Belief, z, *, measurement_noise_cov=None) -> tuple[Belief, Innovation]:
+    def update(self, belief: Belief, z, *, u=None, measurement_noise_cov=None) -> tuple[Belief, Innovation]:
         """Update the belief with measurement z (m,); return it and the innovation. NaN marks a missing channel.
 
-        A `measurement_noise_cov`, (m, m) or m variances, replaces the model's R in this update.
+        A `measurement_noise_cov`, (m, m) or m variances, replaces the model's R in this update. If the model's h
+        takes the input, it gets that of the last `predict`, zero before the first one, or `u` (p,) if that is not
+        None. So z_k = h(x_k, u_k), of the input from k on, is `update(belief, z, u=u)`, then `predict(belief, u)`.
 
-        Raises ValueError for a measurement that is not m numbers, finite or NaN, and as `predict` for a belief.
+        Raises ValueError for a measurement that is not m numbers, finite or NaN, an input that h does not take or
+        that is not p finite numbers, and as `predict` for a belief.
         """
+        if u is None and measurement_noise_cov is None and type(belief) is OwnBelief:
+            result = self._quickly(belief, UPDATE, z)
+            if result is not None:
+                return result
         session = self._borrow()
         session.load(belief)
         if measurement_noise_cov is not None:
             session.set_noise(measurement_noise_cov=measurement_noise_cov)
+        if u is not None:
+            session.set_input(u)
         session.run("update", z=z)
         updated = session.belief(), session.innovation_copy()
         self._put_back(session)
@@ -117,29 +131,36 @@ class Filter:
         """Members that stand for a belief, (n, N); where they have weights, a row behind holds the logarithms."""
         return belief.members[: self.kernel_model.n + 1]
 
+    def _quickly(self, belief: OwnBelief, task: int, signal) -> Any:
+        """The result of a prediction, or of an update, by a spare session; None without one, or if it refuses."""
+        spare = self._spare_sessions()
+        try:
+            session = spare.pop()  # then no other thread has it
+        except IndexError:
+            return None
+        result = session.quickly(belief, task, signal)
+        if not spare:
+            spare.append(session)
+        return result
+
     def _borrow(self) -> Session:
         """A spare session in its initial state, else a new one, which takes longer to make than a step.
 
         `_put_back` returns it, except after an error.
         """
-        spare = self._spare_sessions()
-        source = self.kernel_model.numbers_from, self.own_parameters
-        if spare:
-            try:
-                was, session = spare.pop()  # then no other thread has it
-            except IndexError:
-                was, session = None, None
-            if session is not None and was == source:
+        try:
+            session = self._spare_sessions().pop()
+            if session.is_current:
                 session.clear()
                 return session
-        session = Session(self)
-        session.source = source
-        return session
+        except IndexError:
+            pass
+        return Session(self)
 
     def _put_back(self, session: Session) -> None:
         spare = self._spare_sessions()
         if not spare:
-            spare.append((session.source, session))
+            spare.append(session)
 
     def _spare_sessions(self) -> list:
         """Sessions that are not in use: at most one, unless several threads put theirs back at once."""
@@ -166,7 +187,12 @@ class Filter:
                 )
 
     def session(self, gate: float | None = None) -> Running:
-        """A session: this filter running in place on one belief, which is faster than `predict` and `update`.
+        """A session: this filter running in place on one belief, some ten times as fast as `predict` and `update`.
+
+            session.start()
+            session.predict(u)
+            session.update(z)
+            session.mean, session.cov
 
         With a gate, a channel whose innovation is beyond so many standard deviations of S is left out of a step,
         as if it were missing; `rejected` counts these, (m,).

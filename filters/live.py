@@ -160,7 +160,8 @@ class Live:
             raise ValueError(f"time must not step back behind {self.time:.9g} s, but got {time:.9g}")
         checked = as_floats(() if u is None else u).reshape(-1)
         if checked.shape != (self._inputs,) or not np.isfinite(checked).all():
-            raise ValueError(f"u must be {self._inputs} finite numbers, but got {short_repr(u)}")
+            count = f"{self._inputs} finite numbers" if self._inputs else "empty, because the model has no inputs"
+            raise ValueError(f"u must be {count}, but got {short_repr(u)}")
         if time > self.time + near:
             self._predict(time, checked)
 

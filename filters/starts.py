@@ -256,7 +256,7 @@ def likely_cause(model: StateSpaceModel, before: Moments | None, u, z) -> Flaw:
         flaw = None
         if before is not None and u is not None:
             x, p, flaw = _predicted(model, x, p, u)
-        return flaw or _updated(model, x, p, z)
+        return flaw or _updated(model, x, p, u, z)
 
 
 def _predicted(model: StateSpaceModel, x, p, u) -> tuple[np.ndarray, np.ndarray, Flaw | None]:
@@ -273,14 +273,15 @@ def _predicted(model: StateSpaceModel, x, p, u) -> tuple[np.ndarray, np.ndarray,
     return x, p, _flaw_of(p, "prediction")
 
 
-def _updated(model: StateSpaceModel, x, p, z) -> Flaw:
+def _updated(model: StateSpaceModel, x, p, u, z) -> Flaw:
     everything = np.ones(model.n, dtype=bool)
-    expected = _called(model.functions.observe, model.m, as_value(x), model.constants)
+    fed = model.shape.fed(as_value(np.zeros(model.inputs) if u is None else u))
+    expected = _called(model.functions.observe, model.m, as_value(x), *fed, model.constants)
     measured = ~np.isnan(z)
     if not np.isfinite(expected[measured]).all():
         return everything, f"h(x) is {_kind(expected[measured])}"
     slopes = observation_slopes(model.functions, model.shape)
-    h = _called(slopes, (model.m, model.n), as_value(x), as_value(model.scales), model.constants)[measured]
+    h = _called(slopes, (model.m, model.n), as_value(x), as_value(model.scales), *fed, model.constants)[measured]
     if not np.isfinite(h).all():
         return ~np.isfinite(h).all(axis=0), f"H = dh/dx is {_kind(h)}"
     s = h @ p @ h.T + model.measurement_noise_cov[np.ix_(measured, measured)]
@@ -382,15 +383,18 @@ def cov_of_measured_starts(model: StateSpaceModel, first: np.ndarray) -> np.ndar
     Source: Durbin, Koopman (2012), Time Series Analysis by State Space Methods, section 5.2, on diffuse starts.
     """
     x, c, shape = as_value(model.prior_mean), model.given_constants, model.shape
+    fed = shape.fed(as_value(np.zeros(model.inputs)))  # none acts before the first measurement
     scales, deviations = model.scales, np.sqrt(np.diag(model.measurement_noise_cov))
     deviations = np.where(deviations > 0, deviations, 1.0)
-    h = np.array(observation_slopes(model.functions, shape)(x, as_value(scales), c)).reshape(model.m, model.n)
+    h = np.array(observation_slopes(model.functions, shape)(x, as_value(scales), *fed, c)).reshape(
+        model.m, model.n
+    )
     a = h * scales / deviations[:, None]
     if not (np.isfinite(a).all() and a.any()):
         rule = "a start from the first measurement needs a measurement that depends on a state at the prior mean"
         raise ValueError(f"{rule}, but dh/dx there is {h.tolist()}")
     inverse = np.linalg.pinv(a, rcond=FAINT)
-    off = difference(first, np.array(model.functions.observe(x, c)), shape.measurement_angles) / deviations
+    off = difference(first, np.array(model.functions.observe(x, *fed, c)), shape.measurement_angles) / deviations
     reach = scales * np.abs(np.where(np.isfinite(off), off, 0.0) @ inverse.T).max(axis=0, initial=0.0)
     observed, scaling = inverse @ a, np.outer(scales, scales)
     unseen = np.eye(model.n) - observed

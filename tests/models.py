@@ -25,7 +25,8 @@ def gaussians(q, r, mean, cov):
 
 def state_space(f, h, /, q, r, mean, cov, **more):
     """A model by f, h, Q, R, and mean and covariance of the initial state, which further arguments may replace."""
-    return StateSpaceModel(**{"transition": f, "observe": h, **gaussians(q, r, mean, cov), **more})
+    inputs = {} if "input_quantities" in more else {"inputs": 1}
+    return StateSpaceModel(**{"transition": f, "observe": h, **gaussians(q, r, mean, cov), **inputs, **more})
 
 
 def affine(a, b, c, /, q, r, mean, cov, **more):

@@ -307,7 +307,7 @@ MAIN = """\
        @NAME@_log [HEADER ...] < log.csv > estimates.csv
 
    HEADER names the columns of the inputs, then of the measurements, "HEADER[UNIT]" with another unit; without any
-   they are those below, or others of the same name or symbol. An input acts from its row on, and is held where its
+   they are those below, or others of the same name or symbol. An input acts @WHEN@, and is held where its
    cell is empty; an empty cell of a measurement is a missing one.@GAPS@ Text, infinite numbers, unknown units, and
    times off the steps end it with the number of the line. What else `thruster estimate` reads, such as dates,
    stamps in ms without a unit and irregular ones, `thruster log LOG --out log.csv` writes as this program takes
@@ -355,7 +355,7 @@ int main(int count, char **words)
     for (long row = 0, step = 0; read_row(row); row++) {
         for (; step <= step_of_row; step++) {
             for (int i = 0; i < COLUMNS; i++) {
-                double number = step < step_of_row ? (double)NAN : numbers[i];
+                double number = step < step_of_row@PAST@ ? (double)NAN : numbers[i];
                 last[i] = values[i];
                 if (i >= INPUTS || !isnan(number)) {
                     values[i] = (@REAL@)number;
@@ -364,7 +364,7 @@ int main(int count, char **words)
             if (step > 0) {
                 @NAME@_predict(&filter@LAST@);
             }
-@BEGIN@            @NAME@_update(&filter, values + INPUTS);
+@FIRST@@BEGIN@            @NAME@_update(&filter, values + INPUTS);
             show_time(step);
             for (int i = 0; i < STATES; i++) {
                 show((double)filter.x[i]);
@@ -398,6 +398,11 @@ ALARMS = """\
                 show((double)count);
             }
 """
+FIRST = """\
+            for (int i = 0; step == 0 && i < CHANNELS; i++) {
+                values[INPUTS + i] = (@REAL@)NAN; /* the input until then is unknown */
+            }
+"""
 GAPS = " Rows that are\n   missing by their times are predicted, as in `thruster estimate`."
 
 
@@ -421,6 +426,7 @@ def log_program(
     titles += [header_of("alarm", quantity._replace(unit="")) for quantity in model.measurements if tested]
     words = {
         "ABOUT": ABOUT * tested,
+        "FIRST": FIRST * model.feeds,
         "BEGIN": BEGIN * tested,
         "ALARMS": ALARMS * tested,
         "GAPS": GAPS * (dt is not None),
@@ -437,7 +443,9 @@ def log_program(
         "CHANNELS": str(model.m),
         "STATES": str(model.n),
         "TITLES": _text("".join(f",{title}" for title in titles)).replace("%", "%%"),
-        "LAST": ", last" * (model.inputs > 0),
+        "LAST": (", values" if model.feeds else ", last") * (model.inputs > 0),
+        "WHEN": "until its row" if model.feeds else "from its row on",
+        "PAST": " && i >= INPUTS" * model.feeds,
     }
     source = MAIN
     for word, text in words.items():

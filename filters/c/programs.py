@@ -194,8 +194,8 @@ def programs_of(filter_: Filter) -> FilterPrograms:
     paged = with_page(filter_, "a filter in C")
     shape, (f, by_f, h, by_h) = paged.kernel_model.shape, paged.kernel_model.functions
     try:
-        _check_traced("transition", f, by_f, 2, shape)
-        _check_traced("observe", h, by_h, 1, shape)
+        _check_traced("transition", f, by_f, "motion", shape)
+        _check_traced("observe", h, by_h, "sight", shape)
         return _member_programs(paged) if isinstance(paged, EnsembleFilter) else _row_programs(paged)
     except TooLarge as error:
         raise ValueError(f"a filter in C must have few operations, but got a model for which {error}") from error
@@ -260,12 +260,10 @@ def _nis(v: Matrix, s: Matrix) -> Matrix:
     return dot(v, quotient(v, factor(s)))
 
 
-def _check_traced(
-    name: str, function: Callable, jacobian: Callable | None, further_arguments: int, shape: Shape
-) -> None:
+def _check_traced(name: str, function: Callable, jacobian: Callable | None, which: str, shape: Shape) -> None:
     """Raise ValueError that names the function if it cannot be traced."""
     try:
-        Traced(function, jacobian, further_arguments, shape)
+        Traced(function, jacobian, which, shape)
     except TooLarge:
         raise
     except Exception as error:  # whatever a user's function raises

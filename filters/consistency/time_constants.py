@@ -167,7 +167,8 @@ def slopes_along(filter_: Filter, runs: Sequence[Run]) -> Path | None:
             x, p, s = estimates.means[0, k - 1], estimates.covs[0, k - 1], estimates.innovation_covs[0, k]
             if constant is None or not isinstance(model, AffineModel):
                 f, _, after = slopes_of_step(model, x, inputs[0, k - 1], functions=functions)
-                h = np.array(slopes(as_value(after), as_value(model.scales), model.given_constants))
+                fed = model.shape.fed(as_value(inputs[0, k - 1]))
+                h = np.array(slopes(as_value(after), as_value(model.scales), *fed, model.given_constants))
                 constant = f, h.reshape(model.m, model.n)
             f, h = constant[0], constant[1].copy()
             h[np.isnan(measurements[0, k])] = 0.0

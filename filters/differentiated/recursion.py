@@ -215,7 +215,7 @@ def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page
         fingerprint = function_fingerprint(functions.transition, functions.observe, *slopes, within=__name__)
         at_once = 1
     length = max(stage.length for stage in compiled)
-    if page.initial is None:
+    if page.initial is None and not shape.feeds:
         works[:0] = nothing, nothing
     if page.represent is None:
         works[2:2] = nothing, nothing
@@ -262,15 +262,15 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
         return stage._replace(slopes=still | stage.slopes | (slopes or {}))
 
     stages = []
-    if page.initial is not None:
-        started = _by_offset(memory, page.initial(model))
+    if page.initial is not None or model.feed:
+        started = _by_offset(memory, page.started(model))
         stage = stage_of(started, started, moves)
         stages.append(stage._replace(slopes={at: value * 0.0 for at, value in started.items()} | stage.slopes))
     model.extras = memory.extras
     if page.represent is not None:
         stages.append(belief_stage(page.represent(model, x, p)))
     stages += [
-        belief_stage(page.propagate(model, *memory.predicted, memory.u)),
+        belief_stage(page.propagated(model, *memory.predicted, u=memory.u)),
         belief_stage(page.add_process_noise(model, *memory.predicted)),
     ]
     mean, cov, v, s, _, changed = with_extras(page.update(model, x, p, memory.z))

@@ -79,7 +79,7 @@ def run(
         keys: random keys (B, 2), two whole numbers below 2^32 for each trajectory; those of seeds 0, 1, ..., B - 1
             if None. Filters without random draws ignore them: run(filter_, inputs=u, measurements=z).
         inputs: u, (B, K, p), in the units of the model's inputs; None for a model without inputs. The filter
-            predicts step k + 1 with u[:, k].
+            predicts step k + 1 with u[:, k], which a measurement h(x, u, c) at its end depends on, too.
         measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing; z[:, 0]
             updates the prior, and z[:, k + 1] the prediction with u[:, k].
         process_noise_covs: Q of every step, (K, n, n), in place of the model's. Covariances are per step and do
@@ -165,7 +165,8 @@ def trajectories(
     count, times, m = z.shape
     if inputs.shape != (count, times - 1, model.inputs) or m != model.m:
         shapes = f"{(count, times - 1, model.inputs)} and {(count, times, model.m)}"
-        rule = f"inputs and measurements must have shapes {shapes}"
+        without = ", because the model has no inputs" if not model.inputs else ""
+        rule = f"inputs and measurements must have shapes {shapes}{without}"
         raise ValueError(f"{rule}, but got {inputs.shape} and {z.shape}")
     if not np.isfinite(inputs).all() or np.isinf(z).any():
         raise ValueError("inputs must be finite, and measurements finite or NaN, but some are not")
@@ -189,11 +190,17 @@ def _as_batch(model: StateSpaceModel, measurements: Any, inputs: Any) -> tuple[n
     z = z[:, None] if z.ndim == 1 else z
     if inputs is None:
         if model.inputs:
-            rule = f"a model with {model.inputs} inputs must get them (inputs=), or be made with inputs=0"
+            count = f"{model.inputs} input{'s' * (model.inputs > 1)}"
+            rule = f"a model with {count} must get {'it' if model.inputs == 1 else 'them'} (inputs=)"
             raise ValueError(f"{rule}, but got measurements alone")
         return z[None], None
     u = _floats("inputs", inputs)
     u = u[:, None] if u.ndim == 1 else u
+    if model.feeds and len(u) == len(z):
+        raise ValueError(
+            "inputs of a model with h(x, u, c) must be one fewer than measurements, as u_k acts until z_{k+1}, "
+            f"but got {len(u)} of each: inputs=u[1:] and no first z if u_k was sampled together with z_k"
+        )
     return z[None], (u[:-1] if len(u) == len(z) else u)[None]
 
 

@@ -65,6 +65,25 @@ class Belief(NamedTuple):
     extras: np.ndarray = np.empty(0)
 
 
+class OwnBelief(Belief):
+    """A belief that a session made: as long as nobody writes to its arrays it needs no checks.
+
+    Attributes:
+        origin: the kernels that made it, then its mean and covariance, and its extras, as bytes; None of a belief
+            with replaced parts.
+    """
+
+    origin: tuple[Kernels, bytes, bytes] | None = None
+
+    def __repr__(self) -> str:
+        """That of a belief."""
+        return repr(Belief(*self))
+
+    def __reduce__(self) -> tuple:
+        """Copies and pickles are beliefs without an origin."""
+        return Belief, tuple(self)
+
+
 class LostBelief(Belief):
     """The result of `predict` if it is not finite; the next update restarts from the prior."""
 
@@ -94,6 +113,9 @@ class Kernels(NamedTuple):
     `kept_rows` rows of the table and `extras` values of the row, from `memory_offsets(n, m).extras` on; then come
     `scratch` values that it does not keep.
 
+    If h takes the input, `acting` are the places in the row of the last step's, perhaps several times; they are
+    among the extras, and zero at the start.
+
     `vectors`, if there are any, are four functions (rows, given, numbers) for eight beliefs side by side: the
     parts of `predict` before its substeps, in each substep and after them, and `update`. Batches run these
     (`engine.compile.build_side_by_side`).
@@ -111,6 +133,7 @@ class Kernels(NamedTuple):
     extra_kept_rows: int = 0  # rows of the table, after the n of members, that belong to the belief
     scratch: int = 0
     vectors: tuple[Callable, ...] = ()
+    acting: tuple[int, ...] = ()
 
     @property
     def kept_rows(self) -> int:
@@ -182,6 +205,8 @@ def vector_like(name: str, value, like: np.ndarray, *, missing_allowed: bool) ->
     wrong = np.isinf(array) if missing_allowed else ~np.isfinite(array)
     if array.shape != like.shape or wrong.any():
         rule = "finite or NaN" if missing_allowed else "finite"
+        if not like.size:
+            raise ValueError(f"{name} must be empty, because the model has no inputs, but got {short_repr(value)}")
         count = f"{like.size} number{'' if like.size == 1 else 's'}"
         raise ValueError(f"{name} must be {count}, each {rule}, but got {short_repr(value)}")
     return array

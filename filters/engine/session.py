@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from math import prod
+from math import isfinite, prod
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -14,6 +14,7 @@ from filters.engine.belief import (
     Belief,
     Innovation,
     LostBelief,
+    OwnBelief,
     check_belief,
     checked_key,
     filter_offset,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from filters.filter import Filter
 
 STEP = PREDICT + UPDATE
+NO_EXTRAS, FEW = np.empty(0), 100  # numbers, whose sum Python finds as fast as NumPy
 TASKS = {"start": START, "predict": PREDICT, "update": UPDATE}
 
 
@@ -81,8 +83,12 @@ class Session:
         self._prior_variances = model.prior_cov.diagonal()
         self._first_values = values.copy()
         self._noise_was: np.ndarray | None = None  # numbers before another Q or R
-        self.source: tuple = ()  # the origin of the numbers, for sessions that are kept
+        arrays = model.process_noise_cov, model.measurement_noise_cov, model.prior_mean, model.prior_cov
+        self._source, self._source_bytes = arrays, b"".join(map(np.ndarray.tobytes, arrays))
         self.divergences = 0
+        self._moments = self._row[layout.mean : layout.key_0]  # mean and covariance, which are neighbours
+        self._has_extras, self._has_belief = kernels.extras > 0, False
+        self._latest: OwnBelief | None = None
         self._given = (*self._memory, size, values, self._numbers)
         self._operate: Callable[[int], int] = self._operate_first
         self.mean = self._row[layout.mean : layout.mean + n]
@@ -104,10 +110,13 @@ class Session:
             self._remember_noise()
         for array, stored in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
             array[...] = stored
+        self._has_belief = True
         self.divergences = divergences
 
     def _operate_first(self, task: int) -> int:
         """Operate once, so that numba has compiled; later calls are direct, because `step` has to be quick."""
+        if not (task & START or self._has_belief):
+            raise ValueError("a session must begin with start(key, z) or load(belief), but got neither")
         divergences = operation_on(self._kernels, self._given)(task)
         self._operate = operation_on(self._kernels, self._given)
         return divergences
@@ -128,11 +137,24 @@ class Session:
         if self._noise_was is not None:
             self._numbers[:] = self._noise_was
             self._noise_was = None
-        self.divergences = 0
+        self.divergences, self._latest = 0, None
 
     def set_key(self, key) -> None:
         """Set the key (2,) on which the belief's randomness depends: two whole numbers below 2^32."""
         self._row[self._places.key_0], self._row[self._places.key_1] = checked_key(key)
+
+    def set_input(self, u) -> None:
+        """Set the input u (p,) on which the next measurement depends, in place of that of the last step.
+
+        Raises ValueError if the model's h takes no input, or u is not p finite numbers.
+        """
+        offsets = list(self._kernels.acting)
+        if not offsets:
+            raise ValueError(
+                f"u of a measurement needs a model with h(x, u, c), but that of {self._name!r} has h(x, c)"
+            )
+        u = vector_like("u", u, self._u, missing_allowed=False)
+        self._row[offsets] = np.tile(u, len(offsets) // len(u))
 
     def set_noise(self, *, process_noise_cov=None, measurement_noise_cov=None) -> None:
         """Use another Q or R from now on, as a filter of a model with these would.
@@ -226,11 +248,40 @@ class Session:
         n, at = len(self.mean), self._noise_places.q
         return self._filter.numbers[at : at + 2 * n * n]
 
-    def start(self, key, z) -> None:
-        """Set the prior with a random key (2,) and update it with a first measurement z (m,)."""
+    def start(self, key=(0, 0), z=None) -> None:
+        """Set the prior with a random key (2,) and update it with a first measurement z (m,), if there is one."""
         self.set_key(key)
+        if z is None:
+            self._do(START)
+            return
         self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
         self._do(START + UPDATE)
+
+    def predict(self, u=()) -> None:
+        """Predict one step ahead under input u (p,); ValueError for one that is not finite numbers."""
+        try:
+            if type(u) is MaskedArray or len(u) != self._p:
+                raise TypeError
+            self._u[:] = u
+        except (TypeError, ValueError, LookupError):
+            self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
+        divergences = self._operate(PREDICT)
+        if divergences == REFUSED:
+            vector_like("u", u, self._u, missing_allowed=False)  # raises ValueError with the reason
+        self.divergences = divergences
+
+    def update(self, z) -> None:
+        """Update with measurement z (m,); NaN marks a missing channel. ValueError for an infinite one."""
+        try:
+            if type(z) is MaskedArray or len(z) != self._m:
+                raise TypeError
+            self._z[:] = z
+        except (TypeError, ValueError, LookupError):
+            self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
+        divergences = self._operate(UPDATE)
+        if divergences == REFUSED:
+            vector_like("z", z, self._z, missing_allowed=True)  # raises ValueError with the reason
+        self.divergences = divergences
 
     def step(self, u, z) -> None:
         """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel.
@@ -281,18 +332,84 @@ class Session:
                 whose = f"a belief that the filter {self._name!r} can take"
                 raise ValueError(f"{name} of {whose} must have shape {shape}, but got {part_shape}")
         check_belief(belief, self._prior_variances)
+        self._remember(belief)
+        self._has_belief = True
+        self.set_key(belief.key)
+        self._latest = None
+
+    def _remember(self, belief: Belief) -> None:
+        """Put a belief into the memory."""
         self.mean[:], self.cov[:] = belief.mean, belief.cov
         if self._size:
             self._table[: self._kept_rows] = belief.members[:, :1]  # the padding is copies of a member
             self._table[: self._kept_rows, : self._size] = belief.members
         self._extras[:] = belief.extras
-        self.set_key(belief.key)
-        self._row[self._places.step] = belief.step
-        self._row[self._places.divergences] = belief.divergences
+        self._row[self._places.step], self._row[self._places.divergences] = belief.step, belief.divergences
+
+    @property
+    def is_current(self) -> bool:
+        """Whether nobody has written to the arrays of the model since the session was made."""
+        q, r, mean, cov = self._source
+        return q.tobytes() + r.tobytes() + mean.tobytes() + cov.tobytes() == self._source_bytes
+
+    def quickly(self, belief: OwnBelief, task: int, signal) -> OwnBelief | tuple[OwnBelief, Innovation] | None:
+        """A belief that a session made, after a prediction under u (p,), or an update with z (m,).
+
+        An update also returns the innovation. The result is None if `load` and `run` must find out what is wrong:
+        a belief that was written to, a signal that is not as many numbers, finite or, of z, NaN, or a result that
+        is not finite.
+        """
+        mean, cov, members, key, step, _, extras = belief
+        if belief.origin is None:
+            return None
+        kernels, moments, rest = belief.origin
+        if kernels is not self._kernels or mean.tobytes() + cov.tobytes() != moments or not self.is_current:
+            return None
+        if self._has_extras and extras.tobytes() != rest:
+            return None
+        target = self._u if task == PREDICT else self._z
+        try:
+            if type(signal) is np.ndarray:
+                if signal.dtype.kind != "f" or signal.shape != target.shape:
+                    return None
+            elif type(signal) not in (list, tuple) or len(signal) != len(target) or sum(signal) is None:
+                return None  # texts, which NumPy takes for numbers, have no sum
+            target[:] = signal
+        except (TypeError, ValueError, LookupError):
+            return None
+        if self._noise_was is not None:
+            self._numbers[:] = self._noise_was
+            self._noise_was = None
+        if belief is not self._latest:  # else the memory holds it
+            self._remember(belief)
+        self._latest = None
+        divergences = self._operate(task)
+        if divergences == REFUSED:
+            return None
+        if task == PREDICT:
+            step, numbers = step + 1, self._moments
+            if not isfinite(sum(numbers.tolist()) if numbers.size < FEW else numbers.sum()):
+                return None
+            return self._own_belief(members, key, step, divergences)
+        return self._own_belief(members, key, step, divergences), self.innovation_copy()
+
+    def _own_belief(self, members, key, step: int, divergences: int) -> OwnBelief:
+        """A copy of the belief in the memory."""
+        extras, rest = NO_EXTRAS, b""
+        if self._has_extras:
+            extras, rest = self._extras.copy(), self._extras.tobytes()
+        parts = self.mean.copy(), self.cov.copy(), members, key, step, divergences, extras
+        belief = tuple.__new__(OwnBelief, parts)
+        belief.origin = self._kernels, self._moments.tobytes(), rest
+        self._latest = belief
+        return belief
 
     def belief(self) -> Belief:
         """A copy of the belief in the memory."""
         row, layout = self._row, self._places
+        key = int(row[layout.key_0]), int(row[layout.key_1])
+        if not self._size and isfinite(self._moments.sum()):
+            return self._own_belief(self._table[:, :0].copy(), key, int(row[layout.step]), self.divergences)
         key = int(row[layout.key_0]), int(row[layout.key_1])
         members = self._table[: self._kept_rows, : self._size].copy()
         step, extras = int(row[layout.step]), self._extras.copy()
@@ -309,7 +426,7 @@ class Session:
 
     def innovation_copy(self) -> Innovation:
         """A copy of the last update's innovation."""
-        log_likelihood = float(self._row[self._places.log_likelihood])
+        log_likelihood = self._row.item(self._places.log_likelihood)
         return Innovation(self.innovation.copy(), self.innovation_cov.copy(), log_likelihood)
 
 

@@ -125,6 +125,7 @@ def regress(table, n, y, moves, taper, size):
 def with_unit_noise(page: Page, memory: MembersMemory, model) -> dict[str, Stage]:
     """M^-1 (y - mean(y)) of members and M^-1 (z - mean(y)), with M M' = R: channels with independent noise."""
     measured, n, m = present(memory.z), memory.shape.n, memory.shape.m
+    model.extras = memory.keep(page.started(model))  # the input that acts, if h takes it
     y, M = expect(model, memory.x, memory.z), root(uncorrelated(measured, model.R))
     v = mask_missing(measured, wrap(memory.z - mean(y), model.measurement_angles))
     rows = input_matrix(Place("table", n), (m,), member=True, like=memory.x)

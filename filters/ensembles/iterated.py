@@ -30,6 +30,7 @@ from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Functions, Shape, number_offsets
+from thruster_env.model.state_space import refuse_feed
 
 MOST_ITERATIONS = 20  # which programs repeat without a loop
 LONGEST_WINDOW = 1000  # steps
@@ -325,6 +326,8 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
         super().__post_init__()
         object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
         object.__setattr__(self, "window", at_least("window", self.window, 0, LONGEST_WINDOW))
+        if self.window:
+            refuse_feed(self.model, f"the model of {self.name!r} with a window")
         if self.window and self.adaptive_inflation:
             rule = f"window of a filter with adaptive_inflation {self.adaptive_inflation:g} must be 0"
             raise ValueError(f"{rule}, but got {self.window}")

@@ -195,7 +195,7 @@ class ForeignFilter(Filter):
         """Raise ValueError; see `init`."""
         raise self._no_filter()
 
-    def update(self, belief: Belief, z, *, measurement_noise_cov=None) -> tuple[Belief, Innovation]:
+    def update(self, belief: Belief, z, *, u=None, measurement_noise_cov=None) -> tuple[Belief, Innovation]:
         """Raise ValueError; see `init`."""
         raise self._no_filter()
 

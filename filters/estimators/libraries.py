@@ -12,7 +12,7 @@ import numpy as np
 from filters.estimators.estimator import Estimator, Output
 from thruster_env.core.angles import difference, wrapped_where
 from thruster_env.core.sources import as_value
-from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel, refuse_feed
 
 START = datetime(2000, 1, 1)  # of every trajectory: states carry a time, and only differences of it count
 
@@ -154,6 +154,7 @@ def unscented(model: StateSpaceModel, alpha=1.0, beta=2.0, kappa=0.0) -> FilterP
     """
     from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
+    refuse_feed(model, "the model of FilterPy's filter")
     move, measure, c = model.functions.transition, model.functions.observe, model.given_constants
 
     def advance(x, dt, u):

@@ -36,7 +36,7 @@ from filters.pages.kernels import (
     stored,
     works_of,
 )
-from filters.pages.page import Equations, PagedModel, RowMemory
+from filters.pages.page import ACTING, Equations, PagedModel, RowMemory
 from thruster_env.core.angles import angle_indices, whole_turns, wrapped
 from thruster_env.core.checks import at_least, one_of, short_repr
 from thruster_env.core.compiled import inlined
@@ -232,7 +232,8 @@ def mixture_kernels(
     n, m, layout, prior = shape.n, shape.m, memory_offsets(shape.n, shape.m), prior_start(shape)
     belief, length, wide = n + n * n, prod(own_shape), max(shape.inputs, m)
     level = belief + m + m * m
-    parts = Parts(layout.extras, level + 1, count)
+    acting, feed = layout.extras, shape.feed  # the input of the last step, if h takes it
+    parts = Parts(acting + feed, level + 1, count)
     first, stride, _ = parts
     weights = first + count * stride
     inputs_offset = weights + count  # of u or z, a part's parameters, and the matrices that all parts share
@@ -241,6 +242,7 @@ def mixture_kernels(
     memory.end = inputs_offset + wide + length
     begun = as_tuple(page.represent(PagedModel(memory), memory.x, memory.P))
     shared = [memory.another(matrix) for matrix in begun[1:]]
+    acting_now = memory.another(memory.read("rows", acting, feed)) if feed else None
     outputs = (layout.innovation, m), (layout.innovation_cov, m, m)
     v, S = (memory.read("rows", *output) for output in outputs)
     begin, density = works_of(
@@ -252,6 +254,8 @@ def mixture_kernels(
         x, P = memory.read("rows", 0, n), memory.read("rows", n, n, n, symmetric=True)
         u, z, of_part = memory.u, memory.z, [memory.read("given", wide, *own_shape)]
         of_part += [memory.read("given", matrix.operation.at - inputs_offset, *matrix.shape) for matrix in shared]
+        if acting_now is not None:
+            model.extras = {ACTING: memory.read("given", acting_now.operation.at - inputs_offset, feed)}
         predicted = page.predict(model, *of_part, x, P, u) if page.predict else ()
         updated, offsets = page.update(model, *of_part, x, P, z), (x, P, belief, belief + m, level)
         return [stored(predicted, (x, P)[: len(predicted)]), stored(updated, offsets[: len(updated)])]
@@ -264,6 +268,7 @@ def mixture_kernels(
     weigh, of_belief = weigher(parts, level), page_kernels(ExtendedKalmanFilter.page, functions, shape)
     step_offset, innovation_offset, likelihood_offset = layout.step, layout.innovation, layout.log_likelihood
     own_first, end, afresh = filter_offset(shape) + plain.own_size, memory.end, page.afresh
+    seen_offset = end - feed
 
     @inlined
     def begin_afresh(row):
@@ -276,6 +281,8 @@ def mixture_kernels(
         def run(row, values, numbers):
             for i in range(values.shape[0]):
                 row[inputs_offset + i] = values[i]
+            for i in range(feed):
+                row[seen_offset + i] = row[acting + i]
             for k in range(count):
                 for i in range(length):
                     row[inputs_offset + wide + i] = numbers[own_first + k * length + i]
@@ -289,7 +296,7 @@ def mixture_kernels(
     def start(memory, numbers, size):
         row, _, _ = memory
         prior(memory, numbers, size)
-        for i in range(first, end):
+        for i in range(acting, end):
             row[i] = 0.0
 
     @inlined
@@ -301,6 +308,8 @@ def mixture_kernels(
     @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
+        for i in range(feed):
+            row[acting + i] = u[i]
         begin(row, u, numbers)
         if afresh:
             begin_afresh(row)
@@ -330,7 +339,10 @@ def mixture_kernels(
 
     works = (start_parts, predict, update) if page.predict else (start, of_belief.predict, split_and_update)
     return Kernels(
-        *(n, m, n, 0, *works, nothing_to_summarise), extras=inputs_offset - first, scratch=end - inputs_offset
+        *(n, m, n, 0, *works, nothing_to_summarise),
+        extras=inputs_offset - acting,
+        scratch=end - inputs_offset,
+        acting=tuple(range(acting, first)),
     )
 
 
@@ -374,7 +386,7 @@ class MixtureFilter(Filter):
 
     def part_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Means (parts, n), covariances (parts, n, n) and weights (parts,) of the parts of a belief."""
-        return parts_of(belief.extras, len(self.of_parts), self.model.n)
+        return parts_of(belief.extras[self.kernel_model.shape.feed :], len(self.of_parts), self.model.n)
 
 
 def split(model, x, P):

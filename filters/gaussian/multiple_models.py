@@ -131,9 +131,9 @@ def mode_kernels(
         blend(row, probabilities, numbers, 0)
 
     extras = probabilities - first
-    return Kernels(
-        n, m, n, 0, start, predict, update, nothing_to_summarise, extras=extras, scratch=end - first - extras
-    )
+    acting = (first + j * stride + at for j, mode in enumerate(modes) for at in mode.kernels.acting)
+    works = start, predict, update, nothing_to_summarise
+    return Kernels(n, m, n, 0, *works, extras=extras, scratch=end - first - extras, acting=tuple(acting))
 
 
 def _mixer(mixing: Callable, parts: Parts, belief: int, logs: int, transitions: int, blend: Callable) -> Callable:

@@ -44,10 +44,12 @@ def horizon_kernels(
     n, m, inputs = shape.n, shape.m, shape.inputs
     layout, step_layout, at = memory_offsets(n, m), kept_places(shape), scratch_places(shape)
     end, width, square = step_layout.end, at.end, n * n
-    arrival = layout.extras + 1
+    acting, feed = layout.extras, shape.feed  # the input of the last step, if h takes it
+    number = acting + feed
+    arrival = number + 1
     steps = arrival + n + square
     numbers_offset = steps + (room + 1) * end
-    mean, cov, number = layout.mean, layout.cov, layout.extras
+    mean, cov = layout.mean, layout.cov
     sigma_offset, horizon_offset, iterations_offset = (filter_offset(shape) + k for k in (1, 2, 3))
     numbers_end, constants = iterations_offset + 1, shape.constants
     scratch, at_numbers = numbers_offset + numbers_end, number_offsets(n, m)
@@ -73,6 +75,7 @@ def horizon_kernels(
         first = steps + step * end
         copy(row, first + step_layout.R, numbers, r_offset, m * m)
         copy(row, first + step_layout.seen_by, numbers, constants_offset, constants)
+        copy(row, first + step_layout.acting, row, acting, feed)
 
     @inlined
     def keep_motion(row, numbers, step):
@@ -253,6 +256,8 @@ def horizon_kernels(
         else:
             for i in range(constants):
                 fits = fits and row[newest + step_layout.seen_by + i] == numbers[constants_offset + i]
+            for i in range(feed):
+                fits = fits and row[newest + step_layout.acting + i] == row[acting + i]
             if not fits:
                 repeat_step(row, numbers, int(row[number]))
                 newest = steps + (int(row[number]) - 1) * end
@@ -280,8 +285,9 @@ def horizon_kernels(
 
     return Kernels(
         *(n, m, n, 0, start, predict, update, nothing_to_summarise),
-        extras=numbers_offset - number,
+        extras=numbers_offset - acting,
         scratch=numbers_end + (room + 1) * width,
+        acting=tuple(range(acting, number)),
     )
 
 
@@ -370,6 +376,7 @@ class MovingHorizonFilter(Filter):
 
     def window(self, belief: Belief) -> np.ndarray:
         """The last estimates (at most L, n) of the states of the window, the oldest first."""
-        layout, n = kept_places(self.kernel_model.shape), self.model.n
-        steps = belief.extras[1 + n + n * n :].reshape(self._kernel_horizon + 1, layout.end)
-        return steps[: int(belief.extras[0]), layout.x : layout.x + n].copy()
+        shape, n = self.kernel_model.shape, self.model.n
+        layout, feed = kept_places(shape), shape.feed
+        steps = belief.extras[feed + 1 + n + n * n :].reshape(self._kernel_horizon + 1, layout.end)
+        return steps[: int(belief.extras[feed]), layout.x : layout.x + n].copy()

@@ -41,7 +41,7 @@ from filters.algebra.roots import careful
 from filters.engine.belief import memory_offsets
 from filters.gaussian import extended
 from filters.pages.kernels import Stage, programs_of, stored
-from filters.pages.page import Equations, Page, RowMemory
+from filters.pages.page import ACTING, Equations, Page, RowMemory
 from filters.smoothers.rts import propagate_jacobian, represent_jacobian
 from thruster_env.core.compiled import inlined
 from thruster_env.model.quantities import Bound
@@ -69,6 +69,7 @@ class Kept(NamedTuple):
     Q: int  # (n, n), from this step to the next one
     moved_by: int  # (c,), constants of that motion
     substeps: int  # of it; zero before a second reading at the same time
+    acting: int  # (p,), the input at z, if h takes it
     end: int
 
 
@@ -103,7 +104,8 @@ def kept_places(shape: Shape) -> Kept:
     """Offsets of the numbers that a belief keeps of a step."""
     n = shape.n
     square, constants = n * n, shape.constants
-    return Kept(*starts_of(shape.inputs, n, shape.m, n, 1, 2 * n, shape.m**2, constants, square, constants, 1))
+    of_step = shape.inputs, n, shape.m, n, 1, 2 * n, shape.m**2, constants, square, constants, 1, shape.feed
+    return Kept(*starts_of(*of_step))
 
 
 @cache
@@ -209,8 +211,11 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
         adjoint = vector(at.pull) + without.T @ after
         estimate, step, shift = vector(at.estimate), vector(at.step), d + P @ adjoint
         half, jump, centred = step * 0.5, wrap(mean - next_x, angles), wrap(d - x, angles)
+        model.extras = {ACTING: memory.read("rows", row.extras, shape.feed)}
+        results = tell(model, memory.x, memory.P, memory.z)
+        model.extras = {ACTING: memory.read("given", step_layout.acting, shape.feed)}
         return [
-            stored(tell(model, memory.x, memory.P, memory.z), outputs),
+            stored(results, outputs),
             stored((centred, cost_of(centred, P)), (d, at.seen_cost)),
             stored(represent_jacobian(model, x, P), (mean, F)),
             stored(propagate_jacobian(model, mean, F, memory.u), (mean, F)),

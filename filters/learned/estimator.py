@@ -22,7 +22,7 @@ from thruster_env.core.sources import matrix_writer, vector_reader, vector_write
 from thruster_env.core.threads import one_thread
 from thruster_env.logs.log import AnyStepModel
 from thruster_env.model.shape import Functions, Shape, constants_reader, number_offsets
-from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel, refuse_feed
 
 MOST = 10_000  # members, or hidden states
 
@@ -36,6 +36,7 @@ class Equations:
     def __init__(self, model: StateSpaceModel):
         if isinstance(model, AnyStepModel):
             raise ValueError("a learned estimator must have steps of one length, but got a model of any step")
+        refuse_feed(model, "the model of a learned estimator")
         self.model = model
 
     def moved(self, x: Tensor, u: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from filters.wrappers.arguments import filter_for
 from thruster_env.core.checks import at_least
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
-from thruster_env.logs.log import Log
+from thruster_env.logs.log import Log, seen_by
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -47,7 +47,7 @@ def by_the_clock(
     if isinstance(filter_, ForeignFilter):
         raise ValueError(f"a log on its own stamps must be for a filter of ours, but got {filter_.name!r}")
     live = Live(filter_, noise=noise, resolution=log.resolution)
-    times, z = log.times.tolist(), log.measurements
+    times, z = log.times.tolist(), seen_by(filter_.model, log.measurements)
     live.start(0.0, z[0], key)
     rows = [live.latest()]
     for k, u in enumerate(log.inputs, 1):
@@ -176,7 +176,8 @@ def estimate_with(
         noise: of a log on its own stamps, Q by the length of a step [s]; None for one in proportion to it.
     """
     smoother = smoother or lag is not None
-    data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], log.measurements[None]
+    measurements = seen_by(filter_.model, log.measurements)
+    data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], measurements[None]
     if log.stamps is not None:
         if smoother:
             raise ValueError(f"a smoother must run on a grid, but log {log.name} has its own stamps")

@@ -37,12 +37,13 @@ from thruster_env.core.files import (
     save_figure,
     tidy,
 )
-from thruster_env.core.sources import is_array
+from thruster_env.core.sources import as_value, is_array
 from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.logs.columns import OUTPUT, STATE, plain, suffix
 from thruster_env.logs.findings import GAP, SPOILING, sentences
 from thruster_env.logs.grid import date_text, time_text
 from thruster_env.model.quantities import Quantity
+from thruster_env.model.simulate import inputs_until
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,6 +60,8 @@ MOST_PANELS = 6  # of states and outputs
 TALL, LOW, WIDTH = 1.5, 1.1, 9.0  # [inch]
 ROOM = 0.6  # for title and legend [inch]
 ALARM = "tab:red"
+FEWEST_MOVES = 10  # rows in which an input changes, for each input
+FOLLOWS = 0.5  # share of the innovations' squares that changes of the input explain, from which it is named
 MARGIN = 0.06  # of an axis above and below what it shows
 DOTS: dict[str, Any] = {"color": "0.5", "s": 4.0, "linewidths": 0, "label": "measurement", "zorder": 1.5}
 
@@ -196,6 +199,7 @@ def verdict(estimate: LogEstimate, log_findings: LogFindings) -> list[str]:
         conclusion = (
             "The innovations are larger than the filter expects: its Q or R is too small, or the model is off."
         )
+        messages += feedthrough_sentences(estimate, log_findings.first)
     elif log_findings.mean_nis < low:
         conclusion = "The innovations are smaller than the filter expects: its Q or R is too large."
     if log_findings.whiteness is not None and log_findings.whiteness.p_value < ALPHA:
@@ -204,6 +208,44 @@ def verdict(estimate: LogEstimate, log_findings: LogFindings) -> list[str]:
         kinds = list(dict.fromkeys(finding.kind for finding in spoilt))
         conclusion += f" First mend what was found in the log ({', '.join(kinds)}): it spoils these numbers."
     return [*messages, conclusion]
+
+
+def feedthrough_sentences(estimate: LogEstimate, first: int = 0) -> list[str]:
+    """The channels whose innovations are those of a measurement that depends on the input of its own row.
+
+        v_k - v_{k-1} = b' (u_k - u_{k-1}) + e_k
+
+    in rows in which the input u of the file changes, explains at least half of the squares, and more than the
+    changes of the row before do.
+
+    Args:
+        estimate: whose innovations are larger than the filter expects.
+        first: the first row that counts.
+    """
+    log = estimate.log
+    inputs, count = np.diff(log.input_rows, axis=0)[first:], log.inputs.shape[1]
+    shares = [
+        (_explained(changes, inputs), _explained(changes[1:], inputs[:-1]))
+        for changes in np.diff(estimate.innovations, axis=0)[first:].T
+    ]
+    remedy = 'read the log with inputs_act="until"' if estimate.model.feeds else "give h(x, u, c)"
+    return [
+        f"Changes of the input in the same row explain {100.0 * now:.0f} % of those of the innovations of "
+        f"{quantity.name}: measurements follow the input of the same instant, so {remedy} (or a controller's "
+        "answer to them is recorded in their row)."
+        for quantity, (now, before) in zip(log.measured, shares, strict=True)
+        if count and now >= FOLLOWS and now > before
+    ]
+
+
+def _explained(changes: np.ndarray, inputs: np.ndarray) -> float:
+    """The share of squares of changes (K,) that changes of the inputs (K, p) explain; 0 of too few."""
+    rows = np.isfinite(changes) & np.isfinite(inputs).all(axis=1) & (inputs != 0.0).any(axis=1)
+    y, x = changes[rows], inputs[rows]
+    if rows.sum() < FEWEST_MOVES * inputs.shape[1] or not y.any():
+        return 0.0
+    rest = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
+    return float(1.0 - (rest @ rest) / (y @ y))
 
 
 # Alarms of a monitor over a log, and the channel without which they are gone.
@@ -321,8 +363,8 @@ def columns_of(estimate: LogEstimate, alarms: LogAlarms | None = None) -> dict[s
     """
     log, model = estimate.log, estimate.model
     columns = {"time_s": log.start + log.times}
-    for quantity, values in zip(log.input_quantities, log.inputs.T, strict=True):
-        columns[header_of("input", quantity)] = np.append(values, np.nan)
+    for quantity, values in zip(log.input_quantities, log.input_rows.T, strict=True):
+        columns[header_of("input", quantity)] = values
     for quantity, values in zip(log.measured, log.measurements.T, strict=True):
         columns[header_of("measured", quantity)] = values
     for key in compared(estimate):
@@ -467,7 +509,10 @@ def _measurements_of(estimate: LogEstimate, values: np.ndarray) -> list[np.ndarr
     model, rows = estimate.model, np.linspace(0, len(values) - 1, 40).astype(int)
     states = estimate.means[rows] if is_array(model.n) else [tuple(row) for row in estimate.means[rows].tolist()]
     try:
-        expected = np.array([model.functions.observe(x, model.given_constants) for x in states])
+        inputs = inputs_until(estimate.log.inputs)[rows]
+        fed = [model.shape.fed(as_value(u.tolist())) for u in inputs]
+        h, c = model.functions.observe, model.given_constants
+        expected = np.array([h(x, *u, c) for x, u in zip(states, fed, strict=True)])
     except (ValueError, ArithmeticError):  # of estimates at which h has no value, where Python raises
         return []
     same = np.isclose(expected, values[rows, None], rtol=1e-9, atol=1e-12, equal_nan=True).all(axis=0)

@@ -22,7 +22,7 @@ from filters.algebra.matrices import Matrix, Operation, evaluate, in_order, inpu
 from filters.algebra.members import covariance, mean, on_branch
 from filters.algebra.operations import present, quotient, slopes_of, wrap
 from filters.engine.belief import Kernels, filter_offset, memory_offsets, row_access
-from filters.pages.page import Equations, NumbersMemory, Page, PagedModel, RowMemory
+from filters.pages.page import Equations, NumbersMemory, Page, PagedModel, RowMemory, acting_places
 from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import matrix_reader, vector_reader
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
@@ -274,7 +274,7 @@ def stages_of(page: Page, memory: RowMemory, model: PagedModel) -> list[Stage]:
     model.extras = memory.keep(started)
     begun = (x, p) if page.represent is None else as_tuple(page.represent(model, x, p))
     predicted = (x, p) if page.represent is None else [memory.another(matrix) for matrix in begun]
-    advanced = as_tuple(page.propagate(model, *predicted, memory.u))
+    advanced = page.propagated(model, *predicted, u=memory.u)
     outputs = layout.innovation, layout.innovation_cov, layout.log_likelihood
     return [
         stored((started,), (), memory.extras),
@@ -317,6 +317,7 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
         extras=extras_size,
         scratch=memory.end - layout.extras - extras_size,
         vectors=vectors[1:],
+        acting=acting_places(memory.extras),
     )
 
 
@@ -389,7 +390,7 @@ def member_stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> di
     of_belief = memory.mean, memory.P
     return {
         "start": stored((prior, started), (x,), extras),
-        "propagate": stored((page.propagate(model, x, memory.u),), (x,)),
+        "propagate": stored(page.propagated(model, x, u=memory.u), (x,), extras),
         "add_process_noise": stored((page.add_process_noise(model, x, memory.w),), (x,)),
         "analyse": stored((updated,), (x,)),
         "update": stored((updated, *rest, *moments(model, updated), changed), (x, *outputs, *of_belief), extras),
@@ -548,6 +549,7 @@ def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
         moments_of(row, row, row, table, draws, size)
 
     update, rows = _correction(works["update"], shape), max(work.rows for work in works.values())
-    return Kernels(
-        n, m, rows, max(n, m), start, predictor(works, shape), update, summarise, extras=extras_size(page, shape)
-    )
+    memory = MembersMemory(shape, page)
+    acting = acting_places(memory.keep(page.started(PagedModel(memory))))
+    parts = start, predictor(works, shape), update, summarise
+    return Kernels(n, m, rows, max(n, m), *parts, extras=extras_size(page, shape), acting=acting)

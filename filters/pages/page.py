@@ -36,6 +36,7 @@ import numpy as np
 
 from filters.algebra.matrices import Matrix, Operation, input_matrix, never, plus, through
 from filters.algebra.points import root
+from filters.algebra.roots import zeros
 from filters.engine.belief import filter_offset, memory_offsets
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.derivatives import RELATIVE_STEP, step_growth, step_of
@@ -50,6 +51,8 @@ from thruster_env.model.shape import (
     transition_slopes,
 )
 from thruster_env.model.traced import not_known, traced_model
+
+ACTING = "acting_input"  # the extra of a model whose h takes the input: that of the last step
 
 
 class Page(NamedTuple):
@@ -67,8 +70,18 @@ class Page(NamedTuple):
     per_particle: tuple[str, ...] = ()  # names of extras that each particle has
 
     def started(self, model: Any) -> dict[str, Any]:
-        """The filter's extras at the prior."""
-        return {} if self.initial is None else self.initial(model)
+        """The filter's extras at the prior; no input acts there."""
+        acting = {ACTING: zeros(model.Q, model.feed)} if model.feed else {}
+        return {**acting, **({} if self.initial is None else self.initial(model))}
+
+    def propagated(self, model: Any, *belief: Any, u: Any) -> tuple:
+        """The results of `propagate`, with the extras that change: the input u acts from now on."""
+        results = self.propagate(model, *belief, u)
+        results = results if isinstance(results, tuple) else (results,)
+        if not model.feed:
+            return results
+        *values, changed = results if isinstance(results[-1], dict) else (*results, {})
+        return *values, {**changed, ACTING: u}
 
     def parameters(self, read: Callable[[int, tuple[int, ...]], Any]) -> Any:
         """`model.own` of pages: `read(offset, shape)` of each parameter, and the fixed values."""
@@ -94,6 +107,14 @@ class Page(NamedTuple):
 @cache
 def _own_class(names: tuple[str, ...]) -> type:
     return namedtuple("Own", names)
+
+
+def acting_places(extras: Mapping[str, Matrix]) -> tuple[int, ...]:
+    """Places in a row of the input that acts, if a filter keeps it."""
+    if ACTING not in extras:
+        return ()
+    first = extras[ACTING].operation.at
+    return tuple(range(first, first + len(extras[ACTING])))
 
 
 class NumbersMemory:
@@ -197,7 +218,7 @@ def called_parts(functions: Functions, shape: Shape, which: str, constants_move:
         rows, angles, inputs = shape.n, shape.state_angles, "u, c"
     else:
         value, matrix = functions.observe, observation_slopes(functions, shape)
-        rows, angles, inputs = shape.m, shape.measurement_angles, "c"
+        rows, angles, inputs = shape.m, shape.measurement_angles, shape.observe_arguments
     by_constants = _by_constants(value, rows, shape, angles, inputs)
     size = rows, shape.n
     entry = "(a[{0}][{1}] - b[{0}][{1}]) / (2.0 * h)"
@@ -324,7 +345,7 @@ def called_at_points(
     if which == "motion":
         value, rows, angles, inputs = functions.transition, shape.n, shape.state_angles, "u, c"
     else:
-        value, rows, angles, inputs = functions.observe, shape.m, shape.measurement_angles, "c"
+        value, rows, angles, inputs = functions.observe, shape.m, shape.measurement_angles, shape.observe_arguments
     plain = written_out("plain", f"x, scales, {inputs}", f"value(x, {inputs})", value=value)
     slope = slope_of(plain, difference_of_values(rows, angles), shape, inputs, constants_move)
     behind = ", dc, size" if constants_move else ""
@@ -369,11 +390,13 @@ class PagedModel:
         prior_mean: of the state.
         own: the filter's parameters.
         extras: what the filter keeps besides mean and covariance, by name.
+        feed: number of inputs that h takes, all or none.
         state_angles, measurement_angles: flags of components that are angles.
     """
 
     def __init__(self, memory: NumbersMemory):
         shape, self._constants = memory.shape, memory.constants
+        self.feed = shape.feed
         self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
         self.Q, self.R, self.Q_root, self.R_root = memory.Q, memory.R, memory.Q_root, memory.R_root
         if shape.step_ratio and memory.ratio is not None:
@@ -387,6 +410,10 @@ class PagedModel:
         other = copy(self)
         other._constants = constants
         return other
+
+    def _seen(self) -> tuple[Matrix, ...]:
+        """The arguments of h besides x: the input that acts, if it takes that, and the constants."""
+        return (self.extras[ACTING], self._constants) if self.feed else (self._constants,)
 
 
 class Equations(PagedModel):
@@ -441,11 +468,11 @@ class Equations(PagedModel):
 
     def h(self, x: Matrix) -> Matrix:
         """What is measured at x; of points (n, points) at each."""
-        return (self._h if len(x.shape) == 1 else self._at_points("sight", x))(x, self._constants)
+        return (self._h if len(x.shape) == 1 else self._at_points("sight", x))(x, *self._seen())
 
     def H(self, x: Matrix) -> Matrix:  # noqa: N802
         """dh/dx."""
-        return self._H(x, self._scales, self._constants)
+        return self._H(x, self._scales, *self._seen())
 
     def _operations(
         self, name: str, parts: tuple[Callable, ...], rows: int, n: int, trace: bool

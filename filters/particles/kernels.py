@@ -46,7 +46,7 @@ from filters.engine.belief import Belief, Kernels, filter_offset, memory_offsets
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.pages.kernels import MembersMemory, Stage, anything_measured, predictor, stored, with_extras
 from filters.pages.kernels import member_works_of as works_of
-from filters.pages.page import Page, PagedModel
+from filters.pages.page import Page, PagedModel, acting_places
 from filters.pages.page_filter import FilterWithPage
 from thruster_env.core.checks import at_least as check_at_least
 from thruster_env.core.checks import finite, positive
@@ -81,7 +81,8 @@ class Layout:
         self.x, self.logarithm = memory.x, input_matrix(Place("table", n), (), member=True, like=memory.x)
         self.size, self.extras = Place("rows", first), {}
         memory.end, rows = first + 1, n + 1
-        self.start = with_extras(page.initial(model, memory.w))  # type: ignore[misc]
+        *drawn, extras = with_extras(page.initial(model, memory.w))  # type: ignore[misc]
+        self.start = *drawn, {**page._replace(initial=None).started(model), **extras}
         for name, value in self.start[-1].items():
             if name in page.per_particle:
                 position = Place("table", rows)
@@ -108,7 +109,7 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
     innovation, cov, likelihood = memory.outputs
     of_each = {
         "start": (on_branch(at.start[0], model.state_angles), *at.start[1:]),
-        "propagate": page.propagate(model, x, memory.u),
+        "propagate": page.propagated(model, x, u=memory.u),
         "add_process_noise": page.add_process_noise(model, x, memory.w),
     }
     if page.rejuvenate:
@@ -309,6 +310,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
         *(n, m, rows, max(n, m), start, predict if page.lookahead else predict_chosen, update, summarise),
         extras=layout.numbers,
         extra_kept_rows=layout.rows - n,
+        acting=acting_places(layout.extras),
     )
 
 

@@ -82,7 +82,8 @@ def smooth_ensembles(
 def _paired_model(model: StateSpaceModel) -> StateSpaceModel:
     """The model of a state (x_k, x_l): the first half moves and is measured, the second stays."""
     nothing = np.zeros((model.n, model.n))
-    transition, observe = _paired_functions(model.functions.transition, model.functions.observe, model.n)
+    functions = model.functions
+    transition, observe = _paired_functions(functions.transition, functions.observe, model.n, model.feeds)
     return StateSpaceModel(
         transition=transition,
         observe=observe,
@@ -98,11 +99,12 @@ def _paired_model(model: StateSpaceModel) -> StateSpaceModel:
 
 
 @lru_cache(maxsize=64)
-def _paired_functions(transition: Callable, observe: Callable, n: int) -> tuple[Callable, Callable]:
+def _paired_functions(transition: Callable, observe: Callable, n: int, feeds: bool) -> tuple[Callable, Callable]:
     now, past = (vector_part(n, 2 * n, first) for first in (0, n))
     names: dict[str, Any] = {"now": now, "past": past, "join": joiner(n, n)}
     moves = written_out("moves", "x, u, c", "join(f(now(x), u, c), past(x))", f=transition, **names)
-    return moves, written_out("observe", "x, c", "h(now(x), c)", h=observe, now=now)
+    arguments = "u, c" if feeds else "c"
+    return moves, written_out("observe", f"x, {arguments}", f"h(now(x), {arguments})", h=observe, now=now)
 
 
 @lru_cache(maxsize=64)
@@ -113,6 +115,7 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
     key_0, key_1, step, divergences = layout.key_0, layout.key_1, layout.step, layout.divergences
     pair_key_0, pair_key_1, pair_step = pair_offsets.key_0, pair_offsets.key_1, pair_offsets.step
     mean, cov, summarise = layout.mean, layout.cov, kernels.summarise
+    feed, acting, pair_acting = len(kernels.acting), layout.extras, pair_offsets.extras
     q_offset, r_offset, pair_r_offset = number_offsets(n, m).q, number_offsets(n, m).r, number_offsets(2 * n, m).r
     fingerprint = function_fingerprint(start, predict, update, analyse_pair, within=__name__)
 
@@ -159,6 +162,8 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
                     restarts[b] += 1.0
                     oldest, row[divergences] = k, 0.0
                 pair_row[pair_step] = row[step]
+                for i in range(feed):
+                    pair_row[pair_acting + i] = row[acting + i]
                 for past in range(max(oldest, k - lag), k):
                     copy(pair_table, 0, forecast, 0)
                     copy(pair_table, n, history, past * n)

@@ -114,20 +114,22 @@ def values_of(
     return [values[number.place] for number in wanted]
 
 
-def sizes_of(further_arguments: int, shape: Shape) -> tuple[int, ...]:
-    """How many components the arguments (x, u, c) or (x, c) have."""
-    return (shape.n, shape.inputs, shape.constants) if further_arguments == 2 else (shape.n, shape.constants)
+def sizes_of(which: str, shape: Shape) -> tuple[int, ...]:
+    """How many components the arguments (x, u, c), or (x, c) of an h without input, have."""
+    if which == "motion" or shape.feeds:
+        return shape.n, shape.inputs, shape.constants
+    return shape.n, shape.constants
 
 
 class OfGraph:
     """An equation whose function can be traced; the Jacobian shares operations with the value."""
 
-    def __init__(self, function: Callable, jacobian: Callable | None, further_arguments: int, shape: Shape):
-        value, matrix, *_ = Traced(function, jacobian, further_arguments, shape).parts
+    def __init__(self, function: Callable, jacobian: Callable | None, which: str, shape: Shape):
+        value, matrix, *_ = Traced(function, jacobian, which, shape).parts
         graph = Graph(MOST)
         x, *rest = (
             np.array([graph.given((part, k)) for k in range(size)], dtype=object)
-            for part, size in enumerate(sizes_of(further_arguments, shape))
+            for part, size in enumerate(sizes_of(which, shape))
         )
         self._value = [graph.number(entry) for entry in value(x, *rest)]
         self._both = self._value + [graph.number(entry) for entry in matrix(x, None, *rest).ravel()]
@@ -309,7 +311,6 @@ def equation_of(
     name: str,
     of_model: tuple[Callable, Callable | None],
     user_functions: tuple[Callable | None, Callable | None],
-    further_arguments: int,
     shape: Shape,
 ) -> Equation:
     """The equation of a model's function and Jacobian, or of functions of tensors in their place.
@@ -318,7 +319,6 @@ def equation_of(
         name: of the function in the model.
         of_model: its function, and its Jacobian or None.
         user_functions: function and Jacobian of tensors; None for the model's.
-        further_arguments: how many arguments it has besides x.
         shape: of the model.
     """
     function, jacobian = user_functions
@@ -327,7 +327,7 @@ def equation_of(
     if jacobian is not None:
         raise ValueError(f"{name}_jacobian must come with {name}, but got it alone")
     try:
-        return OfGraph(*of_model, further_arguments, shape)
+        return OfGraph(*of_model, "motion" if name == "transition" else "sight", shape)
     except Exception:  # a user's function cannot be traced, whatever it raises: it is called instead
         if reason := needs_floats(*of_model):
             raise ValueError(f"{name} must accept tensors, but {reason}") from None

@@ -200,7 +200,7 @@ class TensorFilter:
             filter_: a filter with a page, so no "gsf", "imm", "mmae", "mhe" or "fuzzy".
             transition: f(x, u, c) in place of the model's, a function of tuples of tensors (...,) that returns one
                 for each state; it may contain a network. x, u and c are those of `StateSpaceModel`.
-            observe: h(x, c) in place of the model's.
+            observe: h(x, c), or h(x, u, c), in place of the model's.
             transition_jacobian: df/dx of such a transition, by rows; by `torch.func.jvp` if None.
             observe_jacobian: dh/dx of such a function.
             dtype: torch.float64, or torch.float32.
@@ -230,8 +230,8 @@ class TensorFilter:
         self._model, self._own = paged.kernel_model, paged.parameters
         shape, (f, by_f, h, by_h) = self._model.shape, self._model.functions
         transition, by_transition, observe, by_observe = self._user_functions
-        f_equation = equation_of("transition", (f, by_f), (transition, by_transition), 2, shape)
-        h_equation = equation_of("observe", (h, by_h), (observe, by_observe), 1, shape)
+        f_equation = equation_of("transition", (f, by_f), (transition, by_transition), shape)
+        h_equation = equation_of("observe", (h, by_h), (observe, by_observe), shape)
         self._traced = all(isinstance(equation, OfGraph) for equation in (f_equation, h_equation))
         self._programs: dict[Any, Any] = {}
         if isinstance(paged, EnsembleFilter):

@@ -394,11 +394,11 @@ class TensorModel(PagedModel):
 
     def h(self, x: Matrix) -> Matrix:
         """What is measured at x; of points (n, points) at each."""
-        return self._h.value_at(x, self._constants)
+        return self._h.value_at(x, *self._seen())
 
     def H(self, x: Matrix) -> Matrix:  # noqa: N802
         """dh/dx."""
-        return self._h.matrix(self._h.both(x, self._constants))
+        return self._h.matrix(self._h.both(x, *self._seen()))
 
 
 class _Operations:

@@ -284,7 +284,9 @@ def test_what_a_large_model_is_and_whether_it_fits_its_data_is_found_with_arrays
     """Its functions multiply whole states, which tuples refuse."""
     noise = {"process_noise_cov": np.ones(40), "measurement_noise_cov": [1.0]}
     prior = {"prior_mean": np.ones(40), "prior_cov": np.ones(40)}
-    model = StateSpaceModel(transition=lambda x, u, c: x * x, observe=lambda x, c: (x[0],), **noise, **prior)
+    model = StateSpaceModel(
+        transition=lambda x, u, c: x * x, observe=lambda x, c: (x[0],), inputs=1, **noise, **prior
+    )
     assert model.digest != model.replace(transition=lambda x, u, c: x * x * x).digest
     data = Data((1,), np.zeros((1, 2, 1)), np.ones((1, 3, 1)), np.zeros((1, 2)), states=np.ones((1, 3, 40)))
     check_model(model, data, "large")
@@ -325,7 +327,7 @@ def ring(x, u, c):
 def test_a_wrong_function_of_a_large_model_is_told_in_one_sentence(changes, message):
     functions = {"transition": ring, "observe": lambda x, c: (x[0], x[1])}
     numbers = {"process_noise_cov": np.ones(40), "measurement_noise_cov": [1.0, 1.0]}
-    prior = {"prior_mean": np.zeros(40), "prior_cov": np.ones(40)}
+    prior = {"prior_mean": np.zeros(40), "prior_cov": np.ones(40), "inputs": 1}
     assert StateSpaceModel(**functions, **numbers, **prior).m == 2
     with pytest.raises(ValueError, match=message):
         StateSpaceModel(**{**functions, **changes}, **numbers, **prior)

@@ -1,5 +1,6 @@
 """A belief belongs to a kind of filter and a model; another one's is refused in one line."""
 
+import copy
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -128,6 +129,41 @@ def test_what_was_done_before_with_a_filter_changes_no_later_result(name):
     copied = pickle.loads(pickle.dumps(filter_))
     assert not any(key.startswith("_spare") for key in vars(copied))
     np.testing.assert_array_equal(copied.predict(start, [5.0]).cov, fresh.predict(start, [5.0]).cov)
+
+
+def test_a_belief_that_was_made_here_is_checked_once_it_was_written_to():
+    filter_ = make_filter("ekf", thruster_model())
+    belief = filter_.predict(filter_.init(), [3.0])
+    after, _ = filter_.update(belief, [0.4])
+    for copied in (belief._replace(step=belief.step), pickle.loads(pickle.dumps(belief)), copy.copy(belief)):
+        np.testing.assert_array_equal(filter_.update(copied, [0.4])[0].mean, after.mean)
+    other, _ = filter_.update(belief, [0.4], measurement_noise_cov=[9.0])
+    assert other.mean[0] != after.mean[0]
+    np.testing.assert_array_equal(filter_.update(belief, [0.4])[0].cov, after.cov)  # with R of the model again
+    belief.mean[0] += 1.0
+    assert filter_.update(belief, [0.4])[0].mean[0] != after.mean[0]
+    belief.mean[0] = np.nan
+    with pytest.raises(ValueError, match="mean of a belief must be finite"):
+        filter_.predict(belief, [3.0])
+    with pytest.raises(ValueError, match="u must be 1 number"):
+        filter_.predict(after, [np.inf])
+    assert repr(after).startswith("Belief(mean=")
+
+
+def test_predict_and_update_of_a_session_are_its_step():
+    first, second, third = (make_filter("ekf", thruster_model()).session() for _ in range(3))
+    first.start((1, 2), [0.1])
+    second.start((1, 2))
+    second.update([0.1])
+    for z in ([0.3], [np.nan]):
+        first.step([3.0], z)
+        second.predict([3.0])
+        second.update(z)
+    np.testing.assert_array_equal(first.mean, second.mean)
+    with pytest.raises(ValueError, match="z must be 1 number, each finite or NaN, but got"):
+        second.update([np.inf])
+    with pytest.raises(ValueError, match="a session must begin with start"):
+        third.predict([1.0])
 
 
 def test_threads_share_a_filter_and_not_its_memory():

@@ -134,7 +134,7 @@ def two_of_three(seen, info):
 def car():
     return StateSpaceModel(
         transition=lambda x, u, c: x, observe=lambda x, c: x, process_noise_cov=[1.0, 1.0],
-        measurement_noise_cov=[1.0, 1.0], prior_mean=[0.0, 0.0], prior_cov=[1.0, 1.0],
+        measurement_noise_cov=[1.0, 1.0], prior_mean=[0.0, 0.0], prior_cov=[1.0, 1.0], inputs=1,
     )  # fmt: skip
 
 

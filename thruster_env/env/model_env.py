@@ -120,8 +120,8 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
         parts = [act(f"input {i}", p, value, effects, t) for i, value in enumerate(u)]
         return tuple(value for value, _ in parts), {k: v for _, memory in parts for k, v in memory.items()}
 
-    def observed(p: Parameters, x: tuple, u: tuple, effects: dict | None, memories: dict, t: Moment) -> tuple:
-        z = evaluated(h, call_h, m, p, x)
+    def observed(p: Parameters, x: tuple, u: tuple, v: tuple, effects: dict | None, memories: dict, t: Moment):
+        z = evaluated(h, call_h, m, p, *((x, v) if shape.feeds else (x,)))
         noise, readings = correlated(p.r_root, t.draws.normals(MEASUREMENT, m)), list[Reading]()
         for i in range(m):
             reading, memory = act(f"sensor {i}", p, Reading(z[i] + noise[i], 1.0), effects, t._replace(state=x))
@@ -141,7 +141,7 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
         noise = correlated(p.prior_root, t.draws.normals(INITIAL, n))
         x = tuple(mean + w for mean, w in zip(p.prior_mean, noise, strict=True))
         u, memories = disturbed(p, (0.0,) * shape.inputs, None, t)
-        return observed(p, x, u, None, memories, t)
+        return observed(p, x, u, u, None, memories, t)
 
     def step(p: Parameters, memory: Any, action: tuple, t: Moment) -> tuple[Any, dict]:
         x, effects = memory
@@ -154,7 +154,7 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
 
         noise = correlated(p.q_root, t.draws.normals(PROCESS, n))
         x = tuple(a + w for a, w in zip(t.repeat(substeps, body, x, v), noise, strict=True))
-        return observed(p, x, u, effects, memories, t)
+        return observed(p, x, u, v, effects, memories, t)
 
     return Page(begin, step, shape.inputs)
 
@@ -162,7 +162,8 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
 def _parts(functions: Functions, shape: Shape) -> tuple[Part, Part]:
     """The functions f and h, with the sizes of their arguments, form of constants and number of results."""
     n, p, m, c = shape.n, shape.inputs, shape.m, shape.constants
-    return (functions.transition, (n, p, c), shape.form, n), (functions.observe, (n, c), shape.form, m)
+    sizes = (n, p, c) if shape.feeds else (n, c)
+    return (functions.transition, (n, p, c), shape.form, n), (functions.observe, sizes, shape.form, m)
 
 
 def page_of(plant: ModelPlant, task: ModelTask) -> tuple[Page, Parameters]:
@@ -195,6 +196,7 @@ class ModelEnv(PlantEnv):
 
         x_{k+1} = f(x_k, u_k + d_k) + w,  w ~ N(0, Q);   z_k = sensors(h(x_k) + v),  v ~ N(0, R)
 
+    If h takes the input, z_{k+1} = sensors(h(x_{k+1}, u_k + d_k) + v): the action acts until the end of its step.
     The first episode after `reset(seed=s)` is, to rounding, the trajectory that
     `thruster_env.model.simulate.simulate` draws for the key of seed s under the same inputs, and the data of that
     seed in a tuning problem of the same model.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from thruster_env.core.modules import error_line, object_named
 from thruster_env.env.commands import some_numbers
 from thruster_env.env.copies import PlantCopies
 from thruster_env.env.model_env import with_noise
-from thruster_env.logs.log import Log
+from thruster_env.logs.log import Log, seen_by
 from thruster_env.logs.read import read_log
 from thruster_env.model.continuous import ContinuousModel, continuous_of, in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
@@ -174,7 +175,7 @@ def read_for(log: Any, model, **options) -> tuple[Log, Callable[..., StateSpaceM
                 for quantities in (logged, modelled)
             ]
             raise ValueError(f"{what} of log {log.name} must be the model's, {listed[1]}, but it has {listed[0]}")
-    return log, maker
+    return replace(log, measurements=seen_by(made_model, log.measurements)), maker
 
 
 def _maker(offer: Any, dt: float) -> Callable[..., StateSpaceModel]:

@@ -72,6 +72,8 @@ class Log:
         recording: what became of the file's rows on the grid; empty where the log is not from a file.
         uncut: the log that this one is a piece of, between gaps; None for one that is no piece.
         stamps: times of the rows [s], (K + 1,), 0 at row 0 and increasing; None for a log on a grid.
+        until: whether the file's input of a row acts until then, as a current that is sampled with a voltage does.
+            `inputs` have the one of row k + 1 in place k.
     """
 
     name: str
@@ -89,6 +91,7 @@ class Log:
     recording: Recording = Recording()
     uncut: Log | None = None
     stamps: np.ndarray | None = None
+    until: bool = False
 
     def __post_init__(self):
         positive("dt of a log", self.dt)
@@ -124,6 +127,12 @@ class Log:
     def times(self) -> np.ndarray:
         """Times of the rows [s], (K + 1,), 0 at row 0."""
         return self.dt * np.arange(self.steps + 1) if self.stamps is None else self.stamps
+
+    @property
+    def input_rows(self) -> np.ndarray:
+        """The inputs by the rows of the file, (K + 1, p): NaN in the last or, `until` their rows, in the first."""
+        nothing = np.full((1, self.inputs.shape[1]), np.nan)
+        return np.vstack((nothing, self.inputs) if self.until else (self.inputs, nothing))
 
     @property
     def resolution(self) -> float:
@@ -228,6 +237,18 @@ def at_offset(log: Log, channel: str, seconds: float) -> Log:
         values = sampled(*arguments, log.measured[column].angle)
         changes["measurements"] = _with_column(log.measurements, column, values)
     return replace(log, **changes)
+
+
+def seen_by(model: StateSpaceModel, measurements: np.ndarray) -> np.ndarray:
+    """Measurements (K + 1, m) of rows of a log as a model can take them.
+
+    If h takes the input, the first is left out, because the input until then is unknown.
+    """
+    if not model.feeds:
+        return measurements
+    measurements = measurements.copy()
+    measurements[0] = np.nan
+    return measurements
 
 
 def cut_at_gaps(log: Log, shortest: int = FEWEST_STEPS + 1) -> list[Log]:
@@ -390,6 +411,10 @@ def in_any_steps(model: StateSpaceModel, dt: float | None = None) -> AnyStepMode
     if slopes is not None:
         exact = by_complex_step(slopes)  # which is found anew
         fields["transition_jacobian"] = None if exact else with_ratio(slopes, form, count, index, inputs)
+    for name in ("observe", "observe_jacobian") if model.feeds else ():
+        function = getattr(model, name)
+        if function is not None:
+            fields[name] = None if by_complex_step(function) else without_ratio(function, inputs)
     if model.operating_input is not None:
         fields["operating_input"] = np.append(model.operating_input, 1.0)
     fields |= {
@@ -413,6 +438,12 @@ def with_ratio(function: Callable, form: type, count: int, index: int, inputs: i
     constants = (f"c[{i}] * u[{inputs}]" if i == index else f"c[{i}]" for i in range(count))
     names: dict[str, Any] = {"function": inlined(function), "form": form}
     return written_out("stepped", "x, u, c", f"function(x, u[:{inputs}], form{tuple_of(constants)})", **names)
+
+
+@makes_functions
+def without_ratio(function: Callable, inputs: int) -> Callable:
+    """`function(x, u, c)` of the inputs before the last one."""
+    return written_out("seen", "x, u, c", f"function(x, u[:{inputs}], c)", function=inlined(function))
 
 
 def as_rows(log: Log) -> Log:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.core.checks import finite, listed, positive, short_repr
+from thruster_env.core.checks import finite, listed, one_of, positive, short_repr
 from thruster_env.core.files import read_toml
 from thruster_env.logs.columns import (
     INPUT,
@@ -53,6 +53,7 @@ class Description(NamedTuple):
     clock_offset: Mapping[str, float] = {}  # by quantity [s]: how far its clock is ahead
     dt: float | None = None  # sample time [s]: of rows without a time, or of the grid to put irregular ones on
     stamps: str | None = None  # of a bag: "header" or "receipt"
+    inputs_act: str | None = None  # "from" their rows on, or "until" these
 
     def updated(self, other: Description) -> Description:
         """This one, overridden by the other."""
@@ -62,6 +63,7 @@ class Description(NamedTuple):
             clock_offset={**self.clock_offset, **other.clock_offset},
             dt=self.dt if other.dt is None else other.dt,
             stamps=self.stamps if other.stamps is None else other.stamps,
+            inputs_act=self.inputs_act if other.inputs_act is None else other.inputs_act,
         )
 
 
@@ -74,6 +76,7 @@ def read_log(
     dt: float | None = None,
     grid: bool = True,
     stamps: str | None = None,
+    inputs_act: str | None = None,
     name: str = "a table",
 ) -> Log:
     """Read a log of a model's inputs and measurements from a file; columns of states and outputs are references.
@@ -84,6 +87,7 @@ def read_log(
 
         dt = 0.01
         stamps = "receipt"
+        inputs_act = "until"
         [columns]
         thrust = "loadcell[kgf]"
         [units]
@@ -105,6 +109,9 @@ def read_log(
             (`thruster_env.logs.grid`), and `dt` is the sample time to which covariances belong.
         stamps: of a bag, the clock of all topics: "header" or "receipt"; by default that of the headers if all
             topics have stamps of one clock (`thruster_env.logs.recorders.bags`).
+        inputs_act: whether the input of a row acts "from" it on, as a command that is sent then, or "until" it, as
+            a current that is sampled with the voltage. By default "until" for a model whose measurements have
+            feed-through, h(x, u, c), and "from" for others.
         name: of a log that is not a file.
 
     Raises:
@@ -115,7 +122,11 @@ def read_log(
         if not isinstance(mapping, Mapping | None):
             raise ValueError(f"{what} must be a mapping from quantities, but got {short_repr(mapping)}")
     description_file = _described(Path(path)) if is_file else Description()
-    description = description_file.updated(Description(columns or {}, {}, clock_offset or {}, dt, stamps))
+    description = description_file.updated(
+        Description(columns or {}, {}, clock_offset or {}, dt, stamps, inputs_act)
+    )
+    act = description.inputs_act or ("until" if model.feeds else "from")
+    until = one_of("inputs_act", act, ("from", "until")) == "until"
     wanted = quantities_of(model)
     form = format_of(path) if is_file else None
     if form is not None:
@@ -140,6 +151,10 @@ def read_log(
         if channel.key not in column_of:
             continue
         series, present = _series(table, column_of[channel.key], channel, of_file)
+        if until and channel.kind == INPUT:  # a sample acts since the one before
+            series = Series(
+                series.times[: max(len(series.times) - 1, 1)], series.values[-len(series.values) + 1 :]
+            )
         samples[channel.key] = series
         rows |= present
         if len(series.values) < len(of_file.times) or of_file.irregular or channel.key in offsets:
@@ -192,6 +207,7 @@ def read_log(
         irregular=of_file.irregular,
         recording=recording._replace(damage=table.damage, remarks=remarks),
         stamps=marks,
+        until=until,
     )
 
 

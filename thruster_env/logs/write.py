@@ -147,11 +147,14 @@ def _names_in(path: Path) -> list[str]:
 def write_log(path: str | Path, log: Log) -> None:
     """Write a log with every digit, such that `read_log` with the same model gives its rows again.
 
-    The last row has no input, as nothing is known of what acts after it.
+    The last row has no input, as nothing is known of what acts after it. Where inputs act until their rows, the
+    first row repeats that of the second one.
     """
-    columns = {"time_s": log.start + log.times}
-    for quantity, values in zip(log.input_quantities, log.inputs.T, strict=True):
-        columns[header_of(quantity, columns)] = np.append(values, np.nan)
+    columns, inputs = {"time_s": log.start + log.times}, log.input_rows
+    if log.until:
+        inputs[0] = inputs[1]
+    for quantity, values in zip(log.input_quantities, inputs.T, strict=True):
+        columns[header_of(quantity, columns)] = values
     for quantity, values in zip(log.measured, log.measurements.T, strict=True):
         columns[header_of(quantity, columns)] = values
     for key, values in log.references.items():
@@ -196,7 +199,7 @@ def draw_findings(log: Log) -> Figure:
     from thruster_env.core.text_tables import TITLE, verbatim  # which imports rich
 
     times = log.start + log.times
-    inputs = np.vstack((log.inputs, np.full((1, log.inputs.shape[1]), np.nan)))
+    inputs = log.input_rows
     panels = [("", quantity, inputs[:, column]) for column, quantity in enumerate(log.input_quantities)]
     for column, output in enumerate(log.measured):
         panels.append((f"measurement:{output.symbol}", output, log.measurements[:, column]))
@@ -210,7 +213,13 @@ def draw_findings(log: Log) -> Figure:
             present = ~np.isnan(values)
             axis.plot(*thinned(times[present], values[present]), ".", color=BLUE, markersize=2.5, label="sample")
         else:
-            axis.step(*thinned(times, values), where="post", color=DARK, linewidth=0.9, label="input")
+            axis.step(
+                *thinned(times, values),
+                where="pre" if log.until else "post",
+                color=DARK,
+                linewidth=0.9,
+                label="input",
+            )
         for finding in log.findings:
             if finding.kind in SPANS and finding.channel in ("", channel):
                 word, colour = SPANS[finding.kind]

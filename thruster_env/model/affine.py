@@ -1,4 +1,4 @@
-"""Affine models x' = A x + B u + a, z = C x + d, and affine approximations of nonlinear ones."""
+"""Affine models x' = A x + B u + a, z = C x + D u + d, and affine approximations of nonlinear ones."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ from thruster_env.model.state_space import StateSpaceModel
 
 
 @makes_functions
-def affine_functions(n: int, m: int, p: int) -> dict[str, Callable]:
-    """Functions of an affine model whose constants c are A, B, a, C, d in this order, matrices by rows."""
-    starts = starts_of(n * n, n * p, n, m * n)  # of A, B, a, C, d
-    sizes = {"x": (n,), "u": (p,), "c": (starts[-1] + m,)}
-    if constants_are_array(starts[-1] + m):
+def affine_functions(n: int, m: int, p: int, feeds: bool = False) -> dict[str, Callable]:
+    """Functions of an affine model whose constants c are A, B, a, C, d and, if it feeds, D, matrices by rows."""
+    *starts, last = starts_of(n * n, n * p, n, m * n, m)  # of A, B, a, C, d, D
+    size = last + feeds * m * p
+    sizes = {"x": (n,), "u": (p,), "c": (size,)}
+    if constants_are_array(size):
         del sizes["c"]  # whatever its size, it is an array
 
     def function(name: str, arguments: str, rows: int, matrices: dict, offset: int) -> Callable:
@@ -54,23 +55,30 @@ def affine_functions(n: int, m: int, p: int) -> dict[str, Callable]:
         return source.function(source.matrix(rows, n, lambda i, j: f"c[{i * n + j + first}]"))
 
     a, b, state_offset, c, measurement_offset = starts
+    fed, terms = ("x, u, c", {"u": (last, p)}) if feeds else ("x, c", {})
     return {
         "transition": function("transition", "x, u, c", n, {"x": (a, n), "u": (b, p)}, state_offset),
-        "observe": function("observe", "x, c", m, {"x": (c, n)}, measurement_offset),
+        "observe": function("observe", fed, m, {"x": (c, n), **terms}, measurement_offset),
         "transition_jacobian": slopes("transition_jacobian", "x, u, c", n, a),
-        "observe_jacobian": slopes("observe_jacobian", "x, c", m, c),
+        "observe_jacobian": slopes("observe_jacobian", fed, m, c),
     }
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AffineModel(StateSpaceModel):
-    """A `StateSpaceModel` with f(x, u) = A x + B u + a and h(x) = C x + d; make it with `affine_model`."""
+    """A `StateSpaceModel` with f = A x + B u + a and h = C x + d or C x + D u + d; make it with `affine_model`."""
 
     def matrices(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """A (n, n), B (n, p), a (n,), C (m, n), d (m,)."""
         n, m, p = self.n, self.m, self.inputs
-        parts = np.split(np.array(self.constants), np.cumsum([n * n, n * p, n, m * n]))
+        parts = np.split(np.array(self.constants), np.cumsum([n * n, n * p, n, m * n, m]))
         return parts[0].reshape(n, n), parts[1].reshape(n, p), parts[2], parts[3].reshape(m, n), parts[4]
+
+    @property
+    def feedthrough(self) -> np.ndarray | None:
+        """D (m, p) of z = C x + D u + d; None if h does not take the input."""
+        size = self.m * self.inputs
+        return np.array(self.constants[-size:]).reshape(self.m, self.inputs) if self.feeds and size else None
 
 
 LETTERS = {
@@ -119,6 +127,7 @@ def affine_model(
     measurement_noise_cov,
     prior_mean,
     prior_cov,
+    d=None,
     state_offset=None,
     measurement_offset=None,
     states=None,
@@ -129,8 +138,9 @@ def affine_model(
 
         x' = A x + B u + state_offset + w,  w ~ N(0, Q);   z = C x + measurement_offset + v,  v ~ N(0, R)
 
-    Covariances are per step and do not scale with dt. Arguments may also be named F or A, B or G, H or C, Q, R, x0
-    and P0: `affine_model(F=F, H=H, Q=Q, R=R, P0=P0)`.
+    With D, z_{k+1} = C x_{k+1} + D u_k + measurement_offset + v, the input until then: see `StateSpaceModel`.
+    Covariances are per step and do not scale with dt. Arguments may also be named F or A, B or G, H or C, D, Q, R,
+    x0 and P0: `affine_model(F=F, H=H, Q=Q, R=R, P0=P0)`.
 
     Args:
         a: A, (n, n).
@@ -140,6 +150,7 @@ def affine_model(
         measurement_noise_cov: R, (m, m) or m variances.
         prior_mean: mean of the initial state, (n,); zero by default.
         prior_cov: covariance of the initial state, (n, n) or n variances.
+        d: D, (m, p); none if None.
         state_offset: (n,), zero if None.
         measurement_offset: (m,), zero if None.
         states: names and units of the states, as `StateSpaceModel` takes them.
@@ -155,33 +166,46 @@ def affine_model(
         raise ValueError(
             f"a, b, c must have shapes (n, n), (n, p), (m, n), but got {a.shape}, {b.shape}, {c.shape}"
         )
+    if d is not None:
+        d = np.atleast_2d(np.array(d, dtype=np.float64))
+        if d.shape != (m, p):
+            raise ValueError(f"d must have shape (m, p) = {(m, p)}, as c and b say, but got {d.shape}")
+    feeds = d is not None and p > 0
     offset = vector("state_offset", [0.0] * n if state_offset is None else state_offset, n)
     shift = vector("measurement_offset", [0.0] * m if measurement_offset is None else measurement_offset, m)
     prior_mean = vector("prior_mean", prior_mean, n)
     measurement_noise_cov = covariance("measurement_noise_cov", measurement_noise_cov, m)
     return AffineModel(
-        **affine_functions(n, m, p),
+        **affine_functions(n, m, p, feeds),
         process_noise_cov=process_noise_cov,
         measurement_noise_cov=measurement_noise_cov,
         prior_mean=prior_mean,
         prior_cov=prior_cov,
         inputs=p,
-        constants=tuple(float(v) for part in (a, b, offset, c, shift) for v in np.ravel(part)),
+        constants=tuple(float(v) for part in (a, b, offset, c, shift, *([d] * feeds)) for v in np.ravel(part)),
         states=states,
         input_quantities=input_quantities,
         measurements=measurements,
     )
 
 
-def _slopes_by_input(model: StateSpaceModel, x: Any, scales: Any, u: np.ndarray) -> np.ndarray:
-    """df/du of one application of f, (n, p), by central differences; inputs of zero have the scale 1."""
+def _slopes_by_input(
+    model: StateSpaceModel,
+    function: Callable,
+    rows: int,
+    angles: tuple[bool, ...],
+    x: Any,
+    scales: Any,
+    u: np.ndarray,
+) -> np.ndarray:
+    """df/du of one application of f, or dh/du, (rows, p), by central differences; a zero input has the scale 1."""
     of_inputs, c = np.where(u == 0, 1.0, np.abs(u)), model.given_constants
     far = step_growth(model.n + model.inputs)((*x, *u), (*scales, *of_inputs))
-    columns = np.zeros((model.inputs, model.n))
+    columns = np.zeros((model.inputs, rows))
     for j, unit in enumerate(np.eye(model.inputs)):
         h = step_of(float(u[j]), float(of_inputs[j]), far)
-        above, below = (model.functions.transition(x, as_value(u + side * unit), c) for side in (h, -h))
-        columns[j] = difference(np.array(above), np.array(below), model.shape.state_angles) / (2.0 * h)
+        above, below = (function(x, as_value(u + side * unit), c) for side in (h, -h))
+        columns[j] = difference(np.array(above), np.array(below), angles) / (2.0 * h)
     return columns.T
 
 
@@ -207,10 +231,12 @@ def slopes_of_step(
     a, b, point = np.eye(model.n), np.zeros((model.n, model.inputs)), as_value(x)
     scales, v, c = as_value(model.scales), as_value(u), model.given_constants
     functions = functions or model.functions
-    slopes = transition_slopes(functions, model.shape)
+    slopes, angles = transition_slopes(functions, model.shape), model.shape.state_angles
     for _ in range(model.substeps):
         f = np.array(slopes(point, scales, v, c)).reshape(a.shape)
-        a, b = f @ a, f @ b + (_slopes_by_input(model, point, scales, u) if by_input else 0.0)
+        a, b = f @ a, f @ b
+        if by_input:
+            b = b + _slopes_by_input(model, functions.transition, model.n, angles, point, scales, u)
         point = functions.transition(point, v, c)
     return a, b, np.array(point)
 
@@ -220,7 +246,8 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
 
         x' = f(x*, u*) + A (x - x*) + B (u - u*),   z = h(x*) + C (x - x*)
 
-    with the Jacobians A = df/dx, B = df/du (over all substeps) and C = dh/dx at x*, u*.
+    with the Jacobians A = df/dx, B = df/du (over all substeps) and C = dh/dx at x*, u*. If h takes the input,
+    z = h(x*, u*) + C (x - x*) + D (u - u*) with D = dh/du.
 
     Args:
         model: the model; an affine one is returned as it is.
@@ -234,13 +261,21 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
         return model
     x, u, c = np.array(state, dtype=np.float64), np.array(control, dtype=np.float64), model.given_constants
     a, b, point = slopes_of_step(model, x, u, by_input=True)
-    h = np.array(observation_slopes(model.functions, model.shape)(as_value(x), as_value(model.scales), c))
+    shape, functions, scales = model.shape, model.functions, as_value(model.scales)
+    fed = shape.fed(as_value(u))
+    h = np.array(observation_slopes(functions, shape)(as_value(x), scales, *fed, c)).reshape(model.m, model.n)
+    offset, d = np.array(functions.observe(as_value(x), *fed, c)) - h @ x, None
+    if shape.feeds:
+        angles = shape.measurement_angles
+        d = _slopes_by_input(model, functions.observe, model.m, angles, as_value(x), scales, u)
+        offset -= d @ u
     return affine_model(
         a=a,
         b=b,
         c=h,
+        d=d,
         state_offset=point - a @ x - b @ u,
-        measurement_offset=np.array(model.functions.observe(as_value(x), c)) - h @ x,
+        measurement_offset=offset,
         process_noise_cov=model.process_noise_cov,
         measurement_noise_cov=model.measurement_noise_cov,
         prior_mean=model.prior_mean,

@@ -50,7 +50,7 @@ def called_function(
 
     Args:
         function: of x, perhaps u, and constants c, or its Jacobian.
-        arguments: their names, "x, u, c" or "x, c".
+        arguments: their names, "x, u, c" or, of h without input, "x, c".
         sizes: number of components of each argument.
         form: of the constants, their NamedTuple class, or how many there are in a tuple.
         shape: of the result, which is an array if it is large: (count,), or (rows, columns) of a tuple of rows.

@@ -26,7 +26,7 @@ from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import jacobian, runge_kutta
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import tuple_of, written_out
-from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.state_space import StateSpaceModel, takes_input
 
 # Process noise at another sample time.
 
@@ -117,13 +117,15 @@ class ContinuousModel:
 
         dx/dt = rates(x, u, c) + w(t),  E[w(t) w(s)'] = S delta(t - s);   z = h(x, c) + v,  v ~ N(0, R)
 
+    or z = h(x, u, c) + v, with the input until then.
+
     `rates(x, u, c)` takes and returns tuples, as the functions of a `StateSpaceModel`; the constants c are a
     NamedTuple with a field `substep`, the length of a Runge-Kutta step [s], which `at` sets.
 
     Attributes:
         rates: dx/dt without noise.
-        observe: h, without noise, which returns a tuple; or a function h_i(x, c) of each channel by its symbol,
-            which returns a number: {"position": ..., "depth": ...}.
+        observe: h, without noise, which returns a tuple; or a function h_i(x, c), or h_i(x, u, c), of each channel
+            by its symbol, which returns a number: {"position": ..., "depth": ...}.
         densities: S, (n, n) or n numbers, in the square of each state's unit per second.
         constants: of rates and h.
         arguments: the other fields of `StateSpaceModel`: R, prior, quantities, operating point and the like; also
@@ -283,6 +285,8 @@ def _check_constants(constants: Any) -> None:
 
 @makes_functions
 def _joint_observation(functions: tuple[Callable, ...]) -> Callable:
-    """`observe(x, c)` of a function h_i(x, c) a channel."""
+    """`observe(x, c)` of a function h_i(x, c) a channel; `observe(x, u, c)` if one of them takes the input."""
     names: dict[str, Any] = {f"h_{i}": inlined(function) for i, function in enumerate(functions)}
-    return written_out("observe", "x, c", tuple_of(f"{name}(x, c)" for name in names), **names)
+    arguments = ["x, u, c" if takes_input(function) else "x, c" for function in functions]
+    calls = (f"{name}({of_channel})" for name, of_channel in zip(names, arguments, strict=True))
+    return written_out("observe", max(arguments, key=len), tuple_of(calls), **names)

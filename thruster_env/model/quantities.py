@@ -76,7 +76,7 @@ class Quantities(NamedTuple):
 
 
 def count_of(names: Any) -> int:
-    """The number of components for some quantities or names; one by default."""
+    """The number of components for some quantities or names; one if they are no list."""
     return len(names) if _are_several(names) else 1
 
 

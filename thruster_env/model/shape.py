@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from thruster_env.core import matrices
 from thruster_env.core.angles import with_wrapped_angles
 from thruster_env.core.checks import covariance_root
+from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import jacobian
 from thruster_env.core.equal_functions import first_equal
 from thruster_env.core.sources import tuple_of, written_out
@@ -28,11 +29,26 @@ class Shape(NamedTuple):
     state_angles: tuple[bool, ...]  # (n,), which states wrap at 2 pi
     measurement_angles: tuple[bool, ...]  # (m,), which measurements do
     step_ratio: bool = False  # whether the last input is one, by which pages multiply Q: `steps.in_any_steps`
+    feeds: bool = False  # whether h takes the input: h(x, u, c)
 
     @property
     def constants(self) -> int:
         """Number of the model's constants."""
         return self.form if isinstance(self.form, int) else len(getattr(self.form, "_fields", ()))
+
+    @property
+    def feed(self) -> int:
+        """Number of inputs that h takes: all, or none."""
+        return self.inputs if self.feeds else 0
+
+    def fed(self, u: Any) -> tuple:
+        """The arguments of h between x and the constants: the input u, or none."""
+        return (u,) if self.feeds else ()
+
+    @property
+    def observe_arguments(self) -> str:
+        """Those of h besides x."""
+        return "u, c" if self.feeds else "c"
 
 
 class Functions(NamedTuple):
@@ -66,9 +82,18 @@ def transition_slopes(functions: Functions, shape: Shape) -> Callable:
 
 
 def observation_slopes(functions: Functions, shape: Shape) -> Callable:
-    """Return `slopes(x, scales, c)`: dh/dx, (m, n)."""
+    """Return `slopes(x, scales, c)`, or of an h with input `slopes(x, scales, u, c)`: dh/dx, (m, n)."""
     h, analytic = functions.observe, functions.observe_jacobian
-    return jacobian(h, analytic, shape.m, shape.n, "c", shape.measurement_angles)
+    return jacobian(h, analytic, shape.m, shape.n, shape.observe_arguments, shape.measurement_angles)
+
+
+@lru_cache(maxsize=64)
+def for_any_input(function: Callable, shape: Shape, arguments: str = "x") -> Callable:
+    """The function h of (x, u, c), or its slopes (x, scales, u, c), whether it takes the input or not."""
+    if shape.feeds:
+        return function
+    lines = f"function({arguments}, c)"
+    return written_out("seen", f"{arguments}, u, c", lines, function=inlined(function))
 
 
 # Places of a model's numbers in the float64 row that compiled code reads.

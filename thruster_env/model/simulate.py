@@ -17,8 +17,13 @@ from thruster_env.core.compiled import (
 )
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.core.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
-from thruster_env.model.shape import Functions, Shape, constants_reader, number_offsets, padded
+from thruster_env.model.shape import Functions, Shape, constants_reader, for_any_input, number_offsets, padded
 from thruster_env.model.state_space import StateSpaceModel
+
+
+def inputs_until(inputs: np.ndarray) -> np.ndarray:
+    """The input that acts until each row, (..., K + 1, p), of inputs (..., K, p): none before the first step."""
+    return np.concatenate((np.zeros_like(inputs[..., :1, :]), inputs), axis=-2)
 
 
 class Truth(NamedTuple):
@@ -56,7 +61,7 @@ def noise_step(n: int, m: int):
 
 @lru_cache(maxsize=64)
 def truth_steps(functions: Functions, shape: Shape):
-    """Functions begin(x, draws, key, numbers), advance(x, u, draws, step, key, numbers), measure(z, x, ...).
+    """Functions begin(x, draws, key, numbers), advance(x, u, draws, step, key, numbers), measure(z, x, u, ...).
 
     They work on arrays x (n,), u (inputs,), z (m,), draws with room for GROUP multiples, key (2,).
     """
@@ -66,6 +71,7 @@ def truth_steps(functions: Functions, shape: Shape):
     r_root, disturb = source.r_root, noise_step(n, m)
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
+    look = for_any_input(observe, shape)
 
     @inlined
     def begin(x, draws, key_0, key_1, numbers):
@@ -82,8 +88,8 @@ def truth_steps(functions: Functions, shape: Shape):
         disturb(x, draws, step, key_0, key_1, numbers)
 
     @inlined
-    def measure(z, x, draws, step, key_0, key_1, numbers):
-        store_measurement(z, observe(state(x), constants(numbers)))
+    def measure(z, x, u, draws, step, key_0, key_1, numbers):
+        store_measurement(z, look(state(x), control(u), constants(numbers)))
         fill_normals(draws, m, step, MEASUREMENT, key_0, key_1)
         add_correlated(z, numbers, r_root, m, draws)
 
@@ -108,12 +114,14 @@ def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
         for b in range(keys.shape[0]):
             key_0, key_1 = keys[b, 0], keys[b, 1]
             begin(x, draws, key_0, key_1, numbers)
+            for i in range(u.shape[0]):
+                u[i] = 0.0
             for k in range(states.shape[1]):
                 if k > 0:
                     for i in range(u.shape[0]):
                         u[i] = inputs[b, k - 1, i]
                     advance(x, u, draws, k, key_0, key_1, numbers)
-                measure(z, x, draws, k, key_0, key_1, numbers)
+                measure(z, x, u, draws, k, key_0, key_1, numbers)
                 for i in range(n):
                     states[b, k, i] = x[i]
                 for i in range(m):
@@ -144,6 +152,8 @@ def simulate(model: StateSpaceModel, keys: np.ndarray, inputs: np.ndarray) -> Tr
     """Simulate a model with its own noise, one trajectory for every key.
 
         x_{k+1} = f(x_k, u_k) + w_k,  w_k ~ N(0, Q);   z_k = h(x_k) + v_k,  v_k ~ N(0, R);   x_0 ~ N(mean, cov)
+
+    If h takes the input, z_{k+1} = h(x_{k+1}, u_k) + v_{k+1} and z_0 = h(x_0, 0) + v_0.
 
     The same keys give the same noise as in the plant, so that an exact model gives the plant's trajectories.
     Angles are not wrapped: filters and errors (`thruster_env.core.angles.difference`) wrap them.

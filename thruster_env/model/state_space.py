@@ -44,11 +44,16 @@ class StateSpaceModel:
 
     Covariances are per step and do not scale with dt: a model of another sample time needs its own Q (and R).
 
-    The functions are `transition(x, u, c)`, `observe(x, c)` and, if known, their Jacobians. They take and return
-    tuples of components, Jacobians as tuples of rows (n rows of n, m rows of n), and may use the parameters of the
-    model, `constants` c. They are plain Python: loops, arrays, dataclasses and a few branches become machine
-    code wherever the model is used (`thruster_env.model.called`). What cannot runs as Python, and a warning says
-    why.
+    A measurement that also depends on the input of its instant, as a cell's voltage does on its current, has
+    h(x, u, c) in place of h(x, c). An input acts until the end of its step, and so on the measurement there:
+
+        z_{k+1} = h(x_{k+1}, u_k) + v;   z_0 = h(x_0, 0) + v,  because no input acts before the first step
+
+    The functions are `transition(x, u, c)`, `observe(x, c)` or `observe(x, u, c)` and, if known, their Jacobians,
+    which take the same. They take and return tuples of components, Jacobians as tuples of rows (n rows of n, m
+    rows of n), and may use the parameters of the model, `constants` c. They are plain Python: loops, arrays,
+    dataclasses and a few branches become machine code wherever the model is used (`thruster_env.model.called`).
+    What cannot runs as Python, and a warning says why.
 
     Above 36 states or inputs, or 96 constants in a plain tuple, x, u or c is an array of float64 and not a tuple;
     it is complex if a Jacobian is computed by complex steps (`np.empty_like(x)` makes another such array). It is
@@ -60,17 +65,18 @@ class StateSpaceModel:
 
     Attributes:
         transition: f, or one of its `substeps` equal parts: the function is applied `substeps` times in a step.
-        observe: h, without noise.
+        observe: h, without noise; with three arguments it takes the input, too.
         process_noise_cov: Q, (n, n) or n variances, per step.
         measurement_noise_cov: R, (m, m) or m variances, of each measurement; positive definite.
         prior_mean: mean of the initial state, (n,).
         prior_cov: covariance of the initial state, (n, n) or n variances; zero allowed.
-        inputs: number p of inputs; as many as `input_quantities` if None, or one.
+        inputs: number p of inputs; if None as many as `input_quantities`, and without these none, or one if f does
+            not work without.
         constants: a NamedTuple (or tuple) of floats that is passed to every function.
         transition_jacobian: df/dx(x, u, c) of one application, finite at the prior mean. If None it follows from f
             exactly, where f consists of arithmetic, functions of `math` or numpy and a few branches, or else by
             central differences.
-        observe_jacobian: dh/dx(x, c), in the same way.
+        observe_jacobian: dh/dx(x, c) or dh/dx(x, u, c), in the same way.
         analytic: whether f and h are analytic functions that take complex numbers: Jacobians that are None are
             then found by complex steps, exactly (`derivatives.complex_step`).
         substeps: number of applications of `transition` per step.
@@ -132,21 +138,24 @@ class StateSpaceModel:
             "process_noise_cov": covariance("process_noise_cov", self.process_noise_cov, n),
             "measurement_noise_cov": covariance("measurement_noise_cov", r, m, positive_definite=True),
             "substeps": at_least("substeps", self.substeps, 1, 10_000),
-            "inputs": at_least(
-                "inputs", count_of(self.input_quantities) if self.inputs is None else self.inputs, 0
-            ),
             "constants": checked_constants(self.constants),
         }
+        inputs = self.inputs
+        if inputs is None:
+            unnamed = self.input_quantities is None
+            inputs = _needed_inputs(self, checked) if unnamed else count_of(self.input_quantities)
+        checked["inputs"] = at_least("inputs", inputs, 0)
         sizes = {"operating_state": n, "operating_input": checked["inputs"], "state_low": n, "state_high": n}
         for name, size in sizes.items():
             if getattr(self, name) is not None:
                 checked[name] = vector(name, getattr(self, name), size)
         if self.analytic:
             checked["transition_jacobian"] = self._exact("transition", n, n, "u, c")
-            checked["observe_jacobian"] = self._exact("observe", len(checked["measurement_noise_cov"]), n, "c")
+            checked["observe_jacobian"] = self._exact("observe", m, n, "u, c" if self.feeds else "c")
         checked["states"] = quantities("states", self.states, n, "x", "prior_mean")
-        inputs = quantities("input_quantities", self.input_quantities, checked["inputs"], "u", "inputs, or b,")
-        checked["input_quantities"] = inputs
+        checked["input_quantities"] = quantities(
+            "input_quantities", self.input_quantities, checked["inputs"], "u", "inputs, or b,"
+        )
         checked["measurements"] = quantities("measurements", self.measurements, m, "z", "measurement_noise_cov")
         checked["outputs"] = outputs(self.outputs)
         if self.positions is not None:
@@ -182,19 +191,30 @@ class StateSpaceModel:
         """Number of measurements."""
         return len(self.measurement_noise_cov)
 
+    @cached_property
+    def feeds(self) -> bool:
+        """Whether h takes the input: measurements have feed-through."""
+        return takes_input(self.observe)
+
     @property
     def shape(self) -> Shape:
         """Sizes of the model, and other data needed to compile its code."""
         states, channels = (
             tuple(quantity.angle for quantity in part) for part in (self.states, self.measurements)
         )
-        return Shape(self.n, self.m, self.inputs, constants_form(self.constants), states, channels)
+        form = constants_form(self.constants)
+        return Shape(self.n, self.m, self.inputs, form, states, channels, feeds=self.feeds)
 
     @property
     def functions(self) -> Functions:
         """The model's functions, ready for compiled code: large results are always arrays."""
         n, m, slopes = self.n, self.m, first_equal((self.transition_jacobian, self.observe_jacobian))
-        form, sizes = self.shape.form, (n, self.inputs, len(self.constants))
+        shape = self.shape
+        form, sizes, arguments_of_h = (
+            shape.form,
+            (n, self.inputs, len(self.constants)),
+            f"x, {shape.observe_arguments}",
+        )
 
         def ready(function: Callable | None, arguments: str, *shape: int) -> Any:
             if function is None or by_complex_step(function):
@@ -204,8 +224,8 @@ class StateSpaceModel:
         return Functions(
             ready(first_equal(self.transition), "x, u, c", n),
             ready(slopes[0], "x, u, c", n, n),
-            ready(first_equal(self.observe), "x, c", m),
-            ready(slopes[1], "x, c", m, n),
+            ready(first_equal(self.observe), arguments_of_h, m),
+            ready(slopes[1], arguments_of_h, m, n),
         )
 
     @property
@@ -226,7 +246,7 @@ class StateSpaceModel:
     @property
     def _has_more(self) -> bool:
         """Whether a subclass checks or keeps more than the fields: it may depend on covariances, too."""
-        names = {attribute.name for attribute in dataclasses.fields(self)} | {"digest"}
+        names = {attribute.name for attribute in dataclasses.fields(self)} | {"digest", "feeds"}
         return type(self).__post_init__ is not StateSpaceModel.__post_init__ or not vars(self).keys() <= names
 
     def _with_noise(self, changes: Mapping[str, Any]) -> Self:
@@ -295,6 +315,21 @@ class StateSpaceModel:
         return scales_of(self)
 
 
+def _needed_inputs(model, checked: Mapping[str, Any]) -> int:
+    """The number of inputs of a model that does not say: none if f works without, else one."""
+    constants = checked["constants"]
+    c = np.array(constants) if constants_are_array(constants_form(constants)) else constants
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model.transition(*with_floats(float, [as_value(checked["prior_mean"].tolist()), (), c]))
+    except (IndexError, TypeError, ValueError) as error:
+        return 0 if str(error).startswith("math ") else 1  # "math domain error" is one of the state
+    except Exception:  # which is said later
+        return 0
+    return 0
+
+
 def checked_constants(constants) -> tuple:
     """Return constants as a NamedTuple, as it is given, or a tuple of floats; raise ValueError for others."""
     try:
@@ -311,14 +346,14 @@ def checked_constants(constants) -> tuple:
 
 def check_functions(model) -> None:
     """Raise ValueError unless a model's f and h, and their Jacobians if given, have the shapes of its numbers."""
-    n, m = model.n, model.m
+    n, m, arguments_of_h = model.n, model.m, "x, u, c" if model.feeds else "x, c"
     states, measured = _count(n, "state"), _count(m, "measurement")
     by_states, by_noise = f"as prior_mean has {n}", f"as measurement_noise_cov is {m} x {m}"
     rules = {
         "transition": ("x, u, c", (n,), f"a tuple{_or_array(n)} of {states}, {by_states}"),
-        "observe": ("x, c", (m,), f"a tuple{_or_array(m)} of {measured}, {by_noise}"),
+        "observe": (arguments_of_h, (m,), f"a tuple{_or_array(m)} of {measured}, {by_noise}"),
         "transition_jacobian": ("x, u, c", (n, n), f"{_count(n, 'row')} of {n}, {by_states}"),
-        "observe_jacobian": ("x, c", (m, n), f"{_count(m, 'row')} of {n}, {by_noise}"),
+        "observe_jacobian": (arguments_of_h, (m, n), f"{_count(m, 'row')} of {n}, {by_noise}"),
     }
     for name, (arguments, shape, rule) in rules.items():
         function = getattr(model, name)
@@ -358,10 +393,35 @@ def _check_arguments(name: str, function: Callable, arguments: str) -> None:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # some are written in C
         return
+    if not _takes(signature, arguments):
+        known = "(x, c) or (x, u, c)" if name == "observe" else f"({arguments})"
+        raise ValueError(f"{name} must be a function of {known}, but takes {signature}")
+
+
+def takes_input(observe: Callable) -> bool:
+    """Whether h is one of (x, u, c) and not of (x, c)."""
+    try:
+        signature = inspect.signature(observe)
+    except (TypeError, ValueError):  # what is written in C
+        return False
+    return _takes(signature, "x, u, c") and not _takes(signature, "x, c")
+
+
+def refuse_feed(model: StateSpaceModel, what: str) -> None:
+    """Raise ValueError for a model whose h takes the input."""
+    if model.feeds:
+        raise ValueError(
+            f"{what} must have measurements of the state alone, h(x, c), but the model has h(x, u, c): "
+            "use a filter such as 'ekf', 'ukf', 'enkf' or 'mhe'"
+        )
+
+
+def _takes(signature: inspect.Signature, arguments: str) -> bool:
     try:
         signature.bind(*arguments.split(", "))
     except TypeError:
-        raise ValueError(f"{name} must be a function of ({arguments}), but takes {signature}") from None
+        return False
+    return True
 
 
 def _place(function: Callable) -> str:
@@ -393,7 +453,12 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
                 continue
             sizes = f"{_count(model.n, 'state')}{_form(model.n)} and {_count(model.inputs, 'input')}"
             where = _place(function)
-            raise ValueError(f"{name}{where} must work for {sizes}, but raised {error_line(error)}") from error
+            more = (
+                ": inputs=, or input_quantities=, says how many there are" if isinstance(error, IndexError) else ""
+            )
+            raise ValueError(
+                f"{name}{where} must work for {sizes}, but raised {error_line(error)}{more}"
+            ) from error
         result_shape = _shape(result)
         if result_shape != shape:
             raise ValueError(f"{name} must return {rule}, but returned {_said(result_shape, result)}")
@@ -460,7 +525,7 @@ def digest_of(model: StateSpaceModel) -> str:
         "sizes": (model.n, model.inputs, model.m, model.substeps),
         "constants": constants,
         "transition": _values(model.transition, model, (model.n, model.inputs)),
-        "observe": _values(model.observe, model, (model.n,)),
+        "observe": _values(model.observe, model, (model.n, model.inputs) if model.feeds else (model.n,)),
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:LENGTH]
 

@@ -30,7 +30,7 @@ def traced_model(functions: Functions, shape: Shape, partly: bool = False) -> tu
     """
     f, by_f, h, by_h = functions
     make: Callable = traced_if_possible if partly else Traced
-    return make(f, by_f, 2, shape), make(h, by_h, 1, shape)
+    return make(f, by_f, "motion", shape), make(h, by_h, "sight", shape)
 
 
 def traced_function(function: Callable, *about) -> TracedFunction:
@@ -141,10 +141,11 @@ class Traced:
         of_points: the function and its slope at each column of a matrix.
     """
 
-    def __init__(self, function: Callable, jacobian: Callable | None, input_count: int, shape: Shape):
-        self._input_count = input_count
-        sizes = (shape.n, shape.inputs, shape.constants) if input_count == 2 else (shape.n, shape.constants)
-        rows = shape.n if input_count == 2 else shape.m
+    def __init__(self, function: Callable, jacobian: Callable | None, which: str, shape: Shape):
+        moves = which == "motion"
+        self._input_count = 2 if moves or shape.feeds else 1
+        sizes = (shape.n, shape.inputs, shape.constants) if self._input_count == 2 else (shape.n, shape.constants)
+        rows = shape.n if moves else shape.m
         self._function = traced_function(function, sizes, shape.form, (rows,))
         self._jacobian = None
         if jacobian is not None and not by_complex_step(jacobian):

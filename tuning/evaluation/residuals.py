@@ -19,7 +19,7 @@ from thruster_env.core.angles import difference
 from thruster_env.core.checks import correlation_flaws
 from thruster_env.core.compiled import function_fingerprint, is_interpreting
 from thruster_env.core.sources import vector_reader, vector_writer
-from thruster_env.model.shape import Functions, Shape, constants_reader, number_offsets
+from thruster_env.model.shape import Functions, Shape, constants_reader, for_any_input, number_offsets
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import within
 from tuning.problems.check import data_of
@@ -378,7 +378,7 @@ def _is_regular(cov: np.ndarray) -> bool:
 @lru_cache(maxsize=64)
 def _steps(functions: Functions, shape: Shape, interpreting: bool):
     """The function steps(states, inputs, numbers, expected, outputs) that evaluates f and h along true states."""
-    n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
+    n, m, transition, observe = shape.n, shape.m, functions.transition, for_any_input(functions.observe, shape)
     substeps = number_offsets(n, m).substeps
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
@@ -388,10 +388,12 @@ def _steps(functions: Functions, shape: Shape, interpreting: bool):
         fingerprint  # noqa: B018 - part of the cache's key
         x, z, u, c = np.zeros(n), np.zeros(m), np.zeros(inputs.shape[2]), constants(numbers)
         for b in range(states.shape[0]):
+            for i in range(u.shape[0]):
+                u[i] = 0.0  # no input acts before the first step
             for k in range(states.shape[1]):
                 for i in range(n):
                     x[i] = states[b, k, i]
-                store_measurement(z, observe(state(x), c))
+                store_measurement(z, observe(state(x), control(u), c))
                 for i in range(m):
                     outputs[b, k, i] = z[i]
                 if k < expected.shape[1]:

@@ -196,6 +196,11 @@ class WithConstants:
     form: type | None
     own: int
 
+    @property
+    def __signature__(self) -> inspect.Signature:
+        """The function's own: h may take the input."""
+        return inspect.signature(self.function)
+
     def __call__(self, *arguments):
         """What the function returns; constants may be Numbers."""
         *variables, constants = arguments

@@ -18,6 +18,7 @@ from thruster_env.core.files import BLUE, DARK, RUST, panels
 from thruster_env.core.sources import as_value
 from thruster_env.core.text_tables import verbatim
 from thruster_env.logs.log import Log
+from thruster_env.model.simulate import inputs_until
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.objective import climb
 from tuning.identification.result import Identification
@@ -240,6 +241,10 @@ def _less_predicted(model: StateSpaceModel, runs: Data, estimates: Estimates, hi
     """Measurements minus their prediction from the estimates, if some channels are hidden; else zeros."""
     if not hidden.any():
         return np.zeros_like(runs.measurements)
-    observe, c = model.functions.observe, model.given_constants
-    predicted = [[observe(as_value(x), c) for x in means] for means in estimates.means.tolist()]
+    observe, c, fed = model.functions.observe, model.given_constants, model.shape.fed
+    inputs = inputs_until(runs.inputs)
+    predicted = [
+        [observe(as_value(x), *fed(as_value(u)), c) for x, u in zip(*run, strict=True)]
+        for run in zip(estimates.means.tolist(), inputs.tolist(), strict=True)
+    ]
     return difference(runs.measurements, np.array(predicted), model.shape.measurement_angles)

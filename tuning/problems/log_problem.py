@@ -16,7 +16,7 @@ from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.findings import OUTLIERS, has_outliers, remarks_on
 from thruster_env.logs.findings import outliers as rows_of_outliers
-from thruster_env.logs.log import Log, as_rows, in_any_steps
+from thruster_env.logs.log import Log, as_rows, in_any_steps, seen_by
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
@@ -237,7 +237,8 @@ class LogProblem(AssumedProblem):
         runs = []
         for run in longest:
             log, (first, rows) = self.logs[run], pieces[run]
-            inputs, measurements = log.inputs[first : first + rows - 1], log.measurements[first : first + rows]
+            inputs = log.inputs[first : first + rows - 1]
+            measurements = seen_by(self.model(), log.measurements[first : first + rows])
             runs.append((filter_keys((run,)), inputs[None], measurements[None]))
         return runs
 
@@ -299,7 +300,8 @@ class LogProblem(AssumedProblem):
         model, rows, blocks = self.model(), self.steps + 1, [self.parts.blocks[seed] for seed in seeds]
         slices = [(block.run, slice(block.first, block.first + block.rows)) for block in blocks]
         inputs = padded([self.logs[run].inputs[part][: rows - 1] for run, part in slices], rows - 1, None)
-        measurements = padded([self.logs[run].measurements[part] for run, part in slices], rows)
+        measured = [seen_by(model, self.logs[run].measurements[part]) for run, part in slices]
+        measurements = padded(measured, rows)
         counted = mask_of([block.rows for block in blocks], rows)
         data = Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, counted=counted)
         if self._states is None:

@@ -147,6 +147,25 @@ end
 end
 """
 
+FED = (  # of a model whose h takes the input: its text in place of that of others
+    (
+        "z, u) updates with what was measured (NaN: missing), z, which",
+        "z, u, before) updates with z, measured (NaN:\n%   missing) under the input until then, before, which",
+    ),
+    ("where u is given it then", "where u is not empty it then"),
+    ("(x, P, z, u)\n%{shout}", "(x, P, z, u, before)\n%{shout}"),
+    ("x = m.x0; P = m.P0;\n%   for", "x = m.x0; P = m.P0; before = zeros({inputs_count}, 1);\n%   for"),
+    ("(x, P, z(:, k));", "(x, P, z(:, k), [], before);"),
+    ("[x, P] = {name}(x, P, [], u(:, k)); end", "before = u(:, k); [x, P] = {name}(x, P, [], before); end"),
+    (
+        "correct(o, z(:, k)); predict(o, u(:, k)); end",
+        "correct(o, z(:, k), before); before = u(:, k); predict(o, before); end",
+    ),
+    ("m.h(x)", "m.h(x, before)"),
+    ("slopes(m.h, x)", "slopes(@(y) m.h(y, before), x)"),
+    ("if nargin > 3\n", "if nargin > 3 && ~isempty(u)\n"),
+)
+
 
 def matlab_function(choice: Choice, model: StateSpaceModel, problem: str, dt: float | None) -> str:
     """The text of NAME.m, whose function gives a tuned filter's model and, of a Kalman filter, its step.
@@ -163,7 +182,9 @@ def matlab_function(choice: Choice, model: StateSpaceModel, problem: str, dt: fl
     except ValueError as error:
         pieces, fields, why = "", [], str(error)
     steps = choice.name in STEPPED and pieces and (choice.name == "ekf" or isinstance(model, AffineModel))
-    head = HEAD + (STEP if steps else TOOLBOX if pieces else "")
+    head, update = HEAD + (STEP if steps else TOOLBOX if pieces else ""), UPDATE
+    for plain, fed in FED if model.feeds else ():
+        head, update = head.replace(plain, fed), update.replace(plain, fed)
     text = head.format(
         name=name,
         shout=name.upper(),
@@ -173,9 +194,10 @@ def matlab_function(choice: Choice, model: StateSpaceModel, problem: str, dt: fl
         states=_listed(model.states),
         inputs=_listed(model.input_quantities),
         measurements=_listed(model.measurements),
+        inputs_count=model.inputs,
     )
     if not pieces:
-        text = text.replace(": m.f(x, u), m.h(x), ", ": ")
+        text = text.replace(": m.f(x, u), m.h(x), ", ": ").replace(": m.f(x, u), m.h(x, before), ", ": ")
         text += (
             f"%   f and h are code that cannot be written out: m.f and m.h are yours to add.\n%   Why: {why}.\n"
         )
@@ -190,7 +212,7 @@ def matlab_function(choice: Choice, model: StateSpaceModel, problem: str, dt: fl
     return (
         text
         + (
-            UPDATE.replace("{wrap}", wrap)
+            update.replace("{wrap}", wrap)
             if steps
             else "error('the step of this filter is not written out');\nend\n"
         )
@@ -210,22 +232,28 @@ def _functions(model: StateSpaceModel) -> tuple[str, list[str]]:
         a, b, offset, c, shift = model.matrices()
         transition = f"y = {_matrix(a)} * x + {_matrix(offset[:, None])}"
         transition += f" + {_matrix(b)} * u(:);" if model.inputs else ";"
-        read = f"z = {_matrix(c)} * x + {_matrix(shift[:, None])};"
+        d = model.feedthrough
+        read = f"z = {_matrix(c)} * x + {_matrix(shift[:, None])}"
+        read += ";" if d is None else f" + {_matrix(d)} * u(:);"
         fields = [f"m.A = {_matrix(a)};", f"m.B = {_matrix(b)};", f"m.C = {_matrix(c)};"]
-        return (
-            f"\nfunction y = transition(x, u)\n{transition}\nend\n\nfunction z = measurement(x)\n{read}\nend\n",
-            fields,
-        )
+        fields += [] if d is None else [f"m.D = {_matrix(d)};"]
+        return _written(transition, read, model), fields
     x, u = [f"x({i + 1})" for i in range(model.n)], [f"u({i + 1})" for i in range(model.inputs)]
     f = lines_of(model.transition, (x, u), model.constants, model.n)
-    h = lines_of(model.observe, (x,), model.constants, model.m)
+    h = lines_of(model.observe, (x, *model.shape.fed(u)), model.constants, model.m)
     if max(len(f), len(h)) > LONGEST:
         raise ValueError(f"f and h must have at most {LONGEST} lines, but they have {len(f)} and {len(h)}")
     substep = "\n".join(f"    {line}" for line in (*f[:-1], f"x = {f[-1]};"))
     loop = f"for part = 1:{model.substeps}\n{substep}\nend\ny = x;"
     measurement = "\n".join((*h[:-1], f"z = {h[-1]};"))
-    text = f"\nfunction y = transition(x, u)\n{loop}\nend\n\nfunction z = measurement(x)\n{measurement}\nend\n"
+    text = _written(loop, measurement, model)
     return text + CHOOSE * ("choose(" in text), []
+
+
+def _written(transition: str, measurement: str, model: StateSpaceModel) -> str:
+    arguments = "x, u" if model.feeds else "x"
+    head = f"\nfunction y = transition(x, u)\n{transition}\nend\n"
+    return f"{head}\nfunction z = measurement({arguments})\n{measurement}\nend\n"
 
 
 def _matrix(values: np.ndarray) -> str:

@@ -18,6 +18,8 @@ from thruster_env.core.files import BLUE, GREY, RUST, new_figure, save_figure, t
 from thruster_env.core.sources import as_value
 from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.model.quantities import Quantity
+from thruster_env.model.shape import observation_slopes
+from thruster_env.model.simulate import inputs_until
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data
@@ -35,7 +37,6 @@ TALL, LOW = 2.0, 1.3  # relative heights of panels of values and of errors ...
 UNIT, UNIT_OF_MANY = 8.0 / 6.6, 0.9  # ... in so many inches, for up to two states and for more
 HEIGHT = 1.5  # of a panel [inch]
 DASHES = ("-", "--", ":", "-.")
-STEP = 1e-6  # of a central difference, in standard deviations
 
 
 # Axes of panels over time: limits from the scored steps, so that a start-up does not flatten the rest.
@@ -385,7 +386,8 @@ def gains(filter_: Filter, data: Data, index: int) -> np.ndarray:
     """
     filtered, model = one_run(filter_, data, index, None), filter_.model
     means, covs = filtered.estimates.means[0], filtered.estimates.covs[0]
-    slopes = np.stack([_slopes(model, mean) for mean in means])  # (K + 1, m, n)
+    acting = inputs_until(data.one(index).inputs[0])
+    slopes = np.stack([_slopes(model, mean, u) for mean, u in zip(means, acting, strict=True)])  # (K + 1, m, n)
     products = slopes @ covs.transpose(0, 2, 1)  # H P', (K + 1, m, n)
     found_gains = np.linalg.solve(model.measurement_noise_cov, products).transpose(0, 2, 1)
     found_gains[np.isnan(data.one(index).measurements[0]).all(axis=1)] = np.nan
@@ -420,23 +422,13 @@ def draw_gains(filters: Mapping[str, Filter], data: Data, index: int, dt: float 
     return figure
 
 
-def _slopes(model: StateSpaceModel, mean: np.ndarray) -> np.ndarray:
-    """Slopes of the measurements by the states at an estimate, (m, n)."""
+def _slopes(model: StateSpaceModel, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Slopes of the measurements by the states at an estimate and the input until then, (m, n)."""
     if not np.isfinite(mean).all():
         return np.full((model.m, model.n), np.nan)
-    functions, c = model.functions, model.given_constants
-    if functions.observe_jacobian is not None:
-        return np.array(functions.observe_jacobian(as_value(mean.tolist()), c), dtype=float).reshape(
-            model.m, model.n
-        )
-    columns = []
-    for i, step in enumerate(STEP * model.scales):
-        sides = [
-            np.array(functions.observe(as_value((mean + s * step * np.eye(model.n)[i]).tolist()), c))
-            for s in (1, -1)
-        ]
-        columns.append((sides[0] - sides[1]) / (2 * step))
-    return np.stack(columns, axis=-1).reshape(model.m, model.n)
+    slopes, fed = observation_slopes(model.functions, model.shape), model.shape.fed(as_value(u.tolist()))
+    h = slopes(as_value(mean.tolist()), as_value(model.scales), *fed, model.given_constants)
+    return np.array(h, dtype=float).reshape(model.m, model.n)
 
 
 def _over(state: Quantity, channel: Quantity) -> str:

@@ -67,7 +67,7 @@ def test_there_are_as_many_inputs_as_have_names(names):
     model = decay(input_quantities=names)
     assert model.inputs == len(names) and [one.name for one in model.input_quantities] == names
     assert model.replace(prior_mean=[1.0]).inputs == len(names)
-    assert decay().inputs == 1
+    assert decay().inputs == 0
     with pytest.raises(ValueError, match="input_quantities must be 3 quantities or names, as inputs, or b, says"):
         decay(inputs=3, input_quantities=names)
 

@@ -198,6 +198,7 @@ def model_of(transition, **changes):
         "measurement_noise_cov": [0.1],
         "prior_mean": [1.0],
         "prior_cov": [0.1],
+        "inputs": 1,
     }
     return StateSpaceModel(**arguments | changes)
 
