@@ -8,6 +8,7 @@ thrust T [N] from their values at the operating point. No input acts on the thru
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -49,8 +50,6 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
 
     Raises ValueError if no steady state is found.
     """
-    from scipy.optimize import brentq
-
     c = derive_constants(p, ambient_velocity)
     if voltage == 0 and ambient_velocity == 0:
         return SteadyState(0.0, 0.0, 0.0)
@@ -66,7 +65,7 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
     # U_a = -U_p turns the attack angle past zero lift for every preset, so the root lies between.
     if not imbalance(0.0) * imbalance(20.0 * c.blade_speed) < 0:
         raise ValueError(f"blade_angle must allow a steady state, but got {p.blade_angle}")
-    ratio = brentq(imbalance, 0.0, 20.0 * c.blade_speed, xtol=1e-16)
+    ratio = _bisected(imbalance, 0.0, 20.0 * c.blade_speed)
     load = c.load_gain * forces(ratio)[1]
     drive = c.voltage_gain * abs(voltage)
     # load omega^2 + K1 omega - K2 |V| = 0, in the form that survives load -> 0
@@ -83,6 +82,14 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
             raise ValueError(f"voltage {voltage} V at {ambient_velocity} m/s has no steady state that was found")
         x = solution.x
     return SteadyState(float(x[0]), float(x[1]), float(thrust_and_torque((float(x[0]), float(x[1])), c)[0]))
+
+
+def _bisected(function: Callable[[float], float], low: float, high: float) -> float:
+    """The number between two at which a function changes its sign; importing SciPy would take longer."""
+    rises = function(high) > 0.0
+    while low < (middle := 0.5 * (low + high)) < high:
+        low, high = (low, middle) if (function(middle) > 0.0) == rises else (middle, high)
+    return middle
 
 
 def state_range(p: ThrusterParameters, max_voltage: float) -> np.ndarray:
