@@ -177,7 +177,9 @@ def from_control(
     system = system.to_ss() if hasattr(system, "to_ss") and not hasattr(system, "A") else system
     a, b, c, d = _attributes(system, "a state space, as of python-control or scipy.signal", "A", "B", "C", "D")
     if d.any():
-        raise ValueError(f"D must be zero, for the filter predicts before it knows u, but got {d.tolist()}")
+        raise ValueError(
+            f"D must be zero, but got {d.tolist()}: affine_model(d=) takes the D of the input until then"
+        )
     n, own_dt = len(a), getattr(system, "dt", None)
     g = np.eye(n) if noise_input is None else as_floats(noise_input).reshape(n, -1)
     q = g @ covariance("process_noise_cov", process_noise_cov, g.shape[1]) @ g.T

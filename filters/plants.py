@@ -1,4 +1,4 @@
-"""Nonlinear models that users bring: vehicles in a plane, a pendulum, a motor, a tank, a heated room.
+"""Nonlinear models that users bring: vehicles in a plane, a pendulum, a motor, a tank, a heated room, a battery.
 
 Each function makes a `ContinuousModel` of a few physical numbers; `.at(dt)` is its model of a sample time:
 
@@ -17,7 +17,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from thruster_env.core.checks import one_of, positive
+import numpy as np
+
+from thruster_env.core.checks import one_of, positive, short_repr
+from thruster_env.core.equal_functions import makes_functions
 from thruster_env.model.continuous import ContinuousModel
 
 GRAVITY = 9.81  # [m/s^2]
@@ -398,12 +401,91 @@ def rc_thermal(
     )
 
 
+class Cell(NamedTuple):
+    """Numbers of a battery's cell."""
+
+    capacity: float
+    series: float
+    polarisation: float
+    time_constant: float
+    substep: float
+
+
+# Of a lithium cell with a cathode of nickel, manganese and cobalt: charge, and voltage at rest [V].
+OPEN_CIRCUIT = (
+    *((0.0, 3.0), (0.05, 3.35), (0.1, 3.45), (0.2, 3.55), (0.3, 3.6), (0.4, 3.64), (0.5, 3.7)),
+    *((0.6, 3.8), (0.7, 3.9), (0.8, 4.0), (0.9, 4.08), (1.0, 4.18)),
+)
+
+
+def _discharging(x, u, c):
+    return (-u[0] / (3600.0 * c.capacity), (c.polarisation * u[0] - x[1]) / c.time_constant)
+
+
+@makes_functions
+def _terminal_voltage(charges: tuple[float, ...], voltages: tuple[float, ...]) -> Callable:
+    def observe(x, u, c):
+        return (np.interp(x[0], charges, voltages) - x[1] - c.series * u[0],)
+
+    return observe
+
+
+def battery(
+    capacity: float = 2.5,
+    series: float = 0.03,
+    polarisation: float = 0.02,
+    time_constant: float = 30.0,
+    charge_drift: float = 1e-5,
+    voltage_drift: float = 1e-4,
+    voltage_std: float = 5e-3,
+    open_circuit: Sequence[tuple[float, float]] = OPEN_CIRCUIT,
+) -> ContinuousModel:
+    """A cell with one pair of resistance and capacitance, whose current is the input, positive in discharge.
+
+        s' = -i/C + w_s,  v' = (R_1 i - v)/T + w_v;   z = E(s) - v - R_0 i
+
+    Args:
+        capacity: C [A h].
+        series: R_0 [ohm].
+        polarisation: R_1 [ohm].
+        time_constant: T [s].
+        charge_drift: root density of w_s [1/sqrt(s)].
+        voltage_drift: root density of w_v [V/sqrt(s)].
+        voltage_std: deviation of the voltmeter [V].
+        open_circuit: E, pairs of charge and voltage [V] in ascending order, linear between them: your cell's.
+
+    Raises:
+        ValueError: unless charges and voltages ascend.
+
+    Source: Plett (2015), Battery Management Systems, volume 1, sections 2.3 to 2.5.
+    """
+    charges, voltages = zip(*((float(s), float(v)) for s, v in open_circuit), strict=True)
+    if len(charges) < 2 or (np.diff([charges, voltages]) <= 0.0).any():
+        raise ValueError(f"open_circuit must ascend in charge and voltage, but got {short_repr(open_circuit)}")
+    return ContinuousModel(
+        rates=_discharging,
+        observe=_terminal_voltage(charges, voltages),
+        densities=[charge_drift**2, voltage_drift**2],
+        constants=Cell(positive("capacity", capacity), series, polarisation, time_constant, 1.0),
+        longest=0.2 * positive("time_constant", time_constant),
+        arguments={
+            "prior_mean": [0.5, 0.0],
+            "prior_cov": [0.1, 1e-3],
+            "measurement_noise_cov": [voltage_std**2],
+            "states": [("charge", "s", ""), ("overvoltage", "v", "V")],
+            "input_quantities": [("current", "i", "A")],
+            "measurements": [("terminal voltage", "z", "V")],
+        },
+    )
+
+
 PLANTS: Mapping[str, Callable[..., ContinuousModel]] = {
     "coordinated-turn": coordinated_turn,
     "unicycle": unicycle,
     "bicycle": bicycle,
     "pendulum": pendulum,
     "dc-motor": dc_motor,
+    "battery": battery,
     "tank": tank,
     "rc-thermal": rc_thermal,
 }

@@ -16,6 +16,7 @@ CASES = {  # an input, a state, and the rates there by hand
     "bicycle": ([2.0, 0.1], [0.0, 0.0, 0.3], [2 * math.cos(0.3), 2 * math.sin(0.3), 2 * math.tan(0.1) / 2.7]),
     "pendulum": ([0.7], [0.5, -0.2], [-0.2, -9.81 * math.sin(0.5) + 0.02 + 0.7]),
     "dc-motor": ([3.0], [0.1, 5.0], [5.0, (30.0 - 5.0 - 0.5 * math.tanh(5.0)) / 0.1]),
+    "battery": ([2.0], [0.5, 0.03], [-2.0 / 9000.0, (0.04 - 0.03) / 30.0]),
     "tank": ([0.02], [1.5], [0.02 - 0.01 * math.sqrt(2 * 9.81 * 1.5)]),
     "rc-thermal": ([2000.0, 5.0], [21.0], [((5.0 - 21.0) / 0.005 + 2000.0) / 5e6]),
 }
@@ -42,6 +43,15 @@ def test_range_and_bearing_are_those_from_the_sensor():
         assert model.measurements[1].angle and plant.arguments["measurement_noise_cov"][1] == 1e-4
     with pytest.raises(ValueError, match="sensors must be one of position, range-bearing"):
         plants.unicycle(sensors="radar")
+
+
+def test_the_voltage_of_a_battery_is_that_of_its_table_and_current():
+    plant = plants.battery(open_circuit=[(0.0, 3.0), (1.0, 4.0)])
+    model = plant.at(1.0)
+    assert model.observe((0.25, 0.1), (2.0,), model.constants)[0] == pytest.approx(3.25 - 0.1 - 0.06, rel=1e-12)
+    assert model.functions == plants.battery(open_circuit=[(0.0, 3.0), (1.0, 4.0)]).at(1.0).functions
+    with pytest.raises(ValueError, match="open_circuit must ascend"):
+        plants.battery(open_circuit=[(0.0, 3.0), (0.5, 2.9)])
 
 
 def test_noise_has_the_density_of_what_it_moves():
