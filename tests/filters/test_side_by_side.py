@@ -42,7 +42,7 @@ def test_blocks_that_are_full_or_not_hold_the_same_estimates(kind):
 
 @pytest.mark.parametrize("name", slow_but(FILTERS, ("ekf", "enkf", "pf", "imm")))
 def test_filters_need_no_numba(name, monkeypatch):
-    monkeypatch.setattr("thruster_env.graphs.loops.code_of", lambda module, *names, unrolled: names)
+    monkeypatch.setattr("thruster_env.graphs.loops.code_of", lambda module, *names, **options: names)
     kernels = make_filter(name, thruster_model()).kernels()
     entries = ("call",) if kernels.vectors else ("call", "run")
     assert engine._code_one_by_one.__wrapped__(kernels) == entries
@@ -61,7 +61,7 @@ def test_numba_compiles_the_same_loops_where_code_cannot_be_linked(monkeypatch):
 
     linked, refused = results(), []
 
-    def refuse(module, *names, unrolled=True):
+    def refuse(module, *names, **options):
         refused.extend(names)
         raise NotLinked("Symbols not found: [ cos ]")
 

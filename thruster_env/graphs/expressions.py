@@ -14,7 +14,7 @@ from llvmlite import ir  # type: ignore[import-untyped]
 
 from thruster_env.core.compiled import FASTMATH, instead_of
 from thruster_env.core.optimising import WIDE
-from thruster_env.core.streams import fill_in_loop, fill_normals
+from thruster_env.core.streams import fill_normals
 from thruster_env.graphs.arithmetic import BOOL, FUNCTIONS, Arithmetic, Untranslated, as_value, is_known
 from thruster_env.graphs.forms import Array, Known, common_form, form_of, value_of
 from thruster_env.graphs.instructions import DOUBLE, LONG, LoopWriter, Writer
@@ -22,6 +22,7 @@ from thruster_env.graphs.programs import OF_MEMBERS, cut
 
 LONGEST = 4096  # numbers of an array that a function makes for itself, on the stack
 POINTER = DOUBLE.as_pointer()
+FILL_NORMALS = "fill_normals"
 
 
 class Functions(dict):
@@ -29,9 +30,10 @@ class Functions(dict):
 
     Attributes:
         programs_apart: whether programs are never inlined: within a loop they would take other last digits.
+        draws: whether normals are drawn, by machine code that all modules share.
     """
 
-    programs_apart = True
+    programs_apart, draws = True, False
 
 
 class Expressions:
@@ -415,8 +417,13 @@ class Expressions:
         return module.globals.get(name) or ir.Function(module, ir.FunctionType(*kinds), name)
 
     def _fill_normals(self, out: Array, count: Any, *counter_and_key: Any) -> None:
-        """Fill an array, by the same instructions for all streams."""
-        self.call(fill_in_loop, (out, count, *map(as_value, counter_and_key)))
+        if out.steps != (1,):
+            raise Untranslated("normals in a part of an array")
+        self._functions.draws, module = True, self._builder.module
+        kind = ir.FunctionType(ir.VoidType(), [POINTER, LONG, *[DOUBLE] * len(counter_and_key)])
+        function = module.globals.get(FILL_NORMALS) or ir.Function(module, kind, FILL_NORMALS)
+        numbers = self.numbers.as_whole(count), *map(self.numbers.as_float, counter_and_key)
+        self._builder.call(function, [out.pointer, *numbers])
 
     def _length(self, value: Any) -> Any:
         return value.shape[0] if isinstance(value, Array) else len(value)

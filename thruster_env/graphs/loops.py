@@ -28,10 +28,11 @@ from llvmlite import ir  # type: ignore[import-untyped]
 
 from thruster_env.core.compiled import CompiledOrPython, is_interpreting
 from thruster_env.core.optimising import WIDE
+from thruster_env.core.streams import fill_in_loop
 from thruster_env.graphs.arithmetic import Untranslated, is_known
-from thruster_env.graphs.expressions import POINTER, Expressions, Functions
+from thruster_env.graphs.expressions import FILL_NORMALS, POINTER, Expressions, Functions
 from thruster_env.graphs.forms import changing_form, common_form, has_array
-from thruster_env.graphs.instructions import LONG
+from thruster_env.graphs.instructions import DOUBLE, LONG
 from thruster_env.graphs.machine_code import Code, NotLinked, add_builtin, code_folder, code_of, function_of
 
 
@@ -73,9 +74,25 @@ def common_code_of(*entries: Entry, unrolled: bool = True) -> Code | None:
     except TypeError:
         return None
     try:
-        return code_of(module, *names, unrolled=unrolled)
+        libraries = [_library_of_normals()] if functions.draws else []
+        return code_of(module, *names, unrolled=unrolled, libraries=libraries)
     except NotLinked:  # numba brings the function that is lacking
         return None
+
+
+@cache
+def _library_of_normals() -> Code:
+    """`streams.fill_normals` for all modules, whose instructions would take a third of the time of a kernel."""
+    module = ir.Module()
+    kind = ir.FunctionType(ir.VoidType(), [POINTER, LONG, *[DOUBLE] * 4])
+    target = ir.Function(module, kind, FILL_NORMALS)
+    builder = ir.IRBuilder(target.append_basic_block())
+    out, count, *counter_and_key = target.args
+    translator = _Translator(builder, Functions())
+    translator.call(fill_in_loop, (translator.array_at(out, [count]), count, *counter_and_key))
+    builder.ret_void()
+    set.add(target.attributes, WIDE)
+    return code_of(module, FILL_NORMALS)
 
 
 def add_function(

@@ -60,9 +60,14 @@ class NotLinked(RuntimeError):
 class Code:
     """Machine code in memory, for as long as this object lives."""
 
-    def __init__(self, object_code: bytes, names: Iterable[str]):
-        """Link object code; `names` are those of the functions to be called."""
+    def __init__(self, object_code: bytes, names: Iterable[str], libraries: Iterable[Code] = ()):
+        """Link object code; `names` are those of the functions to be called, which may call those of libraries."""
         builder = llvm.JITLibraryBuilder().add_object_img(object_code).add_current_process()
+        self.addresses: dict[str, int] = {}
+        self._libraries = [*libraries]  # which live as long
+        for library in self._libraries:
+            for name, address in library.addresses.items():
+                builder.import_symbol(name, address)
         for name in names:
             builder.export_symbol(name)
         for symbol in OF_PYTHON:
@@ -72,12 +77,13 @@ class Code:
             self._library = builder.link(linker, f"code {next(_number)}")
         except RuntimeError as error:
             raise NotLinked(str(error)) from error
-        self.addresses = {name: self._library[name] for name in names}
+        self.addresses.update((name, self._library[name]) for name in names)
 
 
-def code_of(module: ir.Module, *names: str, unrolled: bool = True) -> Code:
+def code_of(module: ir.Module, *names: str, unrolled: bool = True, libraries: Iterable[Code] = ()) -> Code:
     """Compile a module, or load its object code, unless it is in memory; `names` are the functions to be called.
 
+    What it calls and does not contain must be in libraries, or in this process.
     Loops are unrolled, or not: those whose bodies are wide vectors gain nothing, and take three times as long to
     compile.
 
@@ -88,7 +94,9 @@ def code_of(module: ir.Module, *names: str, unrolled: bool = True) -> Code:
     with _compiling:
         code = _loaded.get(digest)
         if code is None:
-            code = _loaded[digest] = Code(_kept(digest) or _keep(digest, _compiled(text, unrolled)), names)
+            code = _loaded[digest] = Code(
+                _kept(digest) or _keep(digest, _compiled(text, unrolled)), names, libraries
+            )
     return code
 
 

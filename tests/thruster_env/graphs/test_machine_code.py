@@ -165,7 +165,7 @@ def test_whole_numbers_are_divided_as_in_python(b):
 
 
 def test_what_cannot_be_linked_is_left_to_numba(monkeypatch):
-    def refuse(module, *names, unrolled=True):
+    def refuse(module, *names, **options):
         raise NotLinked("Symbols not found: [ cos ]")
 
     assert machine_code_of(count_up, [(None,), None]) is not None
