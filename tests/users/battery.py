@@ -3,7 +3,7 @@
     s' = -i/C,   v_1' = i/C_1 - v_1/(R_1 C_1),   v_2' likewise;   z = E(s) - v_1 - v_2 - R_0 i,
     E(s) = -1.031 exp(-35 s) + 3.685 + 0.2156 s - 0.1178 s^2 + 0.3201 s^3
 
-A measurement sees the state alone, so the current of the step before is a fourth state, without noise.
+The current of the step before is a fourth state, without noise; h(x, u, c) would need none.
 
 What I had: the published constants, a Q of a tenth of a per cent of charge a step, a voltmeter of 1 mV. The cell
 has aged: an eighth of its capacity is gone, R_0 has grown by a third. The current sensor is off by 10 mA and the
