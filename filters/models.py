@@ -39,7 +39,7 @@ class Scales(NamedTuple):
     roughness: float  # the most that noise can be: by the differences of that order in which they vary least
     dt: float  # [s]
     duration: float  # [s]
-    frequency: float  # of the highest peak of the spectrum [Hz]
+    frequencies: tuple[float, ...]  # of the highest peaks of the spectrum [Hz]
 
 
 class Free(NamedTuple):
@@ -50,13 +50,13 @@ class Free(NamedTuple):
     unit: str  # U is the data's unit
     range: Callable[[Scales], tuple[float, float]]
     starts: int = 1  # how many values of the range a search begins from, at equal ratios
-    start: Callable[[Scales], float] | None = None  # the value of a single one; the middle of the range if None
+    start: Callable[[Scales], Sequence[float]] | None = None  # these values, in place of equal ratios
 
     def values(self, scales: Scales) -> list[float]:
         """Values from which a search begins."""
         low, high = self.range(scales)
         if self.start is not None:
-            return [min(max(self.start(scales), low), high)]
+            return [min(max(value, low), high) for value in self.start(scales)]
         return np.geomspace(low, high, self.starts + 2)[1:-1].tolist()
 
 
@@ -119,7 +119,7 @@ def _density(name: str, meaning: str, power: int) -> Free:
 
 
 def _std(name: str, meaning: str) -> Free:
-    return Free(name, meaning, "U", lambda s: (1e-4 * s.spread, 1e3 * s.spread), start=lambda s: s.spread)
+    return Free(name, meaning, "U", lambda s: (1e-4 * s.spread, 1e3 * s.spread), start=lambda s: [s.spread])
 
 
 TIME_CONSTANT = Free(
@@ -134,7 +134,7 @@ FREQUENCY = Free(
     "natural frequency",
     "Hz",
     lambda s: (0.5 / s.duration, 0.5 / s.dt),
-    start=lambda s: s.frequency,
+    start=lambda s: s.frequencies,
 )
 DAMPING = Free("damping", "damping ratio", "", lambda s: (1e-4, 2.0), starts=3)
 

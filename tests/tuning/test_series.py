@@ -330,7 +330,11 @@ def test_wrong_numbers_are_refused_in_one_line(z, options, message):
 
 
 def test_every_start_lies_in_its_range():
-    sizes = (1e-6, 1e-7, 1e-3, 10.0, 80.0), (5e4, 1e2, 3600.0, 1e8, 1e-4), (1.0, 0.5, 1.0, 30.0, 0.5)
+    sizes = (
+        (1e-6, 1e-7, 1e-3, 10.0, (80.0, 90.0)),
+        (5e4, 1e2, 3600.0, 1e8, (1e-4,)),
+        (1.0, 0.5, 1.0, 30.0, (0.5,)),
+    )
     for scales in (Scales(*size) for size in sizes):
         for number in (number for model in NAMED.values() for number in model.free):
             low, high = number.range(scales)

@@ -24,6 +24,7 @@ from thruster_env.model.state_space import StateSpaceModel
 
 LEAST_ROWS = 20  # with a number
 MOST_AXES = 6
+WIDTHS, PEAKS = (1, 5, 21), 2  # by how many points a spectrum is smoothed, and how many of its peaks are tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +69,11 @@ class Column:
 
     @cached_property
     def scales(self) -> Scales:
-        """The spread of the data, root mean squares of the axes, their times and strongest frequency."""
+        """The spread of the data, root mean squares of the axes, their times and strongest frequencies."""
         spreads, duration = np.nanstd(self.table, axis=0), self.dt * (len(self.values) - 1)
         roughness = [_roughness(*axis) for axis in zip(self.table.T, spreads.tolist(), strict=True)]
-        peak = _peak(self.table[:, int(spreads.argmax())], self.dt)
-        return Scales(_root_mean_square(spreads), _root_mean_square(roughness), self.dt, duration, peak)
+        peaks = _peaks(self.table[:, int(spreads.argmax())], self.dt)
+        return Scales(_root_mean_square(spreads), _root_mean_square(roughness), self.dt, duration, peaks)
 
     def axis(self, index: int) -> Column:
         """One axis alone."""
@@ -207,10 +208,20 @@ def _root_mean_square(values: Any) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _peak(values: np.ndarray, dt: float) -> float:
-    """Frequency of the highest peak of the spectrum [Hz], without the trend; missing numbers lie on the trend."""
+def _peaks(values: np.ndarray, dt: float) -> tuple[float, ...]:
+    """Frequencies of the highest peaks of the spectrum [Hz], as it is for sharp ones, smoothed for wide ones.
+
+    The trend is taken off; missing numbers lie on it.
+    """
     rows, known = np.arange(len(values)), ~np.isnan(values)
     trend = np.polynomial.Polynomial.fit(rows[known], values[known], 1)(rows)
     filled = np.where(known, values - trend, 0.0)
     power = np.abs(np.fft.rfft(filled * np.hanning(len(filled)))) ** 2
-    return float(np.fft.rfftfreq(len(filled), dt)[1 + int(np.argmax(power[1:]))])
+    frequencies, peaks = np.fft.rfftfreq(len(filled), dt)[1:], []
+    for width in WIDTHS:
+        smooth = np.convolve(power[1:], np.ones(width) / width, "same")[: len(frequencies)]
+        for _ in range(PEAKS):
+            highest = int(np.argmax(smooth))
+            peaks.append(float(frequencies[highest]))
+            smooth[max(highest - 2 * width, 0) : highest + 2 * width + 1] = 0.0
+    return tuple(dict.fromkeys(peaks))
