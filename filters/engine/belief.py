@@ -35,7 +35,7 @@ import numpy as np
 
 from thruster_env.core.angles import angle_writer
 from thruster_env.core.checks import ROUNDING, as_floats, at_least, covariance, short_repr
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
 from thruster_env.core.sources import Source, matrix_reader, matrix_writer, vector_reader, vector_writer
 from thruster_env.core.streams import truncated_normal
 from thruster_env.model.quantities import Bound
@@ -442,7 +442,9 @@ def constrained(
 
 
 @lru_cache(maxsize=64)
-def _constrain_rows(n: int, bounds: tuple[Bound, ...], bounded_by: str, interpreting: bool) -> CompiledOrPython:
+def _constrain_rows(n: int, bounds: tuple[Bound, ...], bounded_by: str, interpreting: bool) -> Callable:
+    from thruster_env.graphs.loops import Loops
+
     constrain = _constraint(n, 0, n, bounds, bounded_by)
     fingerprint = function_fingerprint(constrain, within=__name__)
 
@@ -451,7 +453,7 @@ def _constrain_rows(n: int, bounds: tuple[Bound, ...], bounded_by: str, interpre
         for i in range(len(rows)):
             constrain(rows[i])
 
-    return CompiledOrPython(constrain_rows)
+    return Loops(constrain_rows, [(None, n + n * n)])
 
 
 def _constraint(n: int, mean: int, cov: int, bounds: tuple[Bound, ...], bounded_by: str) -> Callable:

@@ -5,6 +5,7 @@ The equations hold over whole steps, by machine code with the model's own Jacobi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -16,7 +17,7 @@ from torch.autograd.function import once_differentiable
 from filters.estimators.estimator import Output
 from filters.tensors.stages import wrapped_where
 from thruster_env.core.checks import as_floats, at_least, one_of
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from thruster_env.core.compiled import function_fingerprint, is_interpreting
 from thruster_env.core.derivatives import jacobian
 from thruster_env.core.sources import matrix_writer, vector_reader, vector_writer
 from thruster_env.core.threads import one_thread
@@ -115,7 +116,9 @@ class _WithSlopes(torch.autograd.Function):
 
 
 @cache
-def _evaluations(functions: Functions, shape: Shape, interpreting: bool) -> tuple[CompiledOrPython, ...]:
+def _evaluations(functions: Functions, shape: Shape, interpreting: bool) -> tuple[Callable, ...]:
+    from thruster_env.graphs.loops import Loops
+
     n, m, (f, by_f, h, by_h) = shape.n, shape.m, functions
     f_slopes = jacobian(f, by_f, n, n, "u, c", shape.state_angles)
     h_slopes = jacobian(h, by_h, m, n, "c", shape.measurement_angles)
@@ -141,7 +144,9 @@ def _evaluations(functions: Functions, shape: Shape, interpreting: bool) -> tupl
             store_measurement(values[b], h(at, c))
             store_h_slopes(slopes[b].reshape(-1), h_slopes(at, size, c))
 
-    return CompiledOrPython(move), CompiledOrPython(measure)
+    arguments = (None, n), (None, shape.inputs), (None,)
+    of_rows = [((None, rows), (None, rows, n)) for rows in (n, m)]
+    return tuple(Loops(work, (*arguments, *out)) for work, out in zip((move, measure), of_rows, strict=True))
 
 
 class Track(NamedTuple):

@@ -168,8 +168,8 @@ class Expressions:
     def _method(self, value: Any, name: str, arguments: list) -> Any:
         if name == "reshape" and isinstance(value, Array):
             shape = arguments[0] if isinstance(arguments[0], tuple) else tuple(arguments)
-            if value.steps[-1] == 1 and len(value.shape) == 1:
-                return self.array_at(value.pointer, shape)
+            if value.steps == self.array_at(value.pointer, value.shape).steps:  # in C order
+                return self.array_at(value.pointer, (self._count(value.shape),) if shape == (-1,) else shape)
         if name == "view" and isinstance(value, ir.Value):
             return self.numbers.bits_as({np.int64: LONG, np.float64: DOUBLE}[arguments[0]], value)
         raise Untranslated(f"the method {name}")
@@ -392,7 +392,7 @@ class Expressions:
 
     def _new_array(self, shape: Any) -> Array:
         sizes, self._makes_arrays = shape if isinstance(shape, tuple) else (shape,), True
-        count = reduce(lambda a, b: self.numbers.of_two("Mult", a, b), sizes)
+        count = self._count(sizes)
         if not is_known(count) or count > LONGEST:
             return self._new_array_on_heap(sizes, count)
         array = self.array_at(self._slot(DOUBLE, max(count, 1)), sizes)
@@ -424,6 +424,9 @@ class Expressions:
         function = module.globals.get(FILL_NORMALS) or ir.Function(module, kind, FILL_NORMALS)
         numbers = self.numbers.as_whole(count), *map(self.numbers.as_float, counter_and_key)
         self._builder.call(function, [out.pointer, *numbers])
+
+    def _count(self, shape: Sequence) -> Any:
+        return reduce(lambda a, b: self.numbers.of_two("Mult", a, b), shape)
 
     def _length(self, value: Any) -> Any:
         return value.shape[0] if isinstance(value, Array) else len(value)
