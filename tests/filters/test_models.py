@@ -299,7 +299,7 @@ def means():
         prior_mean=[1.0], prior_cov=[1.0],
     )
     nothing = np.full((1, 2, 1), np.nan)
-    return run(ExtendedKalmanFilter(model=model), np.zeros((1, 2)), np.zeros((1, 1, 1)), nothing).means
+    return run(ExtendedKalmanFilter(model=model), np.zeros((1, 2)), np.zeros((1, 1, 0)), nothing).means
 """
 
 

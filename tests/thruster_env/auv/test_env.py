@@ -148,8 +148,8 @@ def test_reward_has_its_four_terms():
 def test_a_pitch_beyond_80_degrees_ends_an_episode(theta, ends):
     env = gym.make("SegorogeniAUV-v0", **EXACT)
     env.reset(seed=0)
-    env.unwrapped._memory[0, 6 + 7, 0] = theta
-    env.unwrapped._memory[0, 6, 0] = 0.0
+    env.unwrapped._copies.memory[0, 6 + 7, 0] = theta
+    env.unwrapped._copies.memory[0, 6, 0] = 0.0
     observation, reward, terminated, *_ = env.step(np.zeros(3))
     assert terminated == ends and np.isfinite(reward) and not np.isnan(observation).any()
 

@@ -87,7 +87,7 @@ def test_the_observation_follows_from_measurements_and_never_from_the_true_posit
     for north in (0.0, 3.0):
         env = gym.make(PATH, sensors=sensors, initial_state={"speed": 1.0}, **noise)
         env.reset(seed=3)
-        env.unwrapped._memory[0, 6 + 9, 0] += north
+        env.unwrapped._copies.memory[0, 6 + 9, 0] += north
         step = [env.step([2.0, 0.05, -0.1]) for _ in range(30)]
         seen.append([one[0] for one in step]), errors.append(step[-1][-1]["path_errors"])
     np.testing.assert_array_equal(seen[0], seen[1])
