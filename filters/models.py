@@ -415,7 +415,7 @@ class Sum(NamedTuple):
             c=np.kron(each, signal.output[None]),
             process_noise_cov=np.kron(each, signal.noise(dt)),
             measurement_noise_cov=[noise] * axes,
-            prior_mean=np.kron(np.broadcast_to(first, axes) - offset, level),
+            prior_mean=np.kron(np.broadcast_to(first, axes) - offset, level) + 0.0,  # no negative zeros
             prior_cov=np.tile((WIDE * spread / dt**orders) ** 2, axes),
             measurement_offset=offset,
             states=states,

@@ -83,7 +83,10 @@ class SeriesFit:
 
     def _gains(self) -> np.ndarray:
         a, _, _, c, _ = self.model.matrices()
-        return steady_state(a, c, self.q, self.model.measurement_noise_cov)[1]
+        axes = self.model.m
+        n = self.model.n // axes  # states of an axis, which are independent of the others
+        gain = steady_state(a[:n, :n], c[:1, :n], self.q[:n, :n], self.model.measurement_noise_cov[:1, :1])[1]
+        return np.kron(np.eye(axes), gain)
 
     @property
     def memory(self) -> float:
