@@ -2,6 +2,7 @@
 
 import math
 import re
+import subprocess
 from typing import NamedTuple
 
 import numpy as np
@@ -20,17 +21,18 @@ from filters import (
     transformed_model,
 )
 from filters.bounds import posterior_bound
+from filters.c.project import write_project
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import findings, verdict
 from filters.sensitivity import likelihood
-from tests.filters.test_c import built, printed
+from tests.filters.test_c import WARNINGS, built, printed
 from tests.slow import slow_but
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.env.model_env import ModelEnv, ModelVectorEnv
 from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.log import as_rows, in_any_steps
 from thruster_env.logs.read import read_log
-from thruster_env.logs.write import write_log
+from thruster_env.logs.write import EXACT, write_columns, write_log
 from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.simulate import inputs_until, simulate
 from tuning.problems.log_problem import LogProblem
@@ -188,6 +190,25 @@ def test_code_in_c_agrees_with_run(name, tmp_path):
     filter_ = make_filter(name, model(), **own(name))
     found = printed(built(filter_, tmp_path), inputs[0], z[0])
     np.testing.assert_allclose(found[:, :2], run(filter_, None, inputs, z).means[0], rtol=1e-9)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_program_in_c_reads_a_log_as_estimate_does(tmp_path):
+    """With a gap, before which the input of the row after it acts, and a missing sample."""
+    present = ~np.isin(np.arange(60), [20, 21])
+    table = {name: values[present] for name, values in cycled(60)[0].items()}
+    table["v_V"][30] = np.nan
+    write_columns(tmp_path / "log.csv", table, EXACT)
+    filter_ = make_filter("ekf", cell())
+    expected = estimate_with(filter_, read_log(tmp_path / "log.csv", cell()))
+    write_project(filter_, tmp_path / "c", "battery", dt=1.0)
+    command = ["gcc", *WARNINGS, "battery.c", "main.c", "-lm", "-o", "battery"]
+    subprocess.run(command, cwd=tmp_path / "c", check=True)
+    with open(tmp_path / "log.csv") as rows:
+        program = [tmp_path / "c" / "battery", "i_A", "v_V"]
+        printed_rows = subprocess.run(program, stdin=rows, capture_output=True, text=True, check=True).stdout
+    means = np.array([line.split(",")[1:5:2] for line in printed_rows.splitlines()[1:]], float)
+    np.testing.assert_allclose(means, expected.means, rtol=1e-9, atol=1e-12)
 
 
 def ocv(s):
