@@ -248,7 +248,7 @@ def test_slopes_along_numbers_that_are_made_of_others_are_found():
     graph = Graph()
     a, b, c = (graph.given(Place("numbers", k)) for k in range(3))
     x = np.array([a - b, -a])
-    found = Traced(folded, None, 1, shape).parts[1](x, None, np.array([c]))
+    found = Traced(folded, None, "measurement", shape).parts[1](x, None, np.array([c]))
     numbers = [graph.number(one) for one in found.ravel()]
     jacobian = values_of(numbers, np.array([[0.7], [0.2], [3.0]])).reshape(found.shape)
     expected = [[-1, 0], [0, -1], [0, 1], [0, 3], [-1, 0], [0, -1]]
@@ -269,6 +269,6 @@ def test_conditions_that_are_added_are_traced():
     )
     graph = Graph()
     numbers = np.array([graph.given(Place("numbers", k)) for k in range(4)])
-    value = Traced(model.transition, None, 2, model.shape).parts[0](numbers[:2], numbers[2:3], numbers[3:])
+    value = Traced(model.transition, None, "motion", model.shape).parts[0](numbers[:2], numbers[2:3], numbers[3:])
     found = values_of([graph.number(one) for one in value], np.array([[0.7], [0.2], [0.0], [0.5]]))
     np.testing.assert_array_equal(found.ravel(), [2.5, 0.2])

@@ -83,7 +83,7 @@ def test_an_ensemble_draws_as_the_batch_of_one_does():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"keys": Z}, "a model with 1 inputs must get them"),
+        ({"keys": Z}, "a model with 1 input must get it"),
         ({"inputs": np.zeros(20), "measurements": Z}, "inputs and measurements must have shapes"),
         (
             {"inputs": np.zeros(39), "measurements": np.stack([Z, Z], axis=1)},
