@@ -1,7 +1,8 @@
 """The machine code of a study's filter types, compiled on several cores before its first trial.
 
-Each type takes a second or more on its first use, on one core. If that turns out to be so, other processes compile
-the last of the types meanwhile, into the cache that all processes of a user share.
+Each type takes some tenths of a second on its first use, on one core, and seconds for a large model. If that turns
+out to be so, other processes compile the last of the types meanwhile, into the cache that all processes of a user
+share.
 """
 
 from __future__ import annotations
