@@ -52,6 +52,11 @@ class Estimates(NamedTuple):
     log_likelihoods: np.ndarray
     divergences: np.ndarray
 
+    @property
+    def stds(self) -> np.ndarray:
+        """Standard deviations of the errors, (B, K + 1, n)."""
+        return np.sqrt(np.diagonal(self.covs, axis1=-2, axis2=-1))
+
 
 def estimates_of(rows: Sequence[tuple], divergences: int) -> Estimates:
     """`Estimates` of one trajectory, from the results of `Session.latest` at each row."""

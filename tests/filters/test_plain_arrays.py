@@ -42,6 +42,7 @@ def test_a_column_is_a_batch_of_one(walk, form):
     single = filters.run(walk, form(Z))
     each_equal(single, batch)
     assert single.means.shape == (40, 2) and single.innovations.shape == (40, 1)
+    assert single.stds[3, 1] == pytest.approx(np.sqrt(single.covs[3, 1, 1])) and single.stds.shape == (40, 2)
     each_equal(
         filters.smooth(walk, form(Z)),
         filters.smooth(walk, inputs=np.zeros((1, 39, 0)), measurements=Z[None, :, None]),

@@ -45,6 +45,7 @@ CANDIDATES = (
 )
 BLOCKS = 20  # of the record, of which half are unseen at a time
 EVIDENCE = 3.0  # log-likelihood by which a simpler model may always be behind the best one
+OF_RETURN = 0.5 * 2.86**2  # the same of a walk behind a model that returns to the mean: Dickey and Fuller's 5 %
 MOST_ROWS = 20_000  # on which models are compared
 SHARES = 0.01, 0.2, 0.9  # R from which searches begin, in squares of the roughness
 SEARCHES = 3
@@ -214,10 +215,12 @@ def _ties(candidate: Candidate, best: Candidate) -> bool:
 
     Sources: Breiman, Friedman, Olshen, Stone (1984), Classification and Regression Trees, section 3.4.3, for the
     standard error; Kass, Raftery (1995), "Bayes factors", Journal of the American Statistical Association 90(430),
-    for the evidence below which no model is preferred.
+    for the evidence below which no model is preferred; Dickey, Fuller (1979), "Distribution of the estimators for
+    autoregressive time series with a unit root", ibid. 74(366): a walk seems to return to the mean of its record.
     """
     loss, error = behind(candidate, best)
-    return loss <= max(error, EVIDENCE)
+    returns = named_model(best.name).about_mean and not named_model(candidate.name).about_mean
+    return loss <= max(error, OF_RETURN if returns else EVIDENCE)
 
 
 def _numbers(fitted: Fitted) -> tuple[Number, ...]:
