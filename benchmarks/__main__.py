@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,10 +14,12 @@ import typer
 from benchmarks.rates import measure_again, rates
 from benchmarks.timing import COLUMNS, Row, check_page, machine, machine_lines, write_page
 from thruster_env.core.checks import one_of
-from thruster_env.core.text_tables import table
+from thruster_env.core.text_tables import Table
 from thruster_env.core.threads import cores
-from tuning.cli.options import JsonOption, SeedOption
-from tuning.cli.output import announce_compilation, check_targets, emit, progress_console
+from tuning.api.markers import OUTPUT, RUNS, WRITTEN, Option, Seed
+from tuning.api.result import Printed
+from tuning.cli.output import progress_console
+from tuning.cli.verbs import command_of
 from tuning.policies.algorithms import check_installed
 
 CAPTION = (
@@ -46,24 +48,22 @@ def rows_of(part: str) -> Callable[[int, bool], Iterator[Row]]:
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
-@app.command()
 def command(
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Few rounds: shows that all runs; the times are rough.")
-    ] = False,
-    part: Annotated[
-        list[str] | None, typer.Option(help=f"Measure these parts only: {', '.join(PARTS)}.", show_default=False)
-    ] = None,
-    page: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the table into a page anew: docs/speed.md.")
-    ] = None,
-    seed: SeedOption = 0,
-    json: JsonOption = None,
-) -> None:
+    quick: Annotated[bool, Option(RUNS)] = False,
+    part: Annotated[Sequence[str], Option(RUNS, choices=PARTS)] = (),
+    page: Annotated[Path | None, Option(OUTPUT, metavar="FILE", file=WRITTEN)] = None,
+    seed: Seed = 0,
+) -> Printed:
     """Measure the speed of env, filters and evaluation beside Gymnasium's, FilterPy's and JAX's, in some minutes.
 
     All is measured in this run, ours and the peer in turns, on an otherwise idle machine if the times are to
     mean much. A goal that is missed prints "no" and fails nothing: times are the machine's as well.
+
+    Args:
+        quick: few rounds: shows that all runs; the times are rough.
+        part: measure these parts only:
+        page: write the table into a page anew: docs/speed.md.
+        seed: seed of all randomness; the same seed gives the same results.
     """
     if importlib.util.find_spec("filterpy") is None:
         raise ValueError(
@@ -77,12 +77,10 @@ def command(
         if quick:
             raise ValueError(f"--quick must go without --page, for its times are rough, but got --page {page}")
         check_page(page)
-    check_targets([page], json)
     # After the checks: they import FilterPy, or Stable-Baselines3.
     measures = [rows_of(name) for name in parts]
     from benchmarks import steps, studies
 
-    announce_compilation()
     rows = []
     with progress_console.status("measuring the machine's arithmetic ...") as status:
         for rows_of_part in measures:
@@ -94,22 +92,22 @@ def command(
         resident = studies.resident_memory(seed, quick)
     seconds_an_operation = {"one core": rates(1), "all cores": rates(cores())}
     facts = machine()
-    speeds = table("Speed, side by side", COLUMNS, [row.cells() for row in rows], caption=CAPTION)
+    speeds = Table("Speed, side by side", COLUMNS, [row.cells() for row in rows], caption=CAPTION)
     memory = [steps.memory_line(), studies.memory_line(resident)]
     if page is not None:
         write_page(page, rows, facts, memory)
-    emit(
-        [speeds, *memory, *machine_lines(facts)],
-        {
-            "rows": [row.as_json() for row in rows],
-            "study_resident_megabytes": resident,
-            "machine": facts,
-            "seconds_an_operation": seconds_an_operation,
-            "seed": seed,
-            "quick": quick,
-        },
-        json,
-    )
+    data = {
+        "rows": [row.as_json() for row in rows],
+        "study_resident_megabytes": resident,
+        "machine": facts,
+        "seconds_an_operation": seconds_an_operation,
+        "seed": seed,
+        "quick": quick,
+    }
+    return Printed([speeds, *memory, *machine_lines(facts)], data)
+
+
+app.command()(command_of(command))
 
 
 def main() -> None:

@@ -28,7 +28,8 @@ from tuning.search import parameters, trials
 from tuning.search import plan as plans
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import oracle_choice
-from tuning.search.study import StudyResult, open_study, quiet_optuna, run_study
+from tuning.search.storage import quiet_optuna
+from tuning.search.study import StudyResult, open_study, run_study
 from tuning.thruster.scenario import Scenario, find_scenario
 
 TRIALS = 200
@@ -44,7 +45,8 @@ WARM_UP = 25  # trials, with the first search of the likeliest Q and R
 IN_A_PROCESS = """
 from tuning.search.plan import Plan
 from tuning.thruster.scenario import find_scenario
-from tuning.search.study import open_study, quiet_optuna, run_study
+from tuning.search.storage import quiet_optuna
+from tuning.search.study import open_study, run_study
 quiet_optuna()
 plan = Plan("enkf", (find_scenario("nominal"),), {seed})
 run_study(open_study("memory", plan, None), plan, {trials})

@@ -37,8 +37,7 @@ from filters.smoothers.smooth import Smoothed, smooth
 from filters.starts import Restarts, RestartWarning, restarts_of, run
 from filters.tensors import torch
 from filters.wrappers import register_filtered_envs
-from thruster_env.core.compiled import may_be_inlined
-from thruster_env.core.modules import when_imported
+from thruster_env.core.modules import may_be_inlined, when_imported
 from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.state_space import StateSpaceModel
 

@@ -3,8 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from thruster_env.core.compiled import may_be_inlined
-from thruster_env.core.modules import when_imported
+from thruster_env.core.modules import may_be_inlined, when_imported
 
 if TYPE_CHECKING:
     from thruster_env.thruster.env import (

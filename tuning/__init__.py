@@ -2,6 +2,7 @@
 
     fit         the model, Q and R of one column of numbers
     tune        find a filter's Q, R and other parameters, and evaluate them on held-out seeds
+    verify      whether the metrics in a tuned file hold
     evaluate    a filter, tuned or not, and its baselines, on seeds that no study saw
     compare     several filters on the same seeds, with paired intervals
     estimate    a filter or a smoother over a recorded log
@@ -10,7 +11,7 @@
     find_problem   a problem by name, of another thruster, or with constants to estimate
     read_logs   recorded runs, with all that one has to know to read them
     report      a page on a tuned filter that any browser shows
-
+    export      a tuned filter as C code
     train_estimator   an estimator with a network, trained on a problem's runs
 
 Each does what the command of its name does, in one call. A problem is a name, such as "mismatch" or "auv:motion",
@@ -28,23 +29,25 @@ if TYPE_CHECKING:
     from tuning.api.estimate import estimate
     from tuning.api.evaluate import evaluate
     from tuning.api.explore import explore
+    from tuning.api.export import export
     from tuning.api.fit import fit
     from tuning.api.identify import identify
     from tuning.api.problems import find_problem
     from tuning.api.read_logs import read_logs
     from tuning.api.report import report
-    from tuning.api.study import SearchSpace, tune
     from tuning.api.train_estimator import train_estimator
+    from tuning.api.tune import SearchSpace, tune
+    from tuning.api.verify import verify
 
 warnings.filterwarnings("ignore", message="IProgress not found")  # tqdm's in notebooks: Optuna imports it, unused
 
-HOMES = {"tune": "study", "SearchSpace": "study", "find_problem": "problems"}  # files of those with another name
 __all__ = [
     "SearchSpace",
     "compare",
     "estimate",
     "evaluate",
     "explore",
+    "export",
     "find_problem",
     "fit",
     "identify",
@@ -52,13 +55,20 @@ __all__ = [
     "report",
     "train_estimator",
     "tune",
+    "verify",
 ]
+OTHER_HOMES = {"SearchSpace": "api.tune", "find_problem": "api.problems"}
+
+
+def home_of(name: str) -> str:
+    """The module of a function."""
+    return f"tuning.{OTHER_HOMES.get(name, f'api.{name}')}"
 
 
 def __getattr__(name: str) -> Any:
     """A function, whose module is imported when it is asked for: `import tuning` alone is light."""
     if name in __all__:
-        return getattr(import_module(f"tuning.api.{HOMES.get(name, name)}"), name)
+        return getattr(import_module(home_of(name)), name)
     raise AttributeError(f"module 'tuning' has no attribute {name!r}")
 
 

@@ -26,7 +26,8 @@ from tuning.problems.data import held_out_seeds
 from tuning.problems.problem import Problem
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
-from tuning.search.study import open_study, quiet_optuna, run_study
+from tuning.search.storage import quiet_optuna
+from tuning.search.study import open_study, run_study
 from tuning.thruster.scenario import Scenario, find_scenario
 
 TRIALS = 50

@@ -18,8 +18,10 @@ from docs.scripts import subplots
 from filters import EstimateState
 from filters.engine.batch import run
 from thruster_env.core.files import BLUE, DARK, RUST, save_figure, write_whole
-from tuning.api.run import Tuning
-from tuning.cli.demo import FILTER, SCENARIO, before_and_after, tune
+from tuning.api.study import Study
+from tuning.api.tune import run_tuning
+from tuning.cli.demo import FILTER, SCENARIO, before_and_after
+from tuning.cli.output import progress_console
 from tuning.exploring.bench import Bench
 from tuning.exploring.page.session import Server, page_of
 from tuning.problems.find import find_problem
@@ -33,17 +35,17 @@ FLOW = 1  # place of the flow velocity in the state
 
 
 @cache
-def demo() -> Tuning:
+def demo() -> Study:
     """The study of `make demo`."""
     folder = Path(tempfile.mkdtemp())
     plan = Plan(FILTER, (find_problem(SCENARIO),), seed=0)
-    return tune(plan, 50, f"{folder}/studies.journal", folder / "tuned.json")
+    return run_tuning(plan, 50, progress_console, f"{folder}/studies.journal", out=folder / "tuned.json")
 
 
 def tuned(path: Path) -> Path:
     """The flow velocity, which nothing measures, on a held-out run: estimate and error before and after tuning."""
     tuning = demo()
-    scenario = tuning.scenario
+    scenario = tuning.problem
     data, unit = scenario.data(tuning.comparison.seeds[:1]), scenario.model().states[FLOW]
     time = scenario.dt * np.arange(data.states.shape[1])
     figure, axes = subplots((10.8, 4.4), 2, 2, sharex=True, sharey="row", height_ratios=(3, 2))
@@ -70,7 +72,7 @@ def thruster(path: Path) -> Path:
     The voltage is the one that would hold the reference in the steady state.
     """
     tuning = demo()
-    sensors = tuning.scenario.plant_arguments["sensors"]
+    sensors = tuning.problem.plant_arguments["sensors"]
     env = gym.make("BowThrusterReversal-v0", render_mode="rgb_array", sensors=sensors)
     env = EstimateState(env, tuned=str(tuning.file))
     top, full = env.unwrapped.plant.max_voltage, env.unwrapped.thrust_scale

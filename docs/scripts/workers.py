@@ -27,8 +27,8 @@ from thruster_env.core.threads import cores
 from tuning.problems.data import Data
 from tuning.search.plan import Plan
 from tuning.search.space import suggest, untuned_choice
-from tuning.search.storage import open_storage
-from tuning.search.study import open_study, quiet_optuna, run_trials
+from tuning.search.storage import open_storage, quiet_optuna
+from tuning.search.study import open_study, run_trials
 from tuning.search.trials import CONSISTENCY, NIS, measure
 from tuning.search.workers import take_share
 from tuning.thruster.scenario import find_scenario

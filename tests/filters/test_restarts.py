@@ -4,7 +4,6 @@ import json
 import math
 import pickle
 import warnings
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import gymnasium as gym
@@ -23,9 +22,6 @@ from tuning.evaluation.evaluate import evaluate, restart_sentences
 from tuning.evaluation.held_out import Comparison, summarised, summary
 from tuning.problems.data import Data
 from tuning.problems.model_problem import RunsProblem
-from tuning.reporting.page import html_page
-from tuning.reporting.search_figures import Sketchbook
-from tuning.reporting.sections import held_out_section
 
 
 class Clock(NamedTuple):
@@ -264,9 +260,7 @@ def test_reports_tell_them_also_of_stored_evaluations():
     quiet = found._replace(restarts=None)
     assert "restarts" not in summary(quiet) and summarised(summary(quiet), problem).restarts is None
     comparison = Comparison(quiet, found, None, bound=np.full(2, np.nan), seeds=range(1, 2))
-    subject = SimpleNamespace(plan=SimpleNamespace(scenarios=[problem]), choice=SimpleNamespace(name="ekf"))
-    section = held_out_section(Sketchbook("p"), subject, [comparison])
-    page = html_page("ekf", "advice", [section])
+    page = " ".join(restart_sentences(comparison.evaluations))
     assert f"tuned: {found.restarts.sentence}" in page and page.count("restarted from the prior") == 1
 
 

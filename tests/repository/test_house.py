@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tuning.problems.plant_packages import PLANT_PACKAGES
+from tuning.problems.find import PLANT_PACKAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = "thruster_env", "filters", "tuning"  # a floor knows those before it
@@ -195,7 +195,7 @@ def test_the_command_line_starts_without_packages_that_learn_policies():
 
 
 def test_training_of_estimators_imports_torch_when_it_is_called():
-    code = "import sys, tuning.api.train_estimator, tuning.cli.train_estimator; print('torch' in sys.modules)"
+    code = "import sys, tuning.api.train_estimator; print('torch' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"
 

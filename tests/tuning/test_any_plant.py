@@ -11,7 +11,7 @@ from filters.consistency.report import NO_TRUTH, sentences
 from filters.engine.batch import run
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
-from tuning.api.held_out import CovarianceCheck
+from tuning.api.held_out import CovarianceCheck, HeldOut
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
 from tuning.evaluation.held_out import Comparison, summary
@@ -21,12 +21,11 @@ from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import score_label
 from tuning.reporting import leaderboard
 from tuning.reporting.choice_words import gains
-from tuning.reporting.leaderboard import comparison_table
+from tuning.reporting.leaderboard import ABOVE, comparison_table
 from tuning.reporting.search_figures import comparison_figure, consistency_figure
 from tuning.reporting.sections import advice, held_out_section
 from tuning.reporting.subject import Subject
-from tuning.reporting.tables import errors_table, numbers_table
-from tuning.reporting.terminal import choice_table
+from tuning.reporting.tables import choice_table
 from tuning.reporting.time_figures import estimates_figure, plotted_states
 from tuning.search.objectives import check_objectives, find_objective, nis_ratio
 from tuning.search.plan import Plan
@@ -147,8 +146,6 @@ def test_without_a_bound_nothing_is_said_to_be_above_it(comparisons):
     assert "above" in printed(
         comparison_table(comparison.evaluations, comparison.bound, "here", problem.scale_about)
     )
-    assert errors_table(problem, without).columns[-1] == "expected"
-    assert errors_table(problem, comparison).columns[-1] == "bound; expected"
     assert score_label([problem]) == "score: mean RMSE over scale [-]"
     assert score_label([find_scenario("outliers")]) == "score: mean RMSE over bound [-]"
     assert score_label([find_scenario("outliers"), problem]) == "score: mean RMSE over scale [-]"
@@ -162,16 +159,16 @@ def test_one_zero_in_the_true_q_is_said_to_change_the_scale():
         assert problem.scale_about == words
 
 
-def test_the_tables_of_a_report_grow_downwards_with_the_states(comparisons):
+def test_the_tables_of_errors_grow_downwards_with_the_states(comparisons):
     cases = (1, True), (3, True), (8, True), (3, False)
-    few, three, many, blind = (errors_table(*comparisons[case]) for case in cases)
-    assert list(few.columns[:4]) == ["filter", "score of tuned over this", "score", "RMSE p [m]"]
-    first = ["score of tuned over this", "score", "RMSE p [m]", "RMSE v [m/s]", "RMSE b [m]", "RMSE energy [J]"]
-    assert [row[0] for row in three.rows][:6] == first and [row[0] for row in many.rows][:5] == first[:5]
-    assert 'class="fold"' in few.html() and 'data-head="score of tuned over this"' in few.html()
-    assert len(many.rows) == 8 + 1 + 4 and {len(row) for row in many.rows} == {len(many.columns)}
-    assert {len(row) for row in few.rows} == {len(few.columns)}
-    assert "log-likelihood of a run" in blind.columns and "nan" not in blind.markdown()
+    results = [comparisons[case][1] for case in cases]
+    few, three, many, blind = (comparison_table(part.evaluations, part.bound, "here") for part in results)
+    assert list(few.columns[:3]) == ["filter", "p\n[m]", ABOVE] and list(three.columns[:2]) == ["filter", "state"]
+    assert [row[1] for row in three.rows][:4] == ["p [m]", "v [m/s]", "b [m]", "E [J]"]
+    assert 'class="fold"' in few.html() and 'data-head="p\n[m]"' in few.html()
+    for table in (few, three, many, blind):
+        assert {len(row) for row in table.rows} == {len(table.columns)}
+    assert "log L" in blind.columns and "nan" not in blind.markdown()
 
 
 def test_a_leaderboard_ranks_without_truth_by_the_likelihood():
@@ -269,19 +266,23 @@ def test_a_report_without_truth_says_so_and_has_no_errors(comparisons):
     assert advice(choice, plan, [comparison]).endswith(
         "the covariance is consistent (mean NIS 1.76, expected 1.81)."
     )
-    said, table, memory = held_out_section(None, Subject("s", plan, choice, None, 8, True), [comparison]).parts
-    assert memory.sentences[0].startswith("Time constants of the gain: ")
-    assert said.sentences[0].startswith(
-        "linear-3 has no true states, so filters are compared by how well they predict"
-    )
-    assert table == errors_table(problem, comparison)
+    tables = HeldOut(choice, problem, comparison).tables()
+    subject = Subject("s", plan, choice, None, 8, True)
+    numbers, errors, words = held_out_section(None, subject, [comparison], [tables]).parts
+    assert [numbers, errors] == tables[:2] and errors.title.startswith("Innovations on ")
+    said = " ".join(words.sentences)
+    assert "Time constants of the gain: " in said and "has no true states, so filters are compared by" in said
     assert ensemble_sizes(oracle_choice("enkf", problem), plan, []) == []
 
 
-def test_numbers_of_a_filter_have_the_units_of_their_states(comparisons, monkeypatch):
+def test_numbers_of_a_filter_have_the_units_of_their_states(comparisons):
     problem, _ = comparisons[3, False]
-    choice = oracle_choice("kf", problem)
-    found = {"rule of thumb": untuned_choice("kf", problem), "oracle": choice}
-    monkeypatch.setattr("tuning.reporting.tables.baselines", lambda *arguments: found)
-    rows = numbers_table(choice, problem, 0).rows
-    assert [row[0] for row in rows] == ["Q11 [m²]", "Q22 [(m/s)²]", "Q33 [m²]", "R11 [m²]", "R22 [(m/s)²]"]
+    table = choice_table({"rule of thumb": untuned_choice("kf", problem)}, problem)
+    assert [row[0] for row in table.rows] == [
+        "Q11 [m^2]",
+        "Q22 [(m/s)^2]",
+        "Q33 [m^2]",
+        "R11 [m^2]",
+        "R22 [(m/s)^2]",
+    ]
+    assert "R22 [(m/s)²]" in table.html()

@@ -85,7 +85,7 @@ def test_recorded_runs_are_the_same_in_any_form(logs, tmp_path):
 def test_tuning_on_a_model_and_frames_finds_a_filter(logs):
     frames = [pandas.DataFrame(table_of(log)) for log in logs]
     study = tuning.tune(tuning.read_logs(frames, model=cart(), lead=20), "kf", trials=3, progress=False)
-    assert study.tuning.plan.objectives == ("likelihood",) and "log-likelihood" in repr(study)
+    assert study.plan.objectives == ("likelihood",) and "log-likelihood" in repr(study)
     assert study.problem.name == "run1 and 1 more" and study.filter.name == "kf"
     estimates = tuning.estimate((cart(), frames[0]), study)
     assert estimates.filter.name == "kf" and np.isfinite(estimates.means).all()

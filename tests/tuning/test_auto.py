@@ -14,7 +14,7 @@ from rich.progress import Progress
 
 import tuning
 from filters.registry import FILTERS
-from tuning.api.run import warn_of_few_trials
+from tuning.api.tune import warn_of_few_trials
 from tuning.cli.main import main
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.held_out import evaluate_held_out
@@ -266,7 +266,7 @@ def test_trials_after_the_first_are_of_the_types_in_the_race(priced):
 
 def test_without_a_budget_auto_has_a_default_one_and_few_trials_are_warned_of(monkeypatch, priced):
     plans = []
-    monkeypatch.setattr("tuning.api.study.run_tuning", lambda plan, *others, **named: plans.append(plan))
+    monkeypatch.setattr("tuning.api.tune.run_tuning", lambda plan, *others, **named: plans.append(plan))
     with pytest.warns(UserWarning, match="no budget .* may take 10 microseconds of one core, the default of 2 st"):
         tuning.tune(MISMATCH, "auto", progress=False)
     tuning.tune(MISMATCH, "auto", budget=3.0, progress=False)

@@ -8,7 +8,7 @@ from tests import pendulum_problem
 from tests.models import wide_model
 from tests.small_problems import pair, thruster
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.api.run import run_tuning
+from tuning.api.tune import run_tuning
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
 from tuning.problems.excitation import Steps
@@ -164,7 +164,7 @@ def test_what_is_wrong_with_held_out_data_is_said_before_the_search(tmp_path, mo
     def inputs(seeds, steps):
         return np.where(np.array(seeds) >= 500_000, np.nan, 1.0)[:, None, None] * np.ones((1, steps, 2))
 
-    monkeypatch.setattr("tuning.api.run.HELD_OUT_SEEDS", 2)
+    monkeypatch.setattr("tuning.api.tune.HELD_OUT_SEEDS", 2)
     journal = tmp_path / "study.journal"
     with pytest.raises(ValueError, match="inputs of problem .* must be finite"):
         run_tuning(Plan("ekf", (pair(inputs=inputs),)), 2, Console(quiet=True), str(journal))

@@ -32,10 +32,10 @@ def problem(factor):
 
 def test_a_study_of_a_model_that_blows_up_names_substeps_and_dt_and_not_more_trials():
     study = tuning.tune(problem(-3e4), "kf", trials=3, progress=False, consistent=False)
-    said = " ".join(one for one in report(study.tuning) if isinstance(one, str))
+    said = " ".join(one for one in report(study) if isinstance(one, str))
     assert "diverges between samples" in said and "more substeps" in said and "dt = 0.1 s" in said
     assert "More trials" not in said and "What may help" not in said
-    assert as_json(study.tuning)["blows_up"][0].startswith("The model diverges between samples: its prediction of")
+    assert as_json(study)["blows_up"][0].startswith("The model diverges between samples: its prediction of")
 
 
 @pytest.mark.parametrize("factor", [-3e4, 0.9])

@@ -11,7 +11,7 @@ from tests.linear_problem import LinearProblem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.methods.problems import linear
 from thruster_env.model.affine import affine_model
-from tuning.api import run
+from tuning.api import tune
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import tune_by_gradient
@@ -42,7 +42,7 @@ def test_a_method_gives_its_answer_its_file_and_its_held_out_table(tmp_path):
     assert written["study"]["method"] == "likelihood"
     choice, *_ = read_tuned(file, [SHORT])
     np.testing.assert_allclose(choice.model["process_noise_cov"], study.choice.model["process_noise_cov"])
-    assert study.report(tmp_path / "page.html").is_file()
+    assert study.report(tmp_path / "page.html").page.is_file()
 
 
 def test_the_same_command_goes_on_with_the_answer_that_is_there(tmp_path):
@@ -51,7 +51,7 @@ def test_the_same_command_goes_on_with_the_answer_that_is_there(tmp_path):
     first = tuning.tune("published_tunnel", method="noise-estimation", **options)
     again = tuning.tune("published_tunnel", method="noise-estimation", **options)
     assert again.choice == first.choice and len(again.trials) == len(first.trials)
-    assert again.tuning.answer.runs == first.tuning.answer.runs == TRAINING_SEEDS
+    assert again.answer.runs == first.answer.runs == TRAINING_SEEDS
     assert np.shape(first.choice.model["process_noise_cov"]) == (2, 2)  # where trials have diagonals
 
 
@@ -79,13 +79,13 @@ def test_a_journal_that_says_way_is_continued(tmp_path, monkeypatch, as_python, 
     options = {"filter": "kf", "trials": 2, "progress": False, "storage": storage, "method": method}
     plan = Plan("kf", (problem,), objectives=("likelihood",))
     with monkeypatch.context() as before:
-        before.setattr(run, "ANSWER", "answer of the way")
-        name = f"{run.name_of(plan)}-way-{former}"
+        before.setattr(tune, "ANSWER", "answer of the way")
+        name = f"{tune.name_of(plan)}-way-{former}"
         first = tuning.tune(problem, name=name, **options)
-    monkeypatch.setattr(run, "Task", None)  # nothing is run again
+    monkeypatch.setattr(tune, "Task", None)  # nothing is run again
     again = tuning.tune(problem, **options)
-    assert same_filter(again.choice, first.choice) and again.tuning.study == name
-    assert again.tuning.answer.runs == first.tuning.answer.runs
+    assert same_filter(again.choice, first.choice) and again.name == name
+    assert again.answer.runs == first.answer.runs
 
 
 def test_former_names_are_answered_with_those_of_today(thruster):  # noqa: F811
@@ -140,7 +140,7 @@ def test_ctrl_c_ends_a_method_with_what_it_has_found(monkeypatch, tmp_path):
         task.value(task.best)
         raise AssertionError("it went on")
 
-    monkeypatch.setattr(run, "find_method", lambda name: METHODS["random-only"]._replace(function=follow))
+    monkeypatch.setattr(tune, "find_method", lambda name: METHODS["random-only"]._replace(function=follow))
     study = tuning.tune(SHORT, "ekf", method="random-only", trials=4, progress=False)
     assert study.interrupted and len(study.trials) == 2
     before = SHORT.untuned["process_noise_cov"]
@@ -194,13 +194,13 @@ def test_an_answer_that_is_worse_than_the_start_is_not_given(as_python, monkeypa
     storage = tmp_path / "studies.journal"
     study = tuning.tune(problem, "kf", method="scoring", storage=storage, **options)
     assert same_filter(study.choice, given_choice("kf", problem))
-    refused = study.tuning.answer.refused
-    assert refused.after > refused.before == pytest.approx(study.tuning.result.best_value)
+    refused = study.answer.refused
+    assert refused.after > refused.before == pytest.approx(study.result.best_value)
     again = tuning.tune(problem, "kf", method="scoring", storage=storage, **options)
-    objective = study.tuning.plan.objectives[0]
+    objective = study.plan.objectives[0]
     for one in (study, again):
         answer, given = (f"{reported(objective, value):.4g}" for value in (refused.after, refused.before))
-        assert f"a {reported_name(objective)} of {answer} and the given filter {given}," in one.tuning.chosen[0]
+        assert f"a {reported_name(objective)} of {answer} and the given filter {given}," in one.chosen[0]
 
 
 @pytest.mark.parametrize("options", [{}, {"space": tuning.SearchSpace(hold_r=True)}])
@@ -213,8 +213,8 @@ def test_an_answer_is_no_worse_than_the_numbers_of_the_model(as_python, monkeypa
     r = (untuned_choice("kf", problem).model if options else own)["measurement_noise_cov"]
     np.testing.assert_array_equal(found["process_noise_cov"], own["process_noise_cov"])
     np.testing.assert_array_equal(found["measurement_noise_cov"], r)
-    refused = study.tuning.answer.refused
-    assert refused.before < refused.after and "so that one is returned" in study.tuning.chosen[0]
+    refused = study.answer.refused
+    assert refused.before < refused.after and "so that one is returned" in study.chosen[0]
 
 
 @pytest.mark.parametrize(("method", "options"), [("em", {}), ("em", {"full_r": True}), ("squarem", {})])

@@ -11,9 +11,10 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates
 from tests.tuned_files import rewrite, write_untuned
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
-from tuning.evaluation.tuned import read_tuned, verify
+from tuning.api.report import write_report
+from tuning.api.verify import verify
+from tuning.evaluation.tuned import read_tuned
 from tuning.policies.setup import configuration_from_json, in_scenario, make_configuration
-from tuning.reporting.report import write_report
 from tuning.thruster.scenario import find_scenario
 
 TRAP = f"{__name__}:trap"

@@ -1,5 +1,6 @@
 """A filter that sleeps: results say how long it remembers, warn, and `forget` makes it listen."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -88,19 +89,19 @@ def test_a_filter_that_sleeps_as_the_oracle_does_is_a_fact_and_one_that_must_for
     assert error > 0.1 and stated < 0.005
     constants = asleep.held_out.evaluation.time_constants
     assert constants.is_slow and constants.oracle[0] == pytest.approx(constants.steps[0], rel=0.5)
-    assert not any("time constant" in one for one in asleep.tuning.warnings)
-    text = " ".join(plain_text(report(asleep.tuning)).split())
+    assert not any("time constant" in one for one in asleep.warnings)
+    text = " ".join(plain_text(report(asleep)).split())
     assert text.count("such a slow filter is right") == text.count("--forget 2 keeps it within 2 s.") == 1
-    numbers = as_json(asleep.tuning)["memory"]["cart"]
+    numbers = as_json(asleep)["memory"]["cart"]
     assert numbers["run"] == 10.0 and numbers["advised"] == 2.0 and not numbers["warns"]
     assert numbers["longest"] == DT * constants.steps[0] and numbers["oracle"] == DT * constants.oracle[0]
     error, stated = after_a_push(awake.filter)
     assert error < 3.0 * stated and 0.005 < stated < 0.02
-    (comparison,) = awake.tuning.comparisons
+    (comparison,) = awake.comparisons
     worse = comparison._replace(stored_ratios={"scaled default": Interval(2.0, 1.9, 2.1)})
-    (price,) = way_out(awake.tuning._replace(comparisons=(worse,)))
+    (price,) = way_out(replace(awake, comparisons=(worse,)))
     assert price.startswith("That is the price of forgetting within 0.5 s (--forget)")
-    numbers = as_json(awake.tuning)["memory"]["cart"]
+    numbers = as_json(awake)["memory"]["cart"]
     assert 0.99 * FORGET < numbers["longest"] <= numbers["allowed"] == FORGET and not numbers["warns"]
     assert "Time constants of the gain: 0.5" in memory_sentence(awake.held_out.evaluation, awake.problem)
 
@@ -201,8 +202,8 @@ def test_an_advice_is_accepted_where_a_fifth_of_a_run_is_more_than_a_larger_q_re
 
 def test_all_that_is_chosen_among_forgets_in_time_and_the_plan_is_kept(studies, problem, tmp_path):
     awake = studies[1]
-    plan = awake.tuning.plan
-    for one in awake.tuning.result.validation.met:
+    plan = awake.plan
+    for one in awake.result.validation.met:
         assert plan.forgetting(one.choice) == one.choice
     assert plan.identity["forget"] == FORGET and "forget0.5" in awake.name
     assert "forget" not in Plan("kf", (problem,)).identity
@@ -211,7 +212,7 @@ def test_all_that_is_chosen_among_forgets_in_time_and_the_plan_is_kept(studies, 
         choice.filter(problem).model.process_noise_cov, awake.filter.model.process_noise_cov, rtol=1e-12
     )
     assert _plan(plan.identity, "x", lambda name: problem).forget == FORGET
-    assert choice_from(awake.tuning.result.choice._asdict()) == awake.choice
+    assert choice_from(awake.result.choice._asdict()) == awake.choice
 
 
 def test_the_numbers_on_validation_seeds_are_those_of_the_filter_that_is_handed_out():

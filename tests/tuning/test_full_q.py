@@ -11,9 +11,10 @@ import thruster_env  # noqa: F401 - registers the env
 import tuning
 from filters import EstimateState
 from filters.tuned_file import read_tuned_file, sealed
+from tuning.api.verify import verify
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.tuned import read_tuned, verify, write_tuned
-from tuning.reporting.terminal import choice_table
+from tuning.evaluation.tuned import read_tuned, write_tuned
+from tuning.reporting.tables import choice_table
 from tuning.search.among_types import RESCALED
 from tuning.search.plan import Plan
 from tuning.search.relations import correlation_slopes, correlations_of, full_covariance

@@ -5,7 +5,7 @@ import pytest
 from rich.console import Console
 
 from filters import StateSpaceModel, run
-from tuning.api.run import run_tuning
+from tuning.api.tune import run_tuning
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import goal_of, tune_by_gradient

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from filters import KalmanFilter, affine_model, run
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
-from tuning.cli.demo import tune
+from tuning.api.tune import run_tuning
 from tuning.likelihood import family, identifiability
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import (
@@ -159,7 +160,7 @@ def test_numbers_that_are_held_are_not_told_and_baselines_have_none():
 
 def test_thruster_tune_says_what_the_innovations_determine(tmp_path):
     plan = Plan("ekf", (find_scenario("nominal"),))
-    tuning = tune(plan, 3, str(tmp_path / "j"), out=tmp_path / "tuned.json")
+    tuning = run_tuning(plan, 3, Console(quiet=True), str(tmp_path / "j"), out=tmp_path / "tuned.json")
     assert sentences(tuning.known)[0] in report(tuning)
     assert set(as_data(tuning.known)) == set(as_json(tuning)["innovations_alone"]) == {"Q11", "Q22", "R"}
 

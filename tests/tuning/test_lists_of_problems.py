@@ -9,9 +9,9 @@ import tuning
 from filters.tuned_file import read_tuned_file
 from tests.linear_problem import LinearProblem
 from tests.tuning.test_unequal_runs import MODEL, runs_of
+from tuning.api.verify import verify
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.sizes import ensemble_sizes, few_seeds_first
-from tuning.evaluation.tuned import verify
 from tuning.problems.model_problem import RunsProblem
 from tuning.problems.problem import Parameter
 from tuning.search.plan import Plan
@@ -89,8 +89,8 @@ def test_a_study_of_a_list_is_tuned_saved_verified_and_reported(problems, tmp_pa
     file = found.save(tmp_path / "tuned.json")
     assert set(read_tuned_file(file)["held_out"]) == {"runs", "model"}
     held_out = {name: one for name, one in read_tuned_file(file)["held_out"].items() if name == "runs"}
-    assert verify(file, problems).holds and held_out["runs"]["seeds"] == [13, 19]
-    page = found.report(tmp_path / "report.html").read_text(encoding="utf-8")
+    assert verify(file, problem=[*problems]).holds and held_out["runs"]["seeds"] == [13, 19]
+    page = found.report(tmp_path / "report.html").page.read_text(encoding="utf-8")
     assert f"{data[0].seeds[0]} to {data[0].seeds[-1]}; {data[1].seeds[0]} to " in page
     assert "held-out runs 13 to 18" in page and "held-out seeds 500000 to 500199" in page
 

@@ -13,6 +13,7 @@ from filters.sensitivity import likelihood
 from thruster_env.logs.log import Log
 from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
+from tuning.api.held_out import HeldOut
 from tuning.evaluation.baselines import rule_label
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
@@ -26,7 +27,6 @@ from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem
 from tuning.problems.log_parts import LEAD, parts_of
 from tuning.problems.log_problem import LogProblem
-from tuning.reporting.tables import errors_table, numbers_table
 from tuning.search.parameters import size_ladder
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
@@ -164,8 +164,8 @@ def test_the_noise_of_a_simulation_is_found_again_without_its_truth():
     assert "against the given filter" in tuning_effect(comparison) and "rule of thumb" not in tuning_effect(
         comparison
     )
-    assert [row[0] for row in errors_table(problem, comparison).rows][:2] == ["given", "scaled default"]
-    assert "given" in numbers_table(result.choice, problem, 0, comparison.default).columns
+    numbers, errors, *_ = HeldOut(result.choice, problem, comparison).tables()
+    assert [row[0] for row in errors.rows][:2] == ["given", "scaled default"] and "given" in numbers.columns
 
 
 def test_what_has_ranges_has_a_rule_of_thumb():

@@ -71,7 +71,7 @@ def test_names_are_no_markup_where_work_is_shown(name):
 
 def test_names_are_text_in_markdown_and_html():
     for name in ODD:
-        page = markdown_page(name, name, [Table(name, ["", name], [[name, name]])])
+        page = markdown_page(name, [name, Table(name, ["", name], [[name, name]])])
         for raw in ("[x](http", "<b>", "| a|b", "$"):
             at = page.find(raw)
             assert at < 0 or page[at - 1] == "\\" or raw == "| a|b"

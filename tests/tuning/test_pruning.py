@@ -6,7 +6,7 @@ from scipy import stats
 
 from docs.scripts.tuning_choice import TOP_RUNS, over_studies, pruning_pair
 from tuning.search.plan import TRAINING_SEEDS
-from tuning.search.study import quiet_optuna
+from tuning.search.storage import quiet_optuna
 
 
 @pytest.mark.slow

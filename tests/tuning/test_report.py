@@ -10,12 +10,12 @@ import optuna
 import pytest
 
 from filters.consistency.intervals import Interval
+from tuning.api.report import write_report
 from tuning.cli.main import main
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.reporting.page import Code, Picture, Section, Table, Words, html_page, markdown_page
-from tuning.reporting.report import write_report
 from tuning.reporting.search_figures import FEWEST_TRIALS, counted_trials, early_trials, importances
 from tuning.reporting.sections import advice
 from tuning.search.plan import Plan
@@ -78,13 +78,13 @@ def folder(tmp_path, monkeypatch):
 def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder):
     result = tuned(Plan("enkf", (MISMATCH,)), 14)
     report = write_report("s.json", STORAGE)
-    assert (report.page.as_posix(), report.tables.as_posix()) == ("s.html", "s.md")
+    assert (report.page.as_posix(), report.markdown.as_posix()) == ("s.html", "s.md")
     text = report.page.read_text()
     page = Page(text)
     assert page.headings == [
         "Before and after, on held-out seeds",
         "What the score is",
-        "The parameters",
+        "What the data determine",
         "Model, Q and R",
         "The study",
         "Error against ensemble size",
@@ -113,7 +113,7 @@ def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder)
     assert " lowers the score by " in report.advice and "(mean NEES " in report.advice
     assert "held-out seeds 500000 to 500005" in words and "14, " in words
     assert str(folder) not in text
-    tables = report.tables.read_text()
+    tables = report.markdown.read_text()
     assert report.advice in tables.replace("\\", "") and all(
         f"| {name} | " in tables for name in ("rule of thumb", "scaled default", "oracle")
     )
@@ -156,7 +156,7 @@ def test_a_baseline_has_no_covariance_to_speak_of():
     assert "covariance" not in report.advice
     page = Page(report.page.read_text())
     assert "Is the covariance consistent?" not in page.headings
-    assert "| tuned | " in report.tables.read_text() and "nan" not in report.tables.read_text()
+    assert "| tuned | " in report.markdown.read_text() and "nan" not in report.markdown.read_text()
 
 
 def test_importances_need_enough_trials_and_sum_to_one():
@@ -245,7 +245,7 @@ def test_what_is_said_is_escaped():
     page = Page(text)
     assert {tag for tag, _ in page.attributes} & {"i", "b", "t", "h", "s", "u"} == set()
     assert "x & y" in page.words and 'say "1"' in page.words and page.pictures()[0]["aria-label"] == '"><b>'
-    markdown = markdown_page("a_b", "1 < 2", [Table("c|d", ["", "e"], [["f|g", "h*"]])])
+    markdown = markdown_page("a_b", ["1 < 2", Table("c|d", ["", "e"], [["f|g", "h*"]])])
     assert markdown == "# a\\_b\n\n1 \\< 2\n\n**c\\|d**\n\n|  | e |\n| --- | ---: |\n| f\\|g | h\\* |\n"
 
 

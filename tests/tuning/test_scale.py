@@ -7,9 +7,10 @@ import numpy as np
 import optuna
 import pytest
 
+from tuning.api.verify import verify
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.tuned import verify, write_tuned
+from tuning.evaluation.tuned import write_tuned
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study

@@ -11,7 +11,7 @@ import sqlalchemy
 from optuna.trial import TrialState
 from rich.console import Console
 
-from tuning.api.run import run_tuning
+from tuning.api.tune import run_tuning
 from tuning.problems.find import find_problem
 from tuning.search import storage as database
 from tuning.search.plan import Plan
@@ -135,7 +135,7 @@ def test_a_driver_that_is_missing_is_named_with_the_extra_that_brings_it():
 
 
 def test_several_workers_on_sqlite_are_warned(monkeypatch):
-    monkeypatch.setattr("tuning.api.run.checked", lambda plan: open_storage(""))  # ends here
+    monkeypatch.setattr("tuning.api.tune.checked", lambda plan: open_storage(""))  # ends here
     plan, console = Plan("ekf", (find_problem("nominal"),)), Console(quiet=True)
     with (
         pytest.warns(UserWarning, match="so 2 workers wait for each other"),

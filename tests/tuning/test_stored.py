@@ -8,14 +8,14 @@ import pytest
 from filters.consistency.intervals import Interval
 from filters.tuned_file import read_tuned_file
 from tests.tuned_files import rewrite, write_untuned
+from tuning.api import report
+from tuning.api.held_out import HeldOut
+from tuning.api.report import write_report
 from tuning.evaluation import held_out as summary
 from tuning.evaluation.held_out import evaluate_held_out, sizes_as_data, stored_comparison, stored_sizes
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.tuned import metrics, read_tuned
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
-from tuning.reporting import report
-from tuning.reporting.report import write_report
-from tuning.reporting.tables import errors_table, numbers_table
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.thruster.scenario import find_scenario
@@ -30,8 +30,7 @@ def test_a_comparison_reads_as_it_was(tmp_path, scenario):
     content, fresh = read_tuned_file(path), evaluate_held_out(choice, problem, 0, 3)
     found = stored_comparison(content, choice, problem)
     assert metrics(found) == metrics(fresh) and found.ratios == fresh.ratios
-    assert errors_table(problem, found) == errors_table(problem, fresh)
-    assert numbers_table(choice, problem, 0, found.default) == numbers_table(choice, problem, 0)
+    assert HeldOut(choice, problem, found).tables() == HeldOut(choice, problem, fresh).tables()
     assert tuning_effect(found) == tuning_effect(fresh) and scaling_sentence(found) == scaling_sentence(fresh)
     assert found.default.choice == fresh.default.choice
 
@@ -58,10 +57,10 @@ def test_a_report_takes_what_the_file_keeps_unless_the_problem_has_changed(tmp_p
     monkeypatch.setattr(
         report, "evaluate_held_out", lambda *given: asked.append(given) or evaluate_held_out(*given)
     )
-    tables = write_report(path, "none.journal").tables.read_text()
+    tables = write_report(path, "none.journal").markdown.read_text()
     assert not asked
     rewrite(path, lambda content: content.update(digest="another"))
-    assert write_report(path, "none.journal").tables.read_text() == tables and len(asked) == 1
+    assert write_report(path, "none.journal").markdown.read_text() == tables and len(asked) == 1
 
 
 def test_ensemble_sizes_read_as_they_were_of_the_same_choice_alone(monkeypatch):

@@ -15,12 +15,12 @@ from filters.learned.file import LEARNED, read
 from tests.models import plane_model
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.evaluate import values_of
-from tuning.learning.settings import Settings
 from tuning.learning.training import (
     HELD_OUT,
     LONGER,
     NOISIER,
     Loss,
+    Settings,
     new_estimator,
     scales_of,
     standings,
@@ -163,7 +163,7 @@ def test_the_function_trains_stores_compares_and_continues(tmp_path, runs, as_py
     assert training.plot_training().axes[0].get_xlabel() == "updates of the weights"
     page = training.report(tmp_path / "page.html").read_text()
     assert "recursive-kalmannet trained on plane" in page and page.count("<svg") == 2
-    with pytest.raises(ValueError, match="must be a file that ends in .html"):
+    with pytest.raises(ValueError, match="must end in .html"):
         training.report(tmp_path / "page.pdf")
     comparison = tuning.compare(["ekf", path], PROBLEM, seeds=6)
     assert comparison.filters == ("ekf", "mine")

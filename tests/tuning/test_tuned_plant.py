@@ -20,8 +20,9 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.effects.signals import Gusts
 from thruster_env.thruster.parameters import PRESETS, PresetFile, write_preset
 from thruster_env.thruster.plant import differences, make_plant, plant_data
-from tuning.api.run import name_of
-from tuning.evaluation.tuned import read_tuned, verify
+from tuning.api.tune import name_of
+from tuning.api.verify import verify
+from tuning.evaluation.tuned import read_tuned
 from tuning.logs.problem import log_problem, problems_in
 from tuning.logs.read import as_tuned
 from tuning.policies.setup import make_configuration

@@ -1,13 +1,13 @@
-"""Units of a report: typeset in one way, with one power of ten in a column."""
+"""Units of a report: typeset in one way."""
 
 from math import nan
 
 import pytest
 
 from filters.consistency.intervals import Interval, span
-from tuning.reporting.choice_words import power_of_ten, scaled_unit, typeset
+from thruster_env.core.text_tables import Table, typeset
 from tuning.reporting.leaderboard import about, limit_cell, unless_blank
-from tuning.reporting.page import Table, Words
+from tuning.reporting.page import Words
 
 
 @pytest.mark.parametrize(
@@ -25,15 +25,6 @@ def test_a_number_that_rounds_to_zero_has_no_minus():
         unless_blank(value, form) for value, form in ((-0.3, "+.0f"), (-0.004, ".2f"), (-1.2, "+.0f"), (nan, ""))
     ]
     assert cells == ["0", "0.00", "-1", ""]
-
-
-@pytest.mark.parametrize(
-    ("values", "power"),
-    [([8.59e-6, 2.3e-5], -6), ([0.00009, nan], -6), ([1e-3, 1e-9], 0), ([2e6], 6), ([0.0, nan], 0), ([], 0)],
-)
-def test_a_column_has_one_power_of_ten(values, power):
-    assert power_of_ten(values) == power
-    assert scaled_unit("m", -6) == "10⁻⁶ m" and scaled_unit("m", 0) == "m" and scaled_unit("", 3) == "10³"
 
 
 def test_small_errors_on_a_terminal_have_powers_of_ten():

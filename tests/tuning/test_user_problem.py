@@ -21,9 +21,10 @@ from tests import pendulum_problem
 from tests.tuned_files import rewrite
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from thruster_env.core.compiled import interpreted
+from tuning.api.verify import verify
 from tuning.evaluation.baselines import SCALED
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.tuned import read_choice, read_tuned, verify, write_tuned
+from tuning.evaluation.tuned import read_choice, read_tuned, write_tuned
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, find_same
@@ -91,7 +92,7 @@ def test_by_python_a_study_of_one_number_comes_near_its_most_likely_value(tuned)
     assert (
         set(result.trials[0].params) == {"sigma"} and result.validation.chosen == SCALED
     )  # whose Q sigma cannot give
-    assert read_tuned(path, [problem]) == (result.choice, problem, 0) and verify(path, [problem]).holds
+    assert read_tuned(path, [problem]) == (result.choice, problem, 0) and verify(path, problem=[problem]).holds
     content = read_tuned_file(path)
     assert content["problem"] == problem.name and content["digest"] == problem.digest and content["plant"] is None
     assert content["model"]["states"][0] == ["angle", "theta", "rad", True] and content["model"]["dt"] == 0.05

@@ -90,7 +90,7 @@ def test_four_numbers_of_an_altitude_model_are_no_worse_than_any_baseline_and_tw
 @pytest.mark.slow
 def test_a_tuned_file_keeps_the_choice_as_data_and_own_numbers(altitude):
     problem, study, file = altitude
-    met, content = study.tuning.result.validation, read_tuned_file(file)
+    met, content = study.result.validation, read_tuned_file(file)
     assert content["choice"] == json.loads(json.dumps(as_data(met)))
     assert set(content["choice"]["met"][0]) >= {"name", "value", "over", "proper", "nis", "consistent"}
     assert content["held_out"][problem.name]["given"]["score"] == list(study.held_out.evaluations[GIVEN].score)
@@ -376,14 +376,14 @@ def test_blocks_of_a_log_that_the_given_filter_cannot_follow_are_named():
     logs[1] = dataclasses.replace(logs[1], measurements=disturbed, start=100.0)
     problem = LogProblem(logs, MODEL.replace(process_noise_cov=[0.3]))
     study = tuning.tune(problem, "kf", trials=6, progress=False)
-    met, first = study.tuning.result.validation, 100.0 + 0.1 * 600
+    met, first = study.result.validation, 100.0 + 0.1 * 600
     assert met.tested == GIVEN and 1 <= met.failed <= 3 and met.runs == len(problem.parts.blocks) * 2 // 3
     for one in met.failures:
         name, _, start, _, end, _ = one.run.split()
         assert name == "run1" and float(start) <= first + 4.0 and float(end) >= first and one.nis > 2.0
     likely = {f"trial {one.number + 1}" for one in study.trials if MAXIMUM_LIKELIHOOD in one.user_attrs}
-    assert likely and likely <= {*finalists_of(study.tuning.plan, study.trials, lambda one, _: one)}
-    assert any("The given filter fails in" in sentence for sentence in study.tuning.chosen)
+    assert likely and likely <= {*finalists_of(study.plan, study.trials, lambda one, _: one)}
+    assert any("The given filter fails in" in sentence for sentence in study.chosen)
     assert met.met[0].name == GIVEN
 
 

@@ -7,9 +7,10 @@ import optuna
 import pytest
 
 from filters.tuned_file import sealed
+from tuning.api.verify import Difference, verify
 from tuning.cli.main import main
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.tuned import Difference, verify, write_tuned
+from tuning.evaluation.tuned import write_tuned
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, run_study
 from tuning.thruster.scenario import find_scenario

@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thruster_env.core.files import is_private
+from thruster_env.core.modules import INLINED, when_imported
 from thruster_env.core.optimising import Which, optimise_once
 from thruster_env.core.user_functions import OURS, code_text, codes_in, names_read
 
@@ -194,7 +195,6 @@ JUMPS = frozenset("floor ceil trunc fix rint round fmod mod remainder floor_divi
 
 IN_PYTHON = "the model runs as Python, some hundred times slower"
 MOST_WAITING = 10_000  # functions, above which those that nobody has any more are forgotten
-_packages: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
 
 # Weak references: a model's functions live as long as somebody has them.
 _waiting: list[Callable[[], Callable | None]] = []
@@ -402,6 +402,10 @@ def rounds(code: types.CodeType) -> bool:
 
 def tell_when_compiling(tell: Callable[[], None]) -> None:
     """Call `tell` once, at the first real compilation; loading from the cache does not count."""
+    when_imported("numba", functools.partial(_listen, tell))
+
+
+def _listen(tell: Callable[[], None]) -> None:
     from numba.core import event
 
     class Once(event.Listener):
@@ -418,19 +422,10 @@ def tell_when_compiling(tell: Callable[[], None]) -> None:
     event.register("numba:compile", Once())
 
 
-def may_be_inlined(package: str, *below: str) -> None:
-    """Declare, in a package's `__init__`, that its functions inline one another and those of packages below it.
-
-    Cached machine code of such a function is valid as long as no source file of these packages changes. For other
-    packages, only the files of the functions that are called by name are compared.
-    """
-    _packages[package] = below
-
-
 @functools.cache
 def _package_hash(package: str) -> str:
     digest = hashlib.sha256(package.encode())
-    for below in _packages.get(package, ()):
+    for below in INLINED.get(package, ()):
         digest.update(_package_hash(below).encode())
     spec = importlib.util.find_spec(package)
     for folder in (spec.submodule_search_locations or []) if spec else []:
@@ -453,7 +448,7 @@ def function_fingerprint(*functions: Callable | None, within: str) -> str:
         if function in _instead:
             digest.update(_instead[function]().key.encode())
         package = package_of(function.__module__ or "")
-        if package in _packages:
+        if package in INLINED:
             packages.add(package)
             continue
         with contextlib.suppress(OSError, TypeError):  # from a prompt: the byte code tells changes apart

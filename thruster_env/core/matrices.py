@@ -43,10 +43,11 @@ def scaled(parameters: Parameters, factors: Mapping[str, float], names: Iterable
 
 def zero_order_hold(a: np.ndarray, b: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Discrete A_d, B_d of dx/dt = A x + B u for an input held over dt [s], by the matrix exponential."""
-    from scipy.signal import cont2discrete
+    from scipy.linalg import expm
 
-    a_d, b_d, *_ = cont2discrete((a, b, np.eye(len(a)), np.zeros((len(a), b.shape[1]))), dt, method="zoh")
-    return a_d, b_d
+    n, m = b.shape
+    powers = expm(np.block([[a, b], [np.zeros((m, n + m))]]) * dt)
+    return powers[:n, :n], powers[:n, n:]
 
 
 def observability(a: np.ndarray, c: np.ndarray) -> tuple[int, float]:

@@ -7,12 +7,13 @@ import re
 import sys
 import unicodedata
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from html import escape
 from io import StringIO
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType, RenderResult
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 # Tables in Markdown, and pages whose tables are computed.
@@ -88,14 +89,18 @@ def _in_ascii(character: str) -> str:
     return unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode() or "?"
 
 
-# Tables of text: for the terminal, and as plain text.
+# Tables of text: for the terminal, pages, notebooks, Markdown and JSON.
 
 BEST = "bold green"  # style of rows that win
+RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+INTERVAL = re.compile(r"(\S+) (\[\S+, \S+\]|±\S+)")
+MANY = 9  # columns of a table that is set small on paper
+FOLDED = 4  # columns from which a row is folded on a phone
 
 console = Console(markup=False, highlight=False)
 
 
-class WholeTable(Table):
+class WholeTable(RichTable):
     """A table whose title and caption use the width of the terminal rather than that of the table."""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -109,39 +114,112 @@ class WholeTable(Table):
             self.title, self.caption = title, caption
 
 
-def table(
-    title: str | None,
-    columns: Sequence[str],
-    rows: Sequence[Sequence[Any]],
-    *,
-    caption: str | None = None,
-    words: bool = False,
-    best: Container[int | None] = (),
-) -> Table:
-    """A table for the terminal; where it is narrow, cells fold and no column is lost.
+class Unfolded(str):
+    """Text whose lines are not folded where they go into a file or another program."""
 
-    Args:
-        title: above it, if there is one.
-        columns: their headers; the first one is left-aligned.
-        rows: cells.
+
+class Table(NamedTuple):
+    """A table of text: for the terminal (`print` of rich), a page, a notebook, Markdown and JSON.
+
+    Attributes:
+        title: above it, if it has one.
+        columns: heads; empty for a list of names and what they are.
+        rows: cells; the first one names the row, and is left-aligned.
         caption: below it.
         words: whether the other columns hold words, and are left-aligned, too.
-        best: places of rows that win, which stand out on a terminal; None is no row's place.
+        best: numbers of rows that win, which stand out on a terminal; None is no row's number.
     """
-    title, caption = (part and showable(part, console.encoding) for part in (title, caption))
-    out = WholeTable(title=title, caption=caption, box=SIMPLE_HEAD)
-    out.padding, out.pad_edge = (0, 1, 0, 0), False  # five figures with their intervals fit into 80 columns
-    for index, column in enumerate(columns):
-        justify: JustifyMethod = "left" if index == 0 or words else "right"
-        out.add_column(Text(showable(column, console.encoding), overflow="fold"), justify=justify, overflow="fold")
-    for row_number, row in enumerate(rows):  # Text: units in brackets are no markup
-        cells = [cell if isinstance(cell, Text) else Text(showable(str(cell), console.encoding)) for cell in row]
-        out.add_row(*cells, style=BEST if row_number in best else None)
-    _keep_words_whole(out)
-    return out
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    caption: str = ""
+    words: bool = False
+    best: Container[int | None] = ()
+
+    def __rich__(self) -> RichTable:
+        """The table for the terminal; where it is narrow, cells fold and no column is lost."""
+        title, caption = (showable(part, console.encoding) for part in (self.title, self.caption))
+        out = WholeTable(title=title, caption=caption, box=SIMPLE_HEAD)
+        out.padding, out.pad_edge = (0, 1, 0, 0), False  # five figures with their intervals fit into 80 columns
+        for index, column in enumerate(self.columns):
+            justify: JustifyMethod = "left" if index == 0 or self.words else "right"
+            head = Text(showable(column, console.encoding), overflow="fold")
+            out.add_column(head, justify=justify, overflow="fold")
+        for number, row in enumerate(self.rows):  # Text: units in brackets are no markup
+            cells = [
+                cell if isinstance(cell, Text) else Text(showable(str(cell), console.encoding)) for cell in row
+            ]
+            out.add_row(*cells, style=BEST if number in self.best else None)
+        _keep_words_whole(out)
+        return out
+
+    def html(self) -> str:
+        """The table for a page or a notebook; a page folds many columns on a phone, or lets them scroll."""
+        head = "".join(f'<th scope="col">{typeset_html(column)}</th>' for column in self.columns)
+        rows = "\n".join(
+            f'<tr><th scope="row">{typeset_html(row[0])}</th>{self._cells(row[1:])}</tr>' for row in self.rows
+        )
+        head = f"<thead><tr>{head}</tr></thead>\n" if head else ""
+        kind, label = ("", typeset_html(self.title)) if self.columns else (' class="words"', "a list")
+        if len(self.columns) >= MANY:
+            kind = ' class="many fold"'
+        elif len(self.columns) >= FOLDED:
+            kind = ' class="fold"'
+        title = f'<p class="caption">{typeset_html(self.title)}</p>\n' if self.title else ""
+        below = f"\n<p>{typeset_html(self.caption)}</p>" if self.caption else ""
+        scroll = f'<div class="scroll" role="region" aria-label="{label}" tabindex="0">'
+        return f"{title}{scroll}<table{kind}>\n{head}<tbody>\n{rows}\n</tbody></table></div>{below}"
+
+    def _cells(self, cells: Sequence[Any]) -> str:
+        """Cells of a row, each with the head of its column if there is one, for a folded row."""
+        heads = self.columns[1:] if len(self.columns) >= FOLDED else ("",) * len(cells)
+        return "".join(_cell(str(cell), head) for cell, head in zip(cells, heads, strict=True))
+
+    def markdown(self) -> str:
+        """The table in Markdown, its title above and its caption below."""
+        columns = self.columns or ("",) * len(self.rows[0])
+        lines = [_line(columns), _line(["---", *["---:"] * (len(columns) - 1)]), *map(_line, self.rows)]
+        title = [f"**{markdown_text(self.title)}**", ""] if self.title else []
+        below = ["", markdown_text(self.caption)] if self.caption else []
+        return "\n".join([*title, *lines, *below])
+
+    def as_dict(self) -> dict[str, Any]:
+        """The texts, for JSON."""
+        rows = [[str(cell) for cell in row] for row in self.rows]
+        return {"title": self.title, "columns": list(self.columns), "rows": rows, "caption": self.caption}
 
 
-def _keep_words_whole(out: Table) -> None:
+def _cell(text: str, head: str = "") -> str:
+    """A cell of a page; the interval of a value stands below it, and the head of its column is kept with it."""
+    match = INTERVAL.fullmatch(text)
+    value, below = (match[1], f"<small>{escape(match[2])}</small>") if match else (text, "")
+    named = f' data-head="{typeset_html(head)}"' if head else ""
+    return f"<td{named}>{typeset_html(value)}{below}</td>"
+
+
+def typeset(text: str) -> str:
+    """Units in a text as pages have them: m^3/s is m³/s."""
+    return re.sub(r"(?<=[A-Za-z)])\^(-?\d+)", lambda match: match[1].translate(RAISED), text)
+
+
+def typeset_html(text: str) -> str:
+    """Text of a page, its units typeset."""
+    return escape(typeset(str(text)))
+
+
+def _line(cells: Sequence[Any]) -> str:
+    return "| " + " | ".join(markdown_text(str(cell)) for cell in cells) + " |"
+
+
+def markdown_text(text: str) -> str:
+    """Text that Markdown takes as it is."""
+    text = re.sub(r"([\\|*_`<$~])", r"\\\1", " ".join(text.split()))
+    text = text.replace("](", "\\](").replace("![", "!\\[").replace("&", "&amp;")
+    return f"\\{text}" if text[:1] in ("#", ">") else text
+
+
+def _keep_words_whole(out: RichTable) -> None:
     """Let cells fold between words only, if there is room for the longest one of each column.
 
     The rest of the line goes to the columns in proportion to what they lack: rich itself would make a table with

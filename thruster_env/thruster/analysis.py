@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.core.checks import one_of
+from thruster_env.core.checks import one_of, short_repr
 from thruster_env.core.matrices import observability, zero_order_hold
 from thruster_env.thruster.dynamics import (
     rates,
@@ -222,10 +222,9 @@ def transfer_function(model: LinearModel, input_name: str = "V_s") -> tuple[np.n
     Raises:
         ValueError: if the input is not one of INPUTS.
     """
-    from scipy.signal import ss2tf
-
-    numerator, denominator = ss2tf(*model, np.zeros((1, len(INPUTS))), input=_column(input_name))
-    return numerator[0], denominator
+    denominator = np.poly(model.a)
+    column = model.b[:, [_column(input_name)]]
+    return np.poly(model.a - column @ model.c) - denominator, denominator
 
 
 def frequency_response(model: LinearModel, frequencies, input_name: str = "V_s") -> np.ndarray:
@@ -234,9 +233,9 @@ def frequency_response(model: LinearModel, frequencies, input_name: str = "V_s")
     Raises:
         ValueError: if the input is not one of INPUTS.
     """
-    from scipy.signal import freqs
-
-    return freqs(*transfer_function(model, input_name), worN=np.asarray(frequencies, dtype=np.float64))[1]
+    numerator, denominator = transfer_function(model, input_name)
+    s = 1j * np.asarray(frequencies, dtype=np.float64)
+    return np.polyval(numerator, s) / np.polyval(denominator, s)
 
 
 def step_response(model: LinearModel, times, input_name: str = "V_s") -> np.ndarray:
@@ -250,11 +249,14 @@ def step_response(model: LinearModel, times, input_name: str = "V_s") -> np.ndar
     Raises:
         ValueError: if the input is not one of INPUTS, or times are not even.
     """
-    from scipy.signal import step
-
-    column = _column(input_name)
-    outputs = np.vstack([np.eye(2), model.c])
-    return step((model.a, model.b[:, [column]], outputs, np.zeros((3, 1))), T=np.asarray(times))[1]
+    times = np.asarray(times, dtype=np.float64)
+    if times[0] != 0 or not np.allclose(np.diff(times), times[1]):
+        raise ValueError(f"times must be even and begin at 0, but got {short_repr(times)}")
+    a_d, b_d = zero_order_hold(model.a, model.b[:, [_column(input_name)]], times[1])
+    states = np.zeros((len(times), 2))
+    for k in range(1, len(times)):
+        states[k] = a_d @ states[k - 1] + b_d[:, 0]
+    return np.hstack([states, states @ model.c.T])
 
 
 def _column(input_name: str) -> int:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from rich.console import RenderableType
 
 from filters.consistency.intervals import Interval, slightly
 from filters.estimators.find import label_of
@@ -20,8 +18,7 @@ from filters.registry import FILTERS, filter_type
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.files import panels
-from thruster_env.core.text_tables import TITLE, plain_text, verbatim
-from tuning.api.display import about, drawn, frame, html, number
+from thruster_env.core.text_tables import TITLE, Table, verbatim
 from tuning.api.evaluate import NOMINAL
 from tuning.api.held_out import cells_of
 from tuning.api.markers import (
@@ -38,8 +35,9 @@ from tuning.api.markers import (
 )
 from tuning.api.problems import given_for, is_filter, problems_of
 from tuning.api.progress import console_for, row_bar
-from tuning.api.run import MOST_TRIALS
+from tuning.api.result import Result, drawn, frame, number
 from tuning.api.study import DEFAULT_FILTER, Study, is_own, user_choice
+from tuning.api.tune import MOST_TRIALS
 from tuning.evaluation.baselines import OWN
 from tuning.evaluation.compare import (
     DEFAULT_FILTERS,
@@ -53,7 +51,6 @@ from tuning.evaluation.compare import (
     contender,
     default_filters,
     fitting,
-    noise_sentence,
     sized,
     winners,
 )
@@ -61,7 +58,7 @@ from tuning.evaluation.compare import compare as compare_all
 from tuning.evaluation.evaluate import restart_sentences
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.assumed import Unknowns, constants_in, suited, unknowns_of
-from tuning.problems.plant_packages import built_in
+from tuning.problems.find import built_in
 from tuning.problems.problem import Problem
 from tuning.reporting.leaderboard import as_json, report
 from tuning.search.plan import HELD_OUT_SEEDS
@@ -79,7 +76,7 @@ INTERRUPTED = "Interrupted: these are the rows that were done."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FilterComparison:
+class FilterComparison(Result):
     """Filters on one problem or several, in the order in which they were given.
 
     Attributes:
@@ -159,7 +156,7 @@ class FilterComparison:
         ended = ", interrupted" if self.interrupted else ""
         return f"FilterComparison({'; '.join(parts)}{ended})"
 
-    def tables(self) -> list[RenderableType]:
+    def tables(self) -> list[Table | str]:
         """The tables of each problem and a sentence on the winner, for a terminal."""
         ended = [INTERRUPTED] if self.interrupted else []
         return [*(part for board in self.boards for part in report(board)), *left_out_lines(self.left_out), *ended]
@@ -169,39 +166,14 @@ class FilterComparison:
         data = {"seed": self.seed, "knows": self.knows, "interrupted": self.interrupted, "left_out": self.left_out}
         return {**data, **as_json(list(self.boards))}
 
+    def figures(self) -> dict[str, Figure]:
+        """Scores of all filters."""
+        return {"Scores with 95 % intervals": self.plot_scores()}
+
     @property
     def exit_code(self) -> int:
         """Of the command: 130 if it was interrupted."""
         return 130 if self.interrupted else 0
-
-    def __str__(self) -> str:
-        """What `thruster compare` prints."""
-        return plain_text(self.tables())
-
-    def _repr_html_(self) -> str:
-        parts = []
-        for board in self.boards:
-            truth = board.rows[0].evaluation.has_truth
-            heads = ["filter", "score", "over the first"] if truth else ["filter", "log L", "less the first's"]
-            rows = []
-            for row in board.rows:
-                evaluation = row.evaluation
-                cells = [about(evaluation.score), about(row.score_ratio)]
-                if not truth:
-                    cells = [number(evaluation.log_likelihood, ".2f"), about(row.likelihood_gain, 2)]
-                last = [
-                    number(evaluation.nees.value, ".3g"),
-                    number(evaluation.nis.value, ".3g"),
-                    f"{row.microseconds:.3g}",
-                ]
-                first = row is board.rows[0]  # which is compared with itself
-                rows.append(
-                    [row.label, cells[0], "" if first else cells[1], *last, "" if first else _verdict(row)]
-                )
-            heads += ["NEES", "NIS", "us/step", "verdict"]
-            title = f"{len(board.seeds)} held-out {board.scenario.seed_word} of {board.scenario.name}"
-            parts.append(html(title, heads, rows, f"{noise_sentence(board.rows)} {winners(board)}".strip()))
-        return "".join(parts) + "".join(f"<p>{escape(line)}</p>" for line in left_out_lines(self.left_out))
 
 
 def left_out_lines(left_out: Mapping[str, str]) -> list[str]:

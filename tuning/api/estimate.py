@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from rich.console import RenderableType
 
 from filters.filter import Filter
 from filters.logs.estimate import LogEstimate
@@ -32,10 +31,9 @@ from filters.logs.findings import (
 )
 from filters.monitoring.monitor import Monitor, monitor_of, tuned_monitor
 from thruster_env.core.checks import short_repr
-from thruster_env.core.text_tables import plain_text, table
+from thruster_env.core.text_tables import Table
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import check_picture, check_suffix, write_columns
-from tuning.api.display import drawn, frame, html, number
 from tuning.api.markers import (
     FILTER,
     OUTPUT,
@@ -48,6 +46,7 @@ from tuning.api.markers import (
     TunedArgument,
 )
 from tuning.api.read_logs import read_logs, recorded_runs
+from tuning.api.result import Result, drawn, frame, number
 from tuning.logs.read import as_tuned
 
 if TYPE_CHECKING:
@@ -61,7 +60,7 @@ OF_FILE = "tuned"  # the monitor of the tuned file
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LogEstimates:
+class LogEstimates(Result):
     """Estimates and innovations of every row of a log, and the findings on filter and model.
 
     Attributes:
@@ -159,7 +158,7 @@ class LogEstimates:
     def _what(self) -> str:
         return f"{self.filter.name}, smoothed," if self.found.smoothed else self.filter.name
 
-    def tables(self) -> list[RenderableType]:
+    def tables(self) -> list[Table | str]:
         """Innovations, predictions and references, the findings, the alarms and the files, for a terminal."""
         log, result = self.log, self.findings
         how = ", on its own stamps" if log.stamps is not None else ", put on a grid" if log.irregular else ""
@@ -172,14 +171,14 @@ class LogEstimates:
                 rows.insert(0, ["whiteness, p-value", f"{result.whiteness.p_value:.3g}", f"above {ALPHA:g}"])
             band = " to ".join(f"{end:.3g}" for end in result.nis_band)
             rows.insert(0, ["mean NIS over channels", f"{result.mean_nis:.3g}", band])
-        parts: list[RenderableType] = [table(title, ["innovations", "", "if consistent"], rows)]
+        parts: list[Table | str] = [Table(title, ["innovations", "", "if consistent"], rows)]
         what = "Smoother" if self.found.smoothed else "Estimate"
         for caption, residuals in (
             ("One-step prediction less measurement", result.predictions),
             (f"{what} less reference, not seen", result.references),
         ):
             if residuals or residuals is result.predictions:
-                parts.append(table(caption, ["", "RMSE", "bias", "rows"], list(map(_cells, residuals))))
+                parts.append(Table(caption, ["", "RMSE", "bias", "rows"], list(map(_cells, residuals))))
         return [*parts, *self.sentences(), *self._alarm_sentences(), *(f"wrote {path}" for path in self.files)]
 
     def _alarm_sentences(self) -> list[str]:
@@ -204,6 +203,10 @@ class LogEstimates:
             fault = "no single channel is" if index is None else f"{log.measured[index].symbol} is"
             lines.append(f"Remaining alarms without each channel: {counts}: {fault} at fault.")
         return lines
+
+    def figures(self) -> dict[str, Figure]:
+        """States and innovations over time."""
+        return {"Estimates, references and innovations": self.plot_states()}
 
     def as_dict(self) -> dict[str, Any]:
         """All results as plain data, as in `thruster estimate --json`."""
@@ -247,19 +250,6 @@ class LogEstimates:
         low, high = findings.nis_band
         nis = f"mean NIS over channels {findings.mean_nis:.3g}, {low:.3g} to {high:.3g} if consistent"
         return f"LogEstimates({what}: {rows} rows; {nis}; log-likelihood {number(findings.log_likelihood)})"
-
-    def __str__(self) -> str:
-        """What `thruster estimate` prints."""
-        return plain_text(self.tables())
-
-    def _repr_html_(self) -> str:
-        rows = []
-        for what, residuals in (
-            ("prediction less measurement", self.findings.predictions),
-            ("less reference", self.findings.references),
-        ):
-            rows += [[what, *_cells(residual)] for residual in residuals]
-        return html(repr(self), ["", "quantity", "RMSE", "bias", "rows"], rows, " ".join(self.sentences()))
 
 
 def _cells(residual: Residual) -> list[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console, RenderableType
+from rich.console import Console
 
 from filters.consistency.intervals import Interval, rmse_ratios
 from filters.consistency.nees import SquaresCheck
@@ -16,9 +16,9 @@ from filters.consistency.report import MOST_STATES, ConsistencyReport, compariso
 from filters.estimators.find import label_of
 from filters.filter import Filter
 from thruster_env.core.checks import at_least
-from thruster_env.core.text_tables import plain_text
-from tuning.api.display import about, drawn, frame, html, number
+from thruster_env.core.text_tables import Table
 from tuning.api.progress import working
+from tuning.api.result import Result, about, drawn, frame, number
 from tuning.evaluation.baselines import ORACLE, RULE, TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency, restart_sentences
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
@@ -27,7 +27,7 @@ from tuning.evaluation.worth import memory_sentence, scaling_sentence, warnings_
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import gains, model_doubts, residual_sentences
 from tuning.reporting.leaderboard import comparison_table
-from tuning.reporting.terminal import choice_table
+from tuning.reporting.tables import choice_table
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class HeldOut:
+class HeldOut(Result):
     """A filter and its baselines on the same held-out seeds of a problem.
 
     Attributes:
@@ -199,18 +199,27 @@ class HeldOut:
         ratios = [f"{about(ratio)} x {name}" for name, ratio in self.ratios.items()][: int(self.is_tuned)]
         return f"HeldOut({', '.join([f'{what}: score {about(self.score)}', *ratios])})"
 
-    def __str__(self) -> str:
-        """The choice, then the table of errors and the gain of tuning, as the commands print them."""
-        return plain_text([*self.chosen, *self.tables()])
-
-    def tables(self) -> list[RenderableType]:
-        """The parameters, the errors, the gain of tuning and the residuals, for a terminal."""
+    def numbers_and_errors(self) -> list[Table]:
+        """The parameters of each filter, and its errors."""
         where = f"held-out {self.problem.seed_word} {self.seeds.start} to {self.seeds.stop - 1}"
         where = f"{where}, scenario {self.problem.name}"
         errors = comparison_table(self.evaluations, self.bound, where, self.problem.scale_about)
+        return [choice_table(self.choices, self.problem), errors]
+
+    def tables(self) -> list[Table | str]:
+        """The choice, the parameters, the errors, the gain of tuning and the residuals."""
         checked = [] if self.covariance is None else self.covariance.lines()
         words = [*self.sentences(), *residual_sentences(self.problem, self.seed), *checked]
-        return [choice_table(self.choices, self.problem), errors, *words]
+        return [*self.chosen, *self.numbers_and_errors(), *words]
+
+    def figures(self) -> dict[str, Figure]:
+        """Errors and one run over time; whether the covariance is consistent, if there is one."""
+        figures = {"One run over time": self.plot_run()}
+        if self.evaluation.has_truth:
+            figures |= {"Errors with 95 % intervals": self.plot_errors()}
+        if self.filter.has_covariance:
+            figures |= {"Is the covariance consistent?": self.plot_consistency()}
+        return figures
 
     def sentences(self) -> list[str]:
         """The gain of tuning over each baseline; for an untuned filter a description of the scaled default."""
@@ -223,23 +232,6 @@ class HeldOut:
             return [*sentences, *model_doubts(self.problem, self.comparison, self.seed), *restarts]
         truth = [] if self.evaluation.has_truth else [without_truth(self.problem.name)]
         return [*truth, scaling_sentence(self.comparison), *restarts]
-
-    def _repr_html_(self) -> str:
-        truth, rows = self.evaluation.has_truth, []
-        heads = [*(state.short_label for state in self.evaluation.states), "score", "NEES"] if truth else ["log L"]
-        for name, evaluation in self.evaluations.items():
-            cells = [number(evaluation.log_likelihood, ".2f")]
-            if truth:
-                cells = [
-                    *(about(rmse) for rmse in evaluation.rmse),
-                    about(evaluation.score),
-                    number(evaluation.nees.value, ".3g"),
-                ]
-            rows.append([name, *cells, number(evaluation.nis.value, ".3g")])
-        what = "RMSE" if truth else "Log-likelihood of the innovations of a run, and their mean NIS,"
-        title = f"{what} on {len(self.seeds)} held-out {self.problem.seed_word} of {self.problem.name}"
-        note = "In brackets 95 % intervals. Score: mean over states of RMSE over scale." if truth else ""
-        return html(title, ["filter", *heads, "NIS"], rows, note)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -9,16 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from rich.console import RenderableType
 from rich.text import Text
 
 from thruster_env.core.checks import finite, short_repr
 from thruster_env.core.files import save_figure
-from thruster_env.core.text_tables import plain_text, table
+from thruster_env.core.text_tables import Table
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import check_picture
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.api.display import drawn, frame, html
 from tuning.api.markers import (
     FILTER,
     LOGS,
@@ -34,6 +32,7 @@ from tuning.api.markers import (
 )
 from tuning.api.progress import console_for
 from tuning.api.read_logs import recorded_runs
+from tuning.api.result import Result, drawn, frame
 from tuning.identification.family import with_ranges
 from tuning.identification.identify import STARTS, check_excitation
 from tuning.identification.identify import identify as identify_runs
@@ -64,7 +63,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identified:
+class Identified(Result):
     """Maximum-likelihood values of free parameters, their uncertainty, and the model's errors on other runs.
 
     Attributes:
@@ -166,28 +165,28 @@ class Identified:
         """
         return drawn(profile_figure(self.found, profiles(self.found, names)))
 
-    def _rows(self) -> list[list[str]]:
-        """A row per parameter: unit, start, value, standard error, whether it is determined, and a test."""
-        tests, rows = self.found.null_tests, []
+    @property
+    def title(self) -> str:
+        """The number of runs."""
+        count, steps = len(self.runs), sum(log.steps for log in self.runs)
+        return f"Identified on {count} run{'' if count == 1 else 's'}, {steps} steps"
+
+    def figures(self) -> dict[str, Figure]:
+        """Profile likelihoods, if they were asked for."""
+        return {"Profile likelihoods": profile_figure(self.found, self.curves)} if self.curves else {}
+
+    def tables(self) -> list[Table | str]:
+        """The parameters, the validation and what the runs determine, for a terminal."""
+        heads = ["", "start", "value", "standard\nerror", "determined", "if left\nout, at", "p"]
+        tests, labels = self.found.null_tests, []
         units = {parameter.name: parameter.unit for parameter in self.found.objective.coordinates.free}
         for name, value in self.values.items():
             known = "yes" if self.determined[name] else "at the end" if self.found.at_end[name] else "no"
             test = tests.get(name)
             numbers = [f"{number:.5g}" for number in (self.found.start[name], value, self.standard_errors[name])]
             without = ["-", "-"] if test is None else [f"{test.at:.4g}", test.said]
-            rows.append([name, units[name], *numbers, known, *without])
-        return rows
-
-    def _title(self) -> str:
-        count, steps = len(self.runs), sum(log.steps for log in self.runs)
-        return f"Identified on {count} run{'' if count == 1 else 's'}, {steps} steps"
-
-    def tables(self) -> list[RenderableType]:
-        """The parameters, the validation and what the runs determine, for a terminal."""
-        heads = ["", "start", "value", "standard\nerror", "determined", "if left\nout, at", "p"]
-        labels = [
-            [index_pairs(name) + (f" [{unit}]" if unit else ""), *cells] for name, unit, *cells in self._rows()
-        ]
+            label = index_pairs(name) + (f" [{units[name]}]" if units[name] else "")
+            labels.append([label, *numbers, known, *without])
         where = "On the runs used for identification"
         if self.held_out:
             where = f"Validation on {'; '.join(log.name for log in self.held_out)}"
@@ -200,7 +199,7 @@ class Identified:
             rows.append([f"fit of the simulation, {symbol} [%]", *fits])
         rows.append(["mean NIS over channels", *(f"{check.nis:.3g}" for check in checked.values())])
         rows.append(["log-likelihood", *(f"{check.log_likelihood:.6g}" for check in checked.values())])
-        tables = [table(self._title(), heads, labels), table(where, ["", *checked], rows)]
+        tables = [Table(self.title, heads, labels), Table(where, ["", *checked], rows)]
         return [*tables, *self.sentences(), *(f"wrote {path}" for path in self.files)]
 
     def as_dict(self) -> dict[str, Any]:
@@ -237,20 +236,12 @@ class Identified:
         """Of the command: 130 if it was interrupted."""
         return 130 if self.interrupted else 0
 
-    def __str__(self) -> str:
-        """What `thruster identify` prints."""
-        return plain_text(self.tables())
-
     def __repr__(self) -> str:
         values = ", ".join(f"{name} {value:.4g}" for name, value in list(self.values.items())[:6])
         more = ", ..." if len(self.values) > 6 else ""
         loose = sum(not known for known in self.determined.values())
         verdict = f"{loose} of {len(self.values)} not determined" if loose else "all determined"
         return f"Identified({values}{more}; {verdict}, {len(self.runs)} runs)"
-
-    def _repr_html_(self) -> str:
-        heads = ["", "unit", "start", "value", "standard error", "determined", "if left out, at", "p"]
-        return html(self._title(), heads, self._rows(), " ".join(self.sentences()))
 
 
 def identify(

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
-
-from filters.registry import FILTERS
 
 # Panels of the help, in the order in which verbs declare their parameters.
 INPUT, FILTER, SEARCH, LEARNING, RUNS, OUTPUT = "Input", "Filter", "Search", "Learning", "Runs", "Output"
@@ -29,7 +28,9 @@ class Option:
         metavar: word for its value.
         type: of its value, if the annotation allows more than a command line can express.
         default: if it differs from the function's.
-        choices: names that are accepted in any case, or which list of `tuning.cli.verbs.names_in`.
+        choices: names that are accepted in any case, or which list of `tuning.cli.verbs.names_in`. They follow a
+            description that ends with a colon.
+        listed: what follows instead.
         least: of a number.
         most: of a number.
         file: READ or WRITTEN: whether a file can be written is checked before anything runs.
@@ -42,6 +43,7 @@ class Option:
     type: Any = None
     default: Any = UNSET
     choices: Iterable[str] | str | None = None
+    listed: str = ""
     least: float | None = None
     most: float | None = None
     file: str | None = None
@@ -84,7 +86,9 @@ class PythonOnly:
 Progress = Annotated[bool | None, PythonOnly(True)]
 Seed = Annotated[int, Option(RUNS, least=0)]
 Augment = Annotated[Sequence[str] | Mapping[str, Any], Option(FILTER, metavar="NAME[:STD[:WALK]]", type=list[str])]
-FilterOption = Option(FILTER, ("--filter",), type=str, choices=(*FILTERS, "auto"))
+FilterOption = Option(FILTER, ("--filter",), type=str, choices="filters")
 TunedArgument = Argument(FILTER, ("--tuned",), "FILE", str, file=READ)
 PresetOption = Option(INPUT, type=str, choices="presets", file=READ)
 ModelOption = Option(INPUT, metavar="MODULE:OBJECT", type=str)
+CodeProblem = Annotated[Any, Option(INPUT, ("--problem",), "MODULE:OBJECT", list[str])]
+TunedFile = Annotated[str | Path, Argument(FILTER, metavar="FILE", type=Path, file=READ)]

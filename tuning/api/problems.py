@@ -15,7 +15,7 @@ from tuning.logs.problem import problems_in
 from tuning.problems import find
 from tuning.problems.assumed import augmented, unknowns_of
 from tuning.problems.check import checked_problem
-from tuning.problems.plant_packages import built_in, logs_package
+from tuning.problems.find import built_in, logs_package
 from tuning.problems.problem import Problem
 
 RULE = (

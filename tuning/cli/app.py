@@ -14,6 +14,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
+import tuning
 from tuning.cli.main import PrintedWhole
 
 PANELS = {
@@ -33,11 +34,10 @@ PANELS = {
     "Policies and learned estimators": ("train", "score", "play", "train-estimator"),
     "Published results and long studies": ("reproduce", "study"),
 }
-VERBS = {
-    "tune": "study",
-    **{name: name for name in ("fit", "compare", "evaluate", "estimate", "identify")},
-}  # functions, and their files in tuning.api
 COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
+VERBS = {
+    name for name in COMMANDS if name.replace("-", "_") in tuning.__all__
+}  # made from the function of that name
 MARKUP: Final = "markdown"
 LOADING = "loading ..."
 RENAMED = {"--way": "--method", "--sampler": "--method", "ways": "methods"}
@@ -120,13 +120,13 @@ class Commands(Group):
             return listed(name)
         if name not in self._made:
             alone = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
-            if name in VERBS:
-                verb = getattr(imported(f"tuning.api.{VERBS[name]}"), file_of(name))
-                alone.command(name, cls=Command)(imported("tuning.cli.verbs").command_of(verb))
-            elif hasattr(module := imported(f"tuning.cli.{file_of(name)}"), "app"):
+            is_verb = name in VERBS
+            module = imported(tuning.home_of(file_of(name)) if is_verb else f"tuning.cli.{file_of(name)}")
+            if hasattr(module, "app"):
                 alone = module.app
             else:
-                alone.command(name, cls=Command)(module.command)
+                function = getattr(module, file_of(name) if is_verb else "command")
+                alone.command(name, cls=Command)(imported("tuning.cli.verbs").command_of(function))
             self._made[name] = get_command(alone)
             self._made[name].name = name
         return self._made[name]
@@ -141,7 +141,8 @@ def listed(name: str) -> TyperCommand:
     """A command with its name, panel and help alone, read from its file."""
     file, function = Path(__file__).with_name(f"{file_of(name)}.py"), "command"
     if name in VERBS:
-        file, function = file.parents[1] / "api" / f"{VERBS[name]}.py", file_of(name)
+        parts = tuning.home_of(file_of(name)).split(".")[1:]
+        file, function = file.parents[1].joinpath(*parts).with_suffix(".py"), file_of(name)
     tree = ast.parse(file.read_text(encoding="utf-8"))
     functions = [part for part in tree.body if isinstance(part, ast.FunctionDef) and part.name == function]
     text = (ast.get_docstring(functions[0] if functions else tree) or "").partition("\n\nArgs:")[0]

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json as json_module
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 from rich.console import RenderableType
 
-from thruster_env.core.text_tables import table
+from thruster_env.core.text_tables import Table
 from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.parameters import (
     PresetFile,
@@ -21,8 +20,8 @@ from thruster_env.thruster.parameters import (
 )
 from thruster_env.thruster.plant import make_plant
 from tuning.api.identify import DEFAULT_OUT
-from tuning.cli.options import INPUT, OUTPUT, ColumnOption, JsonOption, LogPresetOption
-from tuning.cli.output import announce_compilation, check_targets, emit
+from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, Argument, Option, PresetOption
+from tuning.api.result import Printed
 from tuning.experiments.bollard import FITTED, Identified, identify, read_table, relative_errors
 from tuning.identification.identify import identify as identify_logs
 from tuning.identification.result import Identification
@@ -36,45 +35,37 @@ RATE = Parameter("motor_rate", 0.05, 20.0, default=1.0)  # the factor on all thr
 
 
 def command(
-    path: Annotated[
-        Path,
-        typer.Argument(
-            metavar="TABLE.csv",
-            help="Table of pwm_us, rpm, current_A, voltage_V and force_kgf (docs/identify.md).",
-        ),
-    ],
-    step: Annotated[
-        Path | None,
-        typer.Option(metavar="LOG", help="A step response, for the time constants.", rich_help_panel=INPUT),
-    ] = None,
-    column: ColumnOption = None,
-    dt: Annotated[
-        float | None, typer.Option(help="Sample time [s] of a step response without times.", rich_help_panel=INPUT)
-    ] = None,
-    preset: LogPresetOption = None,
-    out: Annotated[
-        Path, typer.Option(help="File for the result, a --preset for other commands.", rich_help_panel=OUTPUT)
-    ] = DEFAULT_OUT,
-    json: JsonOption = None,
-) -> None:
+    path: Annotated[Path, Argument(INPUT, metavar="TABLE.csv", file=READ)],
+    step: Annotated[Path | None, Option(INPUT, metavar="LOG", file=READ)] = None,
+    column: Annotated[Sequence[str], Option(INPUT, metavar="NAME=HEADER[UNIT]")] = (),
+    dt: Annotated[float | None, Option(INPUT)] = None,
+    preset: Annotated[str | None, PresetOption] = None,
+    out: Annotated[Path, Option(OUTPUT, file=WRITTEN)] = DEFAULT_OUT,
+) -> Printed:
     """Identify a thruster from a bollard table, write its preset file, and say how well it fits.
 
     The table gives thrust, torque and speed in steady state; an optional step response how fast motor and flow
     follow. Everything else is that of the preset, t200 by default.
 
     Example: thruster bollard table.csv --step step.csv --column speed=motor_rpm --out mine.toml
+
+    Args:
+        path: table of pwm_us, rpm, current_A, voltage_V and force_kgf (docs/identify.md).
+        step: a step response, for the time constants.
+        column: the column of an input or measurement of the step response; may be repeated.
+        dt: sample time [s] of a step response without times.
+        preset: the thruster whose other parameters are taken:
+        out: file for the result, a --preset for other commands.
     """
     if not is_file(out):
         raise ValueError(f"a preset file must end in .toml, but got {str(out)!r}")
-    check_targets((out,), json, read=(path, step, preset))
     read = read_table(path)
     supplies = np.unique(read.supply).tolist()
     held_out = supplies[2:-1:2] or supplies[1:2]  # between others, so that nothing is extrapolated
     fit = identify(read, held_out, preset_parameters(preset or INFERRED))
     errors, parameters, timed = relative_errors(fit, read, held_out), fit.thruster, None
     if step is not None:
-        announce_compilation()
-        timed, parameters = from_step(step, parameters, preset or INFERRED, columns=column, dt=dt)
+        timed, parameters = from_step(step, parameters, preset or INFERRED, columns=list(column) or None, dt=dt)
     identified = {
         "table": path.name,
         "held_out_supplies": held_out,
@@ -89,7 +80,7 @@ def command(
         "step": timed and {"values": timed.values, "standard_errors": timed.standard_errors},
         "files": [str(out)],
     }
-    emit(_report(fit, errors, held_out, timed, out), json_module.loads(json_module.dumps(data)), json)
+    return Printed(_report(fit, errors, held_out, timed, out), data)
 
 
 def from_step(
@@ -129,7 +120,7 @@ def _report(
 ) -> list[RenderableType]:
     rows = [[name, f"{getattr(fit.thruster, name):.5g}"] for name in FITTED]
     rows += [[name, f"{value:.5g}"] for name, value in fit.pulse_widths._asdict().items()]
-    part: list[RenderableType] = [table("Fitted to the table", ["", "value"], rows)]
+    part: list[RenderableType] = [Table("Fitted to the table", ["", "value"], rows)]
     rows = [
         [quantity, *(f"{e['median']:.1%} ({e['90 %']:.1%})" for group in groups.values() for e in group.values())]
         for quantity, groups in errors.items()
@@ -137,10 +128,10 @@ def _report(
     columns = ["", "fitted\nahead", "fitted\nastern", "held out\nahead", "held out\nastern"]
     supplies = ", ".join(f"{supply:g}" for supply in held_out)
     title = f"Relative errors, median (90th percentile); held out: {supplies} V"
-    part.append(table(title, columns, rows))
+    part.append(Table(title, columns, rows))
     if timed is not None:
         rows = [[name, f"{timed.values[name]:.5g}", f"{timed.standard_errors[name]:.3g}"] for name in timed.names]
-        part += [table("From the step response", ["", "value", "standard error"], rows), *timed.sentences()]
+        part += [Table("From the step response", ["", "value", "standard error"], rows), *timed.sentences()]
     else:
         part.append(
             "A static table does not determine time constants: those of the preset are kept. --step LOG "

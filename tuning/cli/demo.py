@@ -10,19 +10,21 @@ import warnings
 from pathlib import Path
 from typing import Annotated
 
-import typer
-from rich.table import Table
+from rich.table import Table as RichTable
 
 from filters.filter import Filter
-from thruster_env.core.text_tables import table
-from tuning.api.run import Tuning, run_tuning
-from tuning.cli.options import JsonOption, SeedOption
-from tuning.cli.output import announce_compilation, emit, progress_console, working
+from thruster_env.core.text_tables import Table
+from tuning.api.markers import OUTPUT, RUNS, Option, Seed
+from tuning.api.progress import working
+from tuning.api.report import Report, write_report
+from tuning.api.result import Printed
+from tuning.api.study import INTERRUPTED, Study
+from tuning.api.tune import run_tuning
+from tuning.cli.output import progress_console
 from tuning.evaluation.baselines import NOISE, ORACLE, TUNED, baselines, same_filter
 from tuning.evaluation.evaluate import score_ratio
 from tuning.problems.problem import score_label
 from tuning.reporting.leaderboard import above_bound, consistency_cells
-from tuning.reporting.report import Report, write_report
 from tuning.reporting.search_figures import comparison_figure, history_figure
 from tuning.reporting.time_figures import estimates_figure
 from tuning.reporting.tuning_report import as_json
@@ -39,26 +41,28 @@ LEGEND = (
 
 
 def command(
-    out: Annotated[Path, typer.Option(help="Folder of the pictures, the report and the tuned file.")] = Path(
-        "out"
-    ),
-    trials: Annotated[int, typer.Option(help="Total number of finished trials of the study.")] = 50,
-    seed: SeedOption = 0,
-    json: JsonOption = None,
-) -> None:
+    out: Annotated[Path, Option(OUTPUT)] = Path("out"),
+    trials: Annotated[int, Option(RUNS)] = 50,
+    seed: Seed = 0,
+) -> Printed:
     """Tune an extended Kalman filter, evaluate it on held-out seeds, draw it before and after, write its report.
 
     One thrust in twenty is off by some 10 N, which the sensor's data sheet does not mention. Table, pictures and
     page compare the tuned filter with four others on the same 200 held-out runs. A second study chooses the filter
     type, too, among all that take at most a microsecond a step.
+
+    Args:
+        out: folder of the pictures, the report and the tuned file.
+        trials: total number of finished trials of the study.
+        seed: seed of all randomness; the same seed gives the same results.
     """
     started = time.perf_counter()
     storage = str(out / "studies.journal")
     plan = Plan(FILTER, (find_scenario(SCENARIO),), seed)
     file = out / f"{FILTER}-{SCENARIO}-seed{seed}.json"
-    tuning = tune(plan, trials, storage=storage, out=file)
+    tuning = run_tuning(plan, trials, progress_console, storage, out=file)
     best = None if tuning.result.interrupted else best_type(plan, trials, storage, out)
-    with working("drawing"):
+    with working("drawing", progress_console):
         pictures = draw(tuning, out)
         report = write_report(file, storage, out)
     seconds = time.perf_counter() - started
@@ -71,31 +75,24 @@ def command(
         "seconds": seconds,
     }
     output = [*result(tuning, best, report, seconds), *files(file, best, pictures, report), *next_steps()]
-    emit(output, data, json)
-    if best is None or best.result.interrupted:
-        sys.exit(130)
+    return Printed(output, data, INTERRUPTED if best is None or best.result.interrupted else 0)
 
 
-def tune(plan: Plan, trials: int, storage: str, out: Path) -> Tuning:
-    """Run or resume a study with a progress bar."""
-    announce_compilation()
-    return run_tuning(plan, trials, progress_console, storage, out=out)
-
-
-def best_type(plan: Plan, trials: int, storage: str, out: Path) -> Tuning:
+def best_type(plan: Plan, trials: int, storage: str, out: Path) -> Study:
     """A study of the filter type and its parameters, within the budget, on the same runs."""
     plan = plan._replace(filter=AUTO, budget=BUDGET)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # few trials: a demo is short
-        return tune(plan, trials, storage=storage, out=out / f"{AUTO}-{SCENARIO}-seed{plan.seed}.json")
+        file = out / f"{AUTO}-{SCENARIO}-seed{plan.seed}.json"
+        return run_tuning(plan, trials, progress_console, storage, out=file)
 
 
-def result(tuning: Tuning, best: Tuning | None, report: Report, seconds: float) -> list[str | Table]:
+def result(tuning: Study, best: Study | None, report: Report, seconds: float) -> list[str | RichTable]:
     """What was tuned on what, the errors before and after, and one sentence on the gain."""
     outcome, seeds = tuning.result, len(tuning.comparison.seeds)
     stopped = ", interrupted," if outcome.interrupted else ""
     return [
-        f"An extended Kalman filter (EKF) where {tuning.scenario.about}: {outcome.finished} trials{stopped} on "
+        f"An extended Kalman filter (EKF) where {tuning.problem.about}: {outcome.finished} trials{stopped} on "
         f"{TRAINING_SEEDS} runs, evaluated on {seeds} others, in {seconds:.0f} s.",
         report.advice,
         "",
@@ -106,7 +103,7 @@ def result(tuning: Tuning, best: Tuning | None, report: Report, seconds: float) 
     ]
 
 
-def advice_on_type(tuning: Tuning, best: Tuning) -> str:
+def advice_on_type(tuning: Study, best: Study) -> str:
     """What the choice of the filter type is worth."""
     ratio = score_ratio(best.comparison.tuned, tuning.comparison.tuned)
     gain = f"{100 * (1 - ratio.value):.0f} % below" if ratio.high < 1 else "no better than"
@@ -117,9 +114,9 @@ def advice_on_type(tuning: Tuning, best: Tuning) -> str:
     )
 
 
-def error_table(tuning: Tuning, best: Tuning | None) -> Table:
+def error_table(tuning: Study, best: Study | None) -> RichTable:
     """A row a filter: its R, the RMSE of both states and how far above the bound it lies, mean NEES and NIS."""
-    comparison, scenario = tuning.comparison, tuning.scenario
+    comparison, scenario = tuning.comparison, tuning.problem
     choices = {TUNED: tuning.result.choice, **baselines(FILTER, scenario, tuning.plan.seed)}
     rows = []
     evaluations, reference = dict(comparison.evaluations), {*comparison.evaluations} - {TUNED}
@@ -140,14 +137,14 @@ def error_table(tuning: Tuning, best: Tuning | None) -> Table:
         for state in scenario.model().states
         for head in ("\n".join([*state.name.split(), f"[{state.unit}]"]), "above\nbound")
     ]
-    output = table(None, ["filter", "R\n[N^2]", *heads, "mean\nNEES", "mean\nNIS"], rows)
+    output = Table("", ["filter", "R\n[N^2]", *heads, "mean\nNEES", "mean\nNIS"], rows).__rich__()
     output.show_edge = False
     return output
 
 
-def draw(tuning: Tuning, out: Path) -> dict[Path, str]:
+def draw(tuning: Study, out: Path) -> dict[Path, str]:
     """Draw the tuned filter before and after, errors and search; return a caption for each file."""
-    comparison, scenario = tuning.comparison, tuning.scenario
+    comparison, scenario = tuning.comparison, tuning.problem
     label, data = f"{tuning.result.choice.name} on {scenario.name}", scenario.data(comparison.seeds[:1])
     run = estimates_figure(out / "estimates.png", before_and_after(tuning), data, 0, scenario.dt)
     errors = comparison_figure(
@@ -163,15 +160,15 @@ def draw(tuning: Tuning, out: Path) -> dict[Path, str]:
     }
 
 
-def before_and_after(tuning: Tuning) -> dict[str, Filter]:
+def before_and_after(tuning: Study) -> dict[str, Filter]:
     """The best baseline and the tuned filter, by the titles of their pictures."""
     before = best_baseline(tuning)
-    choices = {before: baselines(FILTER, tuning.scenario, tuning.plan.seed)[before], TUNED: tuning.result.choice}
+    choices = {before: baselines(FILTER, tuning.problem, tuning.plan.seed)[before], TUNED: tuning.result.choice}
     words = (f"before: {before}", f"after: {TUNED}")
-    return {word: choice.filter(tuning.scenario) for word, choice in zip(words, choices.values(), strict=True)}
+    return {word: choice.filter(tuning.problem) for word, choice in zip(words, choices.values(), strict=True)}
 
 
-def best_baseline(tuning: Tuning) -> str:
+def best_baseline(tuning: Study) -> str:
     """The baseline with the lowest score among those that need no truth."""
     evaluations = tuning.comparison.evaluations
     return min(
@@ -180,7 +177,7 @@ def best_baseline(tuning: Tuning) -> str:
     )
 
 
-def files(tuned: Path, best: Tuning | None, pictures: dict[Path, str], report: Report) -> list[str]:
+def files(tuned: Path, best: Study | None, pictures: dict[Path, str], report: Report) -> list[str]:
     """The paths of all files."""
     about = {
         **pictures,

@@ -9,7 +9,6 @@ from inspect import cleandoc
 from itertools import groupby
 from typing import Annotated, Any, NamedTuple
 
-import typer
 from rich.console import RenderableType
 from rich.text import Text
 
@@ -17,10 +16,9 @@ from filters.engine.compile import new_memory
 from filters.ensembles.stochastic import EnsembleKalmanFilter
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_type
-from thruster_env.core.text_tables import console, table
-from tuning.cli.options import INPUT, JsonOption, spelt
-from tuning.cli.output import emit
-from tuning.cli.problems import PROBLEMS
+from thruster_env.core.text_tables import Table, console
+from tuning.api.markers import INPUT, Argument, Option
+from tuning.api.result import Printed
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
 from tuning.search.parameters import GAUSSIANS, KALMAN_SIZES, PARTICLE_SIZES
@@ -70,7 +68,7 @@ def fit_table(problem: Problem, fits: list[Fit]) -> list[RenderableType]:
     sizes = ", ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts)
     title = f"Filters on {problem.name}: {sizes}"
     return [
-        table(title, ["filter", "fits", "N", "kB", "why not"], rows, words=True),
+        Table(title, ["filter", "fits", "N", "kB", "why not"], rows, words=True),
         "N: members or particles in the rule of thumb. kB: memory of one belief.",
     ]
 
@@ -106,15 +104,9 @@ class Entry(NamedTuple):
 
 
 def command(
-    name: Annotated[str | None, typer.Argument(help="A filter to show in full.", callback=spelt(FILTERS))] = None,
-    problem: Annotated[
-        str | None,
-        typer.Option(
-            "--problem", "--scenario", help=f"Show which filters fit its model. {PROBLEMS}", rich_help_panel=INPUT
-        ),
-    ] = None,
-    json: JsonOption = None,
-) -> None:
+    name: Annotated[str | None, Argument(INPUT, choices=FILTERS)] = None,
+    problem: Annotated[str | None, Option(INPUT, ("--problem", "--scenario"), choices="problems")] = None,
+) -> Printed:
     """List the filters and their parameters; or show one filter with its equations and sources.
 
     Other commands take these names for --filter; so do EstimateState and make_filter.
@@ -122,17 +114,22 @@ def command(
     Example: thruster filters ukf
 
     Example: thruster filters --problem my_module:problem
+
+    Args:
+        name: a filter to show in full.
+        problem: show which filters fit the model of a problem:
     """
     if name is not None:
         filter_type(name)
     if problem is not None:
         chosen = find_problem(problem)
         fits = fits_of(chosen, tuple(FILTERS) if name is None else (name,))
-        emit(fit_table(chosen, fits), {"problem": chosen.name, "filters": [fit._asdict() for fit in fits]}, json)
-        return
+        return Printed(
+            fit_table(chosen, fits), {"problem": chosen.name, "filters": [fit._asdict() for fit in fits]}
+        )
     entries = [entry(known) for known in FILTERS if name in (None, known)]
     output = overview(entries) if name is None else in_full(entries[0], console.width)
-    emit(output, {"filters": [_plain(listed) for listed in entries]}, json)
+    return Printed(output, {"filters": [_plain(listed) for listed in entries]})
 
 
 def entry(name: str) -> Entry:
@@ -157,8 +154,8 @@ def overview(entries: list[Entry]) -> list[RenderableType]:
         numbers.append([Text(textwrap.fill(", ".join(names), OWNERS_WIDTH), style="bold"), "", ""])
         numbers += [[f"  {number.name}", number.default, first_sentence(number.meaning)] for number in group]
     return [
-        table("Filters", ["filter", "what it is", "cov.", "ens."], filters, words=True),
-        table("Parameters of the filters themselves", ["of; number", "default", "meaning"], numbers, words=True),
+        Table("Filters", ["filter", "what it is", "cov.", "ens."], filters, words=True),
+        Table("Parameters of the filters themselves", ["of; number", "default", "meaning"], numbers, words=True),
         "cov.: it has a covariance, the uncertainty of the estimate. ens.: it has an ensemble.",
         f"ensemble_size: {MADE} members in make_filter and estimate, {KALMAN_SIZES.untuned} in the rule of thumb, "
         f"from which tune, evaluate and compare start (particles: {PARTICLE_SIZES.untuned} in both, "
@@ -174,7 +171,7 @@ def in_full(entry: Entry, width: int) -> list[RenderableType]:
     output: list[RenderableType] = [Text(entry.name, style="bold"), f"{kind.__module__}.{kind.__name__}", has, ""]
     output.append(fitted(entry.documentation, width))
     if entry.numbers:
-        output += ["", table("Its own numbers", ["number", "default", "meaning"], list(entry.numbers), words=True)]
+        output += ["", Table("Its own numbers", ["number", "default", "meaning"], list(entry.numbers), words=True)]
     return output
 
 

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 
 from thruster_env.core.checks import within
 from thruster_env.core.files import BLUE, DARK, RUST, new_figure, save_figure, tidy
-from thruster_env.core.text_tables import table
+from thruster_env.core.text_tables import Table
 from thruster_env.logs.write import check_picture
 from thruster_env.thruster.analysis import (
     INPUTS,
@@ -30,41 +29,36 @@ from thruster_env.thruster.analysis import (
 from thruster_env.thruster.linear import NO_LINEARISATION, SAMPLE_TIME, PublishedLinearModel, published_for
 from thruster_env.thruster.parameters import is_file
 from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, Plant, make_plant
-from tuning.cli.options import INPUT, OUTPUT, JsonOption, PresetOption
-from tuning.cli.output import check_targets, emit, warn_beyond
+from tuning.api.markers import INPUT, OUTPUT, WRITTEN, Option, PresetOption
+from tuning.api.result import Printed
+from tuning.cli.output import warn_beyond
 
 GAIN_UNITS = {"V_s": "N/V", "U_0": "N s/m"}  # of thrust over each input
 OUTPUTS = ("omega_m [rad/s]", "U_a [m/s]", "T [N]")
 
 
 def command(
-    preset: PresetOption = "tunnel",
-    voltage: Annotated[float, typer.Option(help="Operating voltage [V].", rich_help_panel=INPUT)] = 12.0,
-    ambient_velocity: Annotated[
-        float, typer.Option(help="Ambient flow along the axis U_0 [m/s].", rich_help_panel=INPUT)
-    ] = 0.0,
-    dt: Annotated[float, typer.Option(help="Sample time [s].", rich_help_panel=INPUT)] = DEFAULT_DT,
-    max_voltage: Annotated[
-        float, typer.Option(help="Voltage range the integration must follow [V].", rich_help_panel=INPUT)
-    ] = DEFAULT_MAX_VOLTAGE,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Bode plot and step response, .png, .svg or .pdf.",
-            show_default="out/inspect-PRESET-VOLTAGE.png",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    json: JsonOption = None,
-) -> None:
+    preset: Annotated[str, PresetOption] = "tunnel",
+    voltage: Annotated[float, Option(INPUT)] = 12.0,
+    ambient_velocity: Annotated[float, Option(INPUT)] = 0.0,
+    dt: Annotated[float, Option(INPUT)] = DEFAULT_DT,
+    max_voltage: Annotated[float, Option(INPUT)] = DEFAULT_MAX_VOLTAGE,
+    out: Annotated[Path | None, Option(OUTPUT, metavar="FILE", file=WRITTEN)] = None,
+) -> Printed:
     """Print and draw a thruster's linear model at a voltage: steady state, stiffness, control, responses.
 
     Example: thruster inspect --preset tunnel --voltage 12 --out tunnel.png
+
+    Args:
+        preset: the thruster:
+        voltage: operating voltage [V].
+        ambient_velocity: ambient flow along the axis U_0 [m/s].
+        dt: sample time [s].
+        max_voltage: voltage range the integration must follow [V].
+        out: Bode plot and step response, .png, .svg or .pdf; by default out/inspect-PRESET-VOLTAGE.png.
     """
     if out is not None:
         check_picture(out, "--out")
-    check_targets((out,), json, read=(preset,))
     plant = make_plant(preset, dt, max_voltage, ambient_velocity)
     voltage = within("voltage", voltage, max_voltage)
     warn_beyond(preset, voltage)
@@ -97,7 +91,7 @@ def command(
         "published": published,
         "picture": None if out is None else str(out),
     }
-    emit([title, _point_table(point, spread, ours, plant), _model_table(columns), *words], data, json)
+    return Printed([title, _point_table(point, spread, ours, plant), _model_table(columns), *words], data)
 
 
 def _point_table(point: SteadyState, spread: np.ndarray, analysis: Analysis, plant: Plant):
@@ -110,7 +104,7 @@ def _point_table(point: SteadyState, spread: np.ndarray, analysis: Analysis, pla
         ["stiffness: largest |eigenvalue| dt", f"{np.abs(analysis.eigenvalues).max() * plant.dt:.3g}"],
         ["Runge-Kutta substeps a sample time", str(plant.substeps)],
     ]
-    return table("", ["quantity", "value"], rows)
+    return Table("", ["quantity", "value"], rows)
 
 
 def _model_table(columns: dict[str, Analysis]):
@@ -129,7 +123,7 @@ def _model_table(columns: dict[str, Analysis]):
     ]
     rows = [list(row) for row in zip(labels, *map(_model_cells, columns.values()), strict=True)]
     caption = "* rank, condition number of the sampled pair, each state scaled by its range"
-    return table("Linear model in rad/s, m/s, V, N, s", ["quantity", *columns], rows, caption=caption)
+    return Table("Linear model in rad/s, m/s, V, N, s", ["quantity", *columns], rows, caption=caption)
 
 
 def _model_cells(analysis: Analysis) -> list[str]:

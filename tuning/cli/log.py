@@ -7,13 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import typer
 from rich.console import RenderableType
 
 from thruster_env.core.checks import listed
-from thruster_env.core.text_tables import console, plain_text, table
+from thruster_env.core.text_tables import Table, Unfolded, console, plain_text
 from thruster_env.env.record import ANY_DT
 from thruster_env.logs.columns import find_columns, quantities_of
 from thruster_env.logs.findings import sentences
@@ -24,18 +23,10 @@ from thruster_env.logs.recorders.bags import HEADER, RECEIPT
 from thruster_env.logs.recorders.registry import ENDINGS, Contents, Field, contents, format_of
 from thruster_env.logs.table import SUFFIXES, read_table
 from thruster_env.logs.write import check_picture, check_suffix, write_log
-from tuning.cli.main import PrintedWhole
-from tuning.cli.options import (
-    A_LOG,
-    INPUT,
-    OUTPUT,
-    JsonOption,
-    ReadingOptions,
-    with_groups,
-)
-from tuning.cli.output import check_targets, emit
-from tuning.logs.read import read_named
-from tuning.problems.plant_packages import logs_package
+from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, LogsArgument, Option
+from tuning.api.read_logs import recorded_runs
+from tuning.api.result import Printed
+from tuning.problems.find import logs_package
 
 # What `thruster log` shows of a recorder's file: its topics and their fields.
 
@@ -80,7 +71,7 @@ def _is_foreign(log: Path) -> bool:
     return True
 
 
-def found_in(log: Path, only: str | None, stamps: str | None = None) -> Contents:
+def listed_in(log: Path, only: str | None, stamps: str | None = None) -> Contents:
     """What is in a file, fields whose names contain a text in any case; ValueError if there are none."""
     every = contents(log, stamps)
     matching = [field for field in every.fields if only is None or only.casefold() in field.name.casefold()]
@@ -104,7 +95,7 @@ def _listed(unread: Mapping[str, str]) -> str:
     return listed(f"{name} ({why})" for name, why in unread.items())
 
 
-def as_table(log: Path, fields: Sequence[Field], is_terminal: bool) -> RenderableType:
+def as_table(log: Path, fields: Sequence[Field], is_terminal: bool) -> Table | Unfolded:
     """The table of fields: by topics for a terminal, or lines of plain text whose names nothing folds."""
     of_times = ["rate\n[Hz]", "longest\ngap [s]", "begin\n[s]", "end\n[s]"]
     columns = ["field", "samples", *of_times, "unit", "least", "greatest", "course"]
@@ -116,8 +107,8 @@ def as_table(log: Path, fields: Sequence[Field], is_terminal: bool) -> Renderabl
     caption = "To read it as a log: --column NAME=FIELD for each input and measurement"
     clocks = dict.fromkeys(CLOCKS[field.clock] for field in fields if field.clock)
     caption += f"; times: {' and '.join(clocks)}" if clocks else ""
-    output = table(title, columns, rows, caption=caption)
-    return output if is_terminal else plain_text([output], WIDE)
+    output = Table(title, columns, rows, caption=caption)
+    return output if is_terminal else Unfolded(plain_text([output], WIDE))
 
 
 def as_json(log: Path, contents: Contents) -> dict:
@@ -164,37 +155,13 @@ def _short(number: float) -> str:
     return f"{number:.4g}" if math.isfinite(number) else ""
 
 
-@with_groups
 def command(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help=A_LOG)],
+    log: Annotated[Any, LogsArgument(INPUT, metavar="LOG", type=Path, file=READ, last="stamps")],
     *,
-    reading: ReadingOptions,
-    only: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TEXT",
-            help="Of a recorder's file, list the fields whose names contain this.",
-            rich_help_panel=INPUT,
-        ),
-    ] = None,
-    plot: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Picture of all channels, findings marked: .png, .svg or .pdf.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Write the log as it is read, on its grid and in the model's units: .csv, .npz or .parquet.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    json: JsonOption = None,
-) -> None:
+    only: Annotated[str | None, Option(INPUT, metavar="TEXT")] = None,
+    plot: Annotated[Path | None, Option(OUTPUT, metavar="FILE", file=WRITTEN)] = None,
+    out: Annotated[Path | None, Option(OUTPUT, metavar="FILE", file=WRITTEN)] = None,
+) -> Printed:
     """Show how a recorded log is read: its channels, and the gaps, stuck sensors, outliers and the like in it.
 
     Other commands that read logs print the same before their results. docs/logs.md has the rules.
@@ -208,23 +175,24 @@ def command(
     Example: thruster log run.csv --sensor speed --column speed=motor_rpm --column voltage=u_cmd_V
 
     Example: thruster log flight.ulg --only actuator
+
+    Args:
+        log: recorded run.
+        only: of a recorder's file, list the fields whose names contain this.
+        plot: picture of all channels, findings marked: .png, .svg or .pdf.
+        out: write the log as it is read, on its grid and in the model's units: .csv, .npz or .parquet.
     """
-    of_log = {key: value for key, value in reading.named().items() if key != "stamps"}
-    if is_listed(log, only, any((*of_log.values(), plot, out))):
-        check_targets((), json, read=(log,))
-        selected = found_in(log, only, reading.stamps)
-        output, notes = as_table(log, selected.fields, console.is_terminal), remarks(selected)
-        with PrintedWhole():
-            emit([output, *notes] if console.is_terminal else [], as_json(log, selected), json)
-            if isinstance(output, str) and json != "-":
-                typer.echo("\n".join([output, *notes]))
-        return
+    runs = recorded_runs(log)
+    file, stamps = runs.files, runs.reading.get("stamps")
+    if is_listed(file, only, bool(runs.reading.keys() - {"stamps"}) or plot is not None or out is not None):
+        selected = listed_in(file, only, stamps)
+        output, notes = as_table(file, selected.fields, console.is_terminal), remarks(selected)
+        return Printed([output, *map(Unfolded, notes)], as_json(file, selected))
     if plot is not None:
         check_picture(plot, "--plot")
     if out is not None:
         check_suffix(out)
-    recorded, _ = read_named(log, **reading.named())
-    check_targets((plot, out), json, read=(log, reading.preset))
+    recorded, _ = runs.read()
     if out is not None:
         write_log(out, recorded)
     if plot is not None:
@@ -232,7 +200,7 @@ def command(
 
         findings_figure(plot, recorded)
     files = [str(path) for path in (plot, out) if path is not None]
-    emit([*_report(recorded), *(f"wrote {path}" for path in files)], _as_json(recorded, files), json)
+    return Printed([*_report(recorded), *(f"wrote {path}" for path in files)], _as_json(recorded, files))
 
 
 def _report(log: Log) -> list[RenderableType]:
@@ -251,7 +219,7 @@ def _report(log: Log) -> list[RenderableType]:
     title = f"{log.name}: {log.steps + 1} rows, dt {log.dt:g} s{on_grid}"
     columns = ["channel", "samples", "smallest", "largest", "standard\ndeviation"]
     messages = sentences(log.findings) or ["Nothing stands out: no gaps, no stuck sensors, no outliers."]
-    return [table(title, columns, rows), *messages]
+    return [Table(title, columns, rows), *messages]
 
 
 def _as_json(log: Log, files: list[str]) -> dict:

@@ -7,12 +7,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from thruster_env.core.checks import one_of
 from thruster_env.core.files import write_whole
-from tuning.cli.options import JsonOption, spelt
-from tuning.cli.output import check_targets, emit
+from tuning.api.markers import INPUT, Argument
+from tuning.api.result import Printed
+from tuning.cli.output import check_targets
 
 TEMPLATES = Path(__file__).parent / "templates"
 FILES = {kind: f"{kind}.py" for kind in ("problem", "model", "env", "filter")} | {"preset": "preset.toml"}
@@ -27,14 +26,9 @@ NEXT = {
 
 
 def command(
-    kind: Annotated[
-        str, typer.Argument(metavar="KIND", help=f"{', '.join(FILES)}.", callback=spelt(FILES), show_default=False)
-    ],
-    name: Annotated[
-        Path, typer.Argument(metavar="NAME", help="Name of the new file, .py or, for a preset, .toml.")
-    ],
-    json: JsonOption = None,
-) -> None:
+    kind: Annotated[str, Argument(INPUT, metavar="KIND", choices=FILES)],
+    name: Annotated[Path, Argument(INPUT, metavar="NAME")],
+) -> Printed:
     """Write a commented, working template of a problem, model, env, filter or thruster of your own.
 
     problem: a plant that generates data and what filters assume of it, for tune, evaluate and compare. model: a
@@ -42,15 +36,19 @@ def command(
     filter: a filter as in a textbook, for every --filter. preset: a thruster's parameters, for every --preset.
 
     Example: thruster new problem pendulum
+
+    Args:
+        kind: what it is:
+        name: name of the new file, .py or, for a preset, .toml.
     """
     file = target(kind, name)
-    check_targets((file,), json)
+    check_targets((file,), None)
     text = (TEMPLATES / FILES[kind]).read_text(encoding="utf-8").replace(f"{NAMED}.toml", str(file))
     cls = file.stem.title().replace("_", "")  # of a filter
     write_whole(file, text.replace(NAMED.title(), cls).replace(NAMED, file.stem))
     following = NEXT[kind].format(name=file.stem, cls=cls, file=file if kind == "preset" else file.name)
     where = "" if kind == "preset" or file.parent == Path() else f", in {file.parent}"
-    emit([f"wrote {file}", f"Try it{where}: {following}"], {"file": str(file), "next": following}, json)
+    return Printed([f"wrote {file}", f"Try it{where}: {following}"], {"file": str(file), "next": following})
 
 
 def target(kind: str, name: Path) -> Path:

@@ -5,25 +5,15 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console, RenderableType
-from rich.text import Text
 
-from thruster_env.core.checks import listening
-from thruster_env.core.compiled import tell_when_compiling
 from thruster_env.core.files import check_not_read, check_target, write_whole
-from thruster_env.core.text_tables import console
-from thruster_env.logs.recorders.registry import ENDINGS
-from thruster_env.logs.table import SUFFIXES
-from thruster_env.logs.write import check_not_among
-from thruster_env.thruster.plant import largest_known_voltage
+from thruster_env.core.text_tables import Unfolded, console
 from tuning.cli.main import PrintedWhole
-from tuning.cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
 
 progress_console = Console(stderr=True, markup=False, highlight=False)
 
@@ -40,12 +30,20 @@ def emit(parts: Sequence[RenderableType], data: dict, json_target: str | None) -
         write_whole(json_target, as_text(data))
     with PrintedWhole():
         for part in parts:
-            console.print(part)
+            if isinstance(part, Unfolded) and not console.is_terminal:
+                sys.stdout.write(f"{part}\n")
+            else:
+                console.print(part)
 
 
 def _check_json(target: str | None) -> None:
     """Raise ValueError for a path that would be a log, or the description of one."""
-    if target is not None and Path(target).suffix in (*SUFFIXES, *ENDINGS, ".toml"):
+    if target is None:
+        return
+    from thruster_env.logs.recorders.registry import ENDINGS
+    from thruster_env.logs.table import SUFFIXES
+
+    if Path(target).suffix in (*SUFFIXES, *ENDINGS, ".toml"):
         raise ValueError(f"--json must be no log, nor what is said of one, but got {target!r}")
 
 
@@ -61,6 +59,8 @@ def check_targets(targets: Iterable[str | Path | None], json_target: str | None,
     inputs = [path for path in read if path is not None]
     for target in named:
         check_not_read(target, inputs)
+    if named:
+        from thruster_env.logs.write import check_not_among
     for target in named:
         check_not_among(target)
         check_target(target)
@@ -69,6 +69,8 @@ def check_targets(targets: Iterable[str | Path | None], json_target: str | None,
 
 def warn_beyond(preset: str, voltage: float) -> None:
     """Say on standard error that a preset is driven by a larger voltage [V] than it is valid for."""
+    from thruster_env.thruster.plant import largest_known_voltage
+
     known = largest_known_voltage(preset)
     if abs(voltage) > known:
         message = f"{preset} is valid up to {known:g} V, but is driven by {abs(voltage):g} V: this is extrapolated"
@@ -78,17 +80,11 @@ def warn_beyond(preset: str, voltage: float) -> None:
 @cache
 def announce_compilation() -> None:
     """Say on standard error when this process has to compile; later ones find the result in a cache."""
+    from thruster_env.core.compiled import tell_when_compiling
+
     tell_when_compiling(
         lambda: progress_console.print("compiling numerical code: the first run only, some seconds per filter ...")
     )
-
-
-@contextmanager
-def working(text: str) -> Iterator[None]:
-    """Say on standard error what is running, with its progress if known."""
-    with progress_console.status(Text(f"{text} ...")) as status:  # names are a user's, and no markup
-        with listening(lambda far: status.update(Text(f"{text}: {far}"))):
-            yield
 
 
 def as_text(data) -> str:
@@ -101,7 +97,7 @@ def _plain(value):
         return {str(key): _plain(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(part) for part in value]
-    if isinstance(value, np.ndarray | np.generic):
+    if hasattr(value, "tolist"):  # an array, or a number of NumPy's
         return _plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None

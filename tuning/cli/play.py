@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import gymnasium as gym
 import numpy as np
-import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 import thruster_env  # noqa: F401 - registers the envs
@@ -25,19 +24,20 @@ from thruster_env.render.renderer import OnStep, Played, check_drawing, steps_a_
 from thruster_env.thruster.controllers import PIController
 from thruster_env.thruster.env import renderer_of
 from thruster_env.thruster.rendering import Moment, Overlay
-from tuning.cli.options import (
+from tuning.api.markers import (
     FILTER,
-    FILTER_HELP,
     INPUT,
     OUTPUT,
+    READ,
     RUNS,
-    ColumnOption,
-    JsonOption,
-    LogPresetOption,
-    SensorOption,
-    filter_option,
+    WRITTEN,
+    Argument,
+    FilterOption,
+    Option,
+    PresetOption,
 )
-from tuning.cli.output import announce_compilation, check_targets, emit, progress_console, warn_beyond
+from tuning.api.result import Printed
+from tuning.cli.output import check_targets, progress_console, warn_beyond
 from tuning.problems.data import held_out_seeds
 from tuning.problems.excitation import EXCITATIONS, excitation_of
 from tuning.thruster.scenario import voltages_of
@@ -46,62 +46,22 @@ STEPS = 500
 
 
 def command(
-    model: Annotated[
-        Path | None, typer.Argument(metavar="MODEL", help="Folder of a policy, that `thruster train` made.")
-    ] = None,
-    policy: Annotated[
-        str | None,
-        typer.Option(
-            help="pi, the default: the controller on the measured thrust follows a reference.",
-            rich_help_panel=INPUT,
-        ),
-    ] = None,
-    voltage: Annotated[float | None, typer.Option(help="A constant voltage [V].", rich_help_panel=INPUT)] = None,
-    excitation: Annotated[
-        str | None,
-        typer.Option(help="A sequence of voltages: steps, prbs, levels, multi-sine, ...", rich_help_panel=INPUT),
-    ] = None,
-    log: Annotated[Path | None, typer.Option(help="A recorded run of a thruster.", rich_help_panel=INPUT)] = None,
-    preset: LogPresetOption = None,
-    sensor: SensorOption = None,
-    column: ColumnOption = None,
-    filter_name: Annotated[
-        str | None, filter_option(f"Filter whose estimate is drawn; ekf by default. {FILTER_HELP}")
-    ] = None,
-    tuned: Annotated[
-        Path | None, typer.Option(help="Tuned file, in place of --filter.", rich_help_panel=FILTER)
-    ] = None,
-    steps: Annotated[
-        int | None, typer.Option(help=f"Steps of an episode; {STEPS} by default.", rich_help_panel=RUNS)
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(
-            min=0, help="Seed of the episode; for a policy a held-out one by default.", rich_help_panel=RUNS
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="An .mp4 or .gif; by default an .mp4 in MODEL, or in out.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    window: Annotated[
-        bool,
-        typer.Option("--window", help="Show it in a window instead, in real time.", rich_help_panel=OUTPUT),
-    ] = False,
-    size: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WIDTHxHEIGHT",
-            help="Size of the picture in pixels; 640x400 by default.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    json: JsonOption = None,
-) -> None:
+    model: Annotated[Path | None, Argument(INPUT, metavar="MODEL")] = None,
+    policy: Annotated[str | None, Option(INPUT)] = None,
+    voltage: Annotated[float | None, Option(INPUT)] = None,
+    excitation: Annotated[str | None, Option(INPUT)] = None,
+    log: Annotated[Path | None, Option(INPUT, file=READ)] = None,
+    preset: Annotated[str | Path | None, PresetOption] = None,
+    sensor: Annotated[Sequence[str] | None, Option(INPUT, choices="sensors")] = None,
+    column: Annotated[Sequence[str] | None, Option(INPUT, metavar="NAME=HEADER[UNIT]")] = None,
+    filter: Annotated[str | None, FilterOption] = None,
+    tuned: Annotated[Path | None, Option(FILTER, file=READ)] = None,
+    steps: Annotated[int | None, Option(RUNS)] = None,
+    seed: Annotated[int | None, Option(RUNS, least=0)] = None,
+    out: Annotated[Path | None, Option(OUTPUT, metavar="FILE", file=WRITTEN)] = None,
+    window: Annotated[bool, Option(OUTPUT)] = False,
+    size: Annotated[str | None, Option(OUTPUT, metavar="WIDTHxHEIGHT")] = None,
+) -> Printed:
     """Show an episode: the motion of the thruster, and a filter's estimate of its hidden state.
 
     Without MODEL no policy is loaded, and torch is not needed: a PI controller follows a reference, a
@@ -117,11 +77,28 @@ def command(
     Example: thruster play --policy pi --filter enkf --out pi.gif
 
     Example: thruster play out/policies/tracking-nominal-ekf-ppo-seed0
+
+    Args:
+        model: folder of a policy, that `thruster train` made.
+        policy: the controller pi on the measured thrust, the default, which follows a reference.
+        voltage: a constant voltage [V].
+        excitation: a sequence of voltages: steps, prbs, levels, multi-sine, ...
+        log: a recorded run of a thruster.
+        preset: the thruster:
+        sensor: a thruster's sensor that the filter sees, thrust by default:
+        column: the column of an input, measurement, state or output; may be repeated.
+        filter: name of the filter whose estimate is drawn, as `thruster filters` lists them; ekf by default.
+        tuned: tuned file, in place of --filter.
+        steps: steps of an episode; 500 by default.
+        seed: seed of the episode; for a policy a held-out one by default.
+        out: an .mp4 or .gif; by default an .mp4 in MODEL, or in out.
+        window: show it in a window instead, in real time.
+        size: size of the picture in pixels; 640x400 by default.
     """
     if window and out is not None:
         raise ValueError(f"give either --window or --out FILE, but got both, --out {out}")
-    if filter_name is not None and tuned is not None:
-        raise ValueError(f"give either --tuned FILE or --filter NAME, but got both, {tuned} and {filter_name}")
+    if filter is not None and tuned is not None:
+        raise ValueError(f"give either --tuned FILE or --filter NAME, but got both, {tuned} and {filter}")
     chosen = {"MODEL": model, "--policy": policy, "--voltage": voltage, "--excitation": excitation, "--log": log}
     if all(value is None for value in chosen.values()):
         chosen["--policy"] = "pi"
@@ -130,22 +107,22 @@ def command(
     _check_options(what, {"--sensor": sensor, "--column": column}, ("--log",))
     _check_options(what, {"--steps": steps}, ("--policy", "--voltage", "--excitation"))
     if model is not None:  # then it is what is played
-        arguments = {"--preset": preset, "--filter": filter_name, "--tuned": tuned}
+        arguments = {"--preset": preset, "--filter": filter, "--tuned": tuned}
         _check_options(what, arguments, tuple(name for name in chosen if name != "MODEL"))
-        played, output, video = _of_policy(model, out, window, seed, picture, json)
+        played, output, video = _of_policy(model, out, window, seed, picture)
     else:
         video = None if window else out or Path("out") / f"play-{_name(chosen[what])}.mp4"
         check_drawing(video)
         _check_even(video, picture)
-        check_targets((video,), json, read=(log, tuned, preset))
-        options = {"filter": filter_name, "tuned": tuned, "size": picture}
+        check_targets((video,), None, read=(log, tuned, preset))
+        options = {"filter": filter, "tuned": tuned, "size": picture}
         played, output = _without_policy(
             what, chosen[what], video, seed or 0, preset, steps, sensor, column, options
         )
     data = {**played._asdict(), "video": None if video is None else str(video)}
     if video is not None:
         output.append(f"Video: {video}")
-    emit(output, data, json)
+    return Printed(output, data)
 
 
 def one_given(chosen: dict) -> str:
@@ -194,7 +171,6 @@ def _of_policy(
     window: bool,
     seed: int | None,
     size: tuple[int, int] | None,
-    json: str | None,
 ) -> tuple:
     from tuning.policies.algorithms import check_installed
 
@@ -206,8 +182,7 @@ def _of_policy(
     video = None if window else out or model / f"episode-seed{seed}.mp4"
     check_drawing(video)
     _check_even(video, size)
-    check_targets((video,), json)
-    announce_compilation()
+    check_targets((video,), None)
     played = _drawn(lambda on_step: play(folder, video, seed, on_step, size))
     sentence = f"Episode {seed}: return {played.total_reward:.3f} in {played.steps} steps, {played.seconds:.1f} s."
     return played, [sentence], video
@@ -218,7 +193,6 @@ def _without_policy(
 ) -> tuple[Played, list[str]]:
     from tuning.logs.read import read_named
 
-    announce_compilation()
     if what == "--log":
         log, offer = read_named(argument, preset, None, sensor, column)
         played = _drawn(lambda on_step: play_log(video, log, offer, on_step, seed=seed, **options))

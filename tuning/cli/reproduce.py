@@ -13,21 +13,21 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.console import RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from filters.consistency.intervals import Interval, mean_interval
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.files import check_target
-from thruster_env.core.text_tables import console, table
+from thruster_env.core.text_tables import Table, console
 from thruster_env.logs.write import check_picture
-from tuning.cli import options
-from tuning.cli.options import JsonOption, SeedOption
-from tuning.cli.output import announce_compilation, emit, progress_console
+from tuning.api.markers import FILTER, INPUT, OUTPUT, WRITTEN, Argument, Option, Seed
+from tuning.api.markers import RUNS as RUNS_PANEL
+from tuning.api.result import Printed
+from tuning.cli.output import progress_console
 from tuning.experiments import BENCHMARKS, STUDIES, VEHICLE_STUDIES
 from tuning.experiments.benchmark import RUNS as BENCHMARK_RUNS
 from tuning.experiments.benchmark import WHY, Benchmark, Row, find_benchmark
@@ -62,7 +62,6 @@ from tuning.experiments.vehicle.tables import ENKF, FKF, Finding, digits, findin
 
 def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list[RenderableType], dict]:
     """Solve a standard problem; return what to show, as a list and as plain data."""
-    announce_compilation()
     benchmark = find_benchmark(name)
     with progress_console.status("...") as status:
         rows = benchmark.reproduce(runs, seed, lambda row: status.update(f"done: {row.label}"))
@@ -79,7 +78,7 @@ def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list[Renderabl
     }
 
 
-def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> Table:
+def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> RichTable:
     columns = benchmark.header
     columns[2] = f"ours ({runs} runs)"
     cells = [row.cells() for row in rows]
@@ -87,7 +86,7 @@ def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> Table:
         row[2] = row[2].replace(" [", "\n[")
     compared = f"The table compares {benchmark.score}, ours with its 95 % interval."
     caption = f"{compared} Median run: median score of single runs. Pooled: the RMSE of our tables."
-    out = fitted(table(benchmark.about, columns, cells, caption=caption), cells, flexible=WHY)
+    out = fitted(Table(benchmark.about, columns, cells, caption=caption), flexible=WHY)
     out.columns[0].width = None
     return out
 
@@ -95,8 +94,9 @@ def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> Table:
 LEAST = 12  # width of a column of words
 
 
-def fitted(out: Table, rows: list[list[str]], flexible: str = "") -> Table:
+def fitted(table: Table, flexible: str = "") -> RichTable:
     """The table with a blank line between rows of two lines, and numbers that do not wrap where there is room."""
+    out, rows = table.__rich__(), table.rows
     out.leading = 1
     fixed = [i for i, column in enumerate(out.columns) if str(column.header) != flexible]
     widths = [max(len(line) for row in rows for line in row[i].split("\n")) for i in fixed]
@@ -111,9 +111,9 @@ def fitted(out: Table, rows: list[list[str]], flexible: str = "") -> Table:
     return out
 
 
-def list_of(statements: Sequence[str]) -> Table:
+def list_of(statements: Sequence[str]) -> RichTable:
     """Statements as a list."""
-    out = Table.grid(padding=(0, 1))
+    out = RichTable.grid(padding=(0, 1))
     for statement in statements:
         out.add_row("-", Text(statement))
     return out
@@ -134,10 +134,10 @@ def particulars_table() -> Table:
         [f"{name} [{unit}]", f"{value:g}", ours.get(name, "not in the equations")]
         for name, (value, unit) in PARTICULARS.items()
     ]
-    return table("ngatini2019, table I: the vehicle", ["", "published", "ours"], rows, words=True)
+    return Table("ngatini2019, table I: the vehicle", ["", "published", "ours"], rows, words=True)
 
 
-def published_table(paper: str, result: PathResult, findings: list[Finding]) -> Table:
+def published_table(paper: str, result: PathResult, findings: list[Finding]) -> RichTable:
     """The printed RMSE of one path beside ours by each transformation."""
     rows = []
     for finding in findings:
@@ -165,7 +165,7 @@ def published_table(paper: str, result: PathResult, findings: list[Finding]) -> 
         'published above ours, of one core. "Similar" means within a factor of 3.'
     )
     title = f"{paper}, path {_name(result)}: published RMSE against ours"
-    return fitted(table(title, columns, rows, caption=caption), rows, flexible=WHY_PAPERS)
+    return fitted(Table(title, columns, rows, caption=caption), flexible=WHY_PAPERS)
 
 
 def velocity_table(result: PathResult) -> Table:
@@ -181,10 +181,10 @@ def velocity_table(result: PathResult) -> Table:
         "In mm/s, mrad/s and mrad, from 2 s on. The expected NEES is the number of states. Bound: Riccati "
         "along the noise-free path."
     )
-    return table(f"path {_name(result)}: RMSE of velocities and attitude", columns, rows, caption=caption)
+    return Table(f"path {_name(result)}: RMSE of velocities and attitude", columns, rows, caption=caption)
 
 
-def position_table(result: PathResult) -> Table:
+def position_table(result: PathResult) -> RichTable:
     """RMSE of position with intervals, and over that of the EKF on the same runs."""
     scores, base, rows = result.scores, result.scores["EKF8"], []
     for label, errors in scores.items():
@@ -199,10 +199,10 @@ def position_table(result: PathResult) -> Table:
         rows.append(cells)
     columns = ["filter", "by yaw alone [m]", "over EKF8", "full [m]", "over EKF8"]
     caption = "Root of the mean square distance over a run, 95 % intervals; ratios are paired by run."
-    return fitted(table(f"path {_name(result)}: position", columns, rows, caption=caption), rows)
+    return fitted(Table(f"path {_name(result)}: position", columns, rows, caption=caption))
 
 
-def end_table(results: list[PathResult]) -> Table:
+def end_table(results: list[PathResult]) -> RichTable:
     """The errors at the end in percent of the path's end."""
     rows = []
     for result in results:
@@ -224,7 +224,7 @@ def end_table(results: list[PathResult]) -> Table:
         "definition. Near zero end values the percentage is meaningless."
     )
     title = "ngatini2017: error at the end in percent"
-    return fitted(table(title, columns, rows, caption=caption), rows)
+    return fitted(Table(title, columns, rows, caption=caption))
 
 
 def outside_table(results: list[PathResult]) -> Table:
@@ -235,7 +235,7 @@ def outside_table(results: list[PathResult]) -> Table:
         if result.world == "vehicle"
     ]
     title = "Time outside the fuzzy filter's bounds 0..1 [%], without noise"
-    return table(title, ["path", *"uvwpqr", "any"], rows)
+    return Table(title, ["path", *"uvwpqr", "any"], rows)
 
 
 def plain_result(paper: str, result: PathResult, findings: list[Finding]) -> dict:
@@ -320,7 +320,6 @@ def reproduce_vehicle(
 
 
 def _run(paper: str, runs: int, seed: int, steps: int | None) -> list[PathResult]:
-    announce_compilation()
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=progress_console) as progress:
         task = progress.add_task(f"{runs} runs", total=None)
@@ -336,53 +335,22 @@ def _run(paper: str, runs: int, seed: int, steps: int | None) -> list[PathResult
 
 
 ALL = "all"
+PUBLISHED = f"{', '.join(STUDIES)}; {ALL}; {', '.join(VEHICLE_STUDIES)}; {', '.join(BENCHMARKS)}."
+RUNS_BY_DEFAULT = (
+    f"{PAPER_RUNS} of 100 steps for a paper on the thruster, {VEHICLE_RUNS} of some 25000 for one on "
+    f"the vehicle, and {BENCHMARK_RUNS} for a standard problem."
+)
 LINES = "In each cell first omega_m [rad/s], below it U_a [m/s]."
 
 
 def command(
-    study: Annotated[
-        str,
-        typer.Argument(
-            help=f"A paper on the bow thruster: {', '.join(STUDIES)}, or {ALL} of them; "
-            f"or on the underwater vehicle: {', '.join(VEHICLE_STUDIES)}; or a standard problem: "
-            f"{', '.join(BENCHMARKS)}."
-        ),
-    ],
-    runs: Annotated[
-        int | None,
-        typer.Option(
-            help=f"Independent runs, at least 2; by default {PAPER_RUNS} of 100 steps for a paper on the "
-            f"thruster, {VEHICLE_RUNS} of some 25000 for one on the vehicle, and {BENCHMARK_RUNS} for a standard "
-            "problem; with fewer the intervals are wide.",
-            rich_help_panel=options.RUNS,
-        ),
-    ] = None,
-    members: Annotated[
-        int | None,
-        typer.Option(
-            help=f"Ensemble size N of the papers' EnKF, at least 2; {MEMBERS} by default.",
-            rich_help_panel=options.FILTER,
-        ),
-    ] = None,
-    series: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also draw one run over time for each system and q, as the papers do, or the vehicle's paths: "
-            ".png, .svg or .pdf; into --json, too.",
-            rich_help_panel=options.OUTPUT,
-        ),
-    ] = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            help="First steps of 1 ms of each of the vehicle's paths, for a quick look; all by default.",
-            rich_help_panel=options.RUNS,
-        ),
-    ] = None,
-    seed: SeedOption = 0,
-    json: JsonOption = None,
-) -> None:
+    study: Annotated[str, Argument(INPUT, listed=PUBLISHED)],
+    runs: Annotated[int | None, Option(RUNS_PANEL, listed=RUNS_BY_DEFAULT)] = None,
+    members: Annotated[int | None, Option(FILTER, listed=f"{MEMBERS}.")] = None,
+    series: Annotated[Path | None, Option(OUTPUT, metavar="FILE", file=WRITTEN)] = None,
+    steps: Annotated[int | None, Option(RUNS_PANEL)] = None,
+    seed: Seed = 0,
+) -> Printed:
     """Repeat a published experiment many times and say why its table differs from ours.
 
     The papers compare a Kalman filter (KF) with an ensemble Kalman filter
@@ -405,6 +373,15 @@ def command(
     Example: thruster reproduce ngatini2019 --series paths.png
 
     Example: thruster reproduce lorenz63
+
+    Args:
+        study: a paper on the bow thruster, all of them, a paper on the underwater vehicle, or a standard problem:
+        runs: independent runs, at least 2; few make wide intervals. By default:
+        members: ensemble size N of the papers' EnKF, at least 2. By default:
+        series: also draw one run over time for each system and q, as the papers do, or the vehicle's paths: .png,
+            .svg or .pdf; into --json, too.
+        steps: first steps of 1 ms of each of the vehicle's paths, for a quick look; all by default.
+        seed: seed of all randomness; the same seed gives the same results.
     """
     one_of("study", study, (*STUDIES, ALL, *VEHICLE_STUDIES, *BENCHMARKS))
     if members is not None and study not in (*STUDIES, ALL):
@@ -414,15 +391,13 @@ def command(
     if study in BENCHMARKS:
         if series is not None:
             raise ValueError(f"--series must come with a paper, but got {study!r}")
-        emit(*reproduce_benchmark(study, BENCHMARK_RUNS if runs is None else runs, seed), json)
-        return
+        return Printed(*reproduce_benchmark(study, BENCHMARK_RUNS if runs is None else runs, seed))
     if series is not None:
         check_picture(series, "--series")
         check_target(series)
     if study in VEHICLE_STUDIES:
         runs = at_least("runs", VEHICLE_RUNS if runs is None else runs, 2, MOST_VEHICLE_RUNS)
-        emit(*reproduce_vehicle(study, runs, seed, steps, series), json)
-        return
+        return Printed(*reproduce_vehicle(study, runs, seed, steps, series))
     names = tuple(STUDIES) if study == ALL else (study,)
     runs = at_least("runs", PAPER_RUNS if runs is None else runs, 2, MOST_RUNS)
     members = at_least("members", MEMBERS if members is None else members, 2, LARGEST_ENSEMBLE)
@@ -431,7 +406,7 @@ def command(
         drawn = all_series(members=members, seed=seed)
         output += ["", f"Picture: {series_figure(series, drawn, members)}"]
         data |= {"series": [run._asdict() for run in drawn], "picture": str(series)}
-    emit(output, data, json)
+    return Printed(output, data)
 
 
 def reproduce(names: tuple[str, ...], runs: int = PAPER_RUNS, members: int = MEMBERS, seed: int = 0):
@@ -464,7 +439,6 @@ def reproduce(names: tuple[str, ...], runs: int = PAPER_RUNS, members: int = MEM
 
 
 def _compare(runs: int, members: int, seed: int):
-    announce_compilation()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=progress_console) as progress:
         task = progress.add_task(f"{runs} runs of each case and noise level", total=None)
@@ -485,7 +459,7 @@ def _own_table(case: str, comparisons: list, runs: int, members: int):
     columns = ["q", "P_0", "Riccati optimum", "KF, 95 % interval", "EnKF, 95 % interval", "EnKF / KF"]
     title = f"{case}: RMSE of {runs} runs of 100 steps, EnKF with {members} members"
     caption = f"{LINES} P_0: covariance of x_0 and of the filter's prior."
-    return fitted(table(title, columns, rows, caption=caption), rows)
+    return fitted(Table(title, columns, rows, caption=caption))
 
 
 def _published_table(name: str, case: str, findings: list):
@@ -509,8 +483,8 @@ def _published_table(name: str, case: str, findings: list):
         f"{LINES} (sd): distance of the published value above ours, in standard deviations of a single run's "
         "RMSE. Un-updated ensemble: a wrong filter, see below."
     )
-    out = table(f"{name}, {case}: published RMSE against ours", columns, rows, caption=caption)
-    return fitted(out, rows, flexible=why)
+    out = Table(f"{name}, {case}: published RMSE against ours", columns, rows, caption=caption)
+    return fitted(out, flexible=why)
 
 
 def _lines(values, form: str = ".4f") -> str:

@@ -7,15 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-import typer
 from rich.console import RenderableType
 from rich.text import Text
 
 from filters.consistency.intervals import mean_interval
 from thruster_env.core.checks import one_of
-from thruster_env.core.text_tables import table
-from tuning.cli.options import INPUT, RUNS, JsonOption, OfPresetOption, SeedOption
-from tuning.cli.output import announce_compilation, emit, progress_console
+from thruster_env.core.text_tables import Table
+from tuning.api.markers import INPUT, RUNS, Argument, Option, PresetOption, Seed
+from tuning.api.result import Printed
+from tuning.cli.output import progress_console
 from tuning.cli.train import LEARNABLE
 from tuning.policies.algorithms import check_installed
 from tuning.policies.observations import find_observation_set
@@ -43,28 +43,13 @@ class Scored(NamedTuple):
 
 
 def command(
-    models: Annotated[list[Path], typer.Argument(metavar="MODEL", help="Folders that `thruster train` made.")],
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            help=f"A plant other than that of training: {LEARNABLE}, or a .toml file.", rich_help_panel=INPUT
-        ),
-    ] = None,
-    preset: OfPresetOption = None,
-    classical: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="pi, lqr, one-step or mpc; may be repeated. A controller with the observations of each "
-            "policy; all but pi need a state.",
-            rich_help_panel=INPUT,
-        ),
-    ] = None,
-    seeds: Annotated[
-        int, typer.Option(help="Number of held-out episodes.", rich_help_panel=RUNS)
-    ] = HELD_OUT_SEEDS,
-    seed: SeedOption = 0,
-    json: JsonOption = None,
-) -> None:
+    models: Annotated[list[Path], Argument(INPUT, metavar="MODEL")],
+    scenario: Annotated[str | None, Option(INPUT, listed=f"{LEARNABLE}.")] = None,
+    preset: Annotated[str | Path | None, PresetOption] = None,
+    classical: Annotated[Sequence[str], Option(INPUT)] = (),
+    seeds: Annotated[int, Option(RUNS)] = HELD_OUT_SEEDS,
+    seed: Seed = 0,
+) -> Printed:
     """Score trained policies on held-out episodes, the same for all, without exploration.
 
     Returns come with 95 % intervals. Thrust errors are root mean squares of the true thrust against the reference:
@@ -80,6 +65,15 @@ def command(
     mpc plans a few steps ahead with the thruster's equations, one-step plans one step; lqr is linear.
 
     Example: thruster score out/policies/* --classical mpc --scenario ambient
+
+    Args:
+        models: folders that `thruster train` made.
+        scenario: a plant other than that of training:
+        preset: the scenario of another thruster:
+        classical: a controller with the observations of each policy: pi, lqr, one-step or mpc; all but pi need a
+            state; may be repeated.
+        seeds: number of held-out episodes.
+        seed: seed of all randomness; the same seed gives the same results.
     """
     check_installed()
     if preset is not None and scenario is None:
@@ -90,23 +84,22 @@ def command(
     folders = {model: find_saved(model) for model in models}
     setups = {model: read_configuration(folder) for model, folder in folders.items()}
     kind = plant_of(next(iter(setups.values())).task)
-    for name in classical or []:
+    for name in classical:
         one_of("classical", name, kind.controllers)
     plant = None if scenario is None else of_preset(kind.find_scenario(scenario), preset)
     check_alike(list(setups.values()), plant)
-    announce_compilation()
     scored = []
     with progress_console.status("scoring ...") as status:
         for model, folder in folders.items():
             status.update(Text(f"scoring {model} on {seeds} episodes ..."))
             scored.append(_learnt(model, folder, setups[model], plant, held_out))
-        for name in classical or []:
+        for name in classical:
             for setup in _each_arm(setups.values()):
                 if name in kind.of_states and not find_observation_set(setup.observe).shows_state:
                     continue
                 status.update(Text(f"scoring {name} on {setup.observe} ..."))
                 scored.append(_classical(name, setup, plant, held_out))
-    emit(report(scored, held_out), as_json(scored, held_out), json)
+    return Printed(report(scored, held_out), as_json(scored, held_out))
 
 
 def check_alike(setups: Sequence[TrainingConfiguration], plant: BaseScenario | None) -> None:
@@ -166,7 +159,7 @@ def report(scored: Sequence[Scored], seeds: range) -> list[RenderableType]:
         f"±: half of the 95 % interval. The other columns are root mean square errors: {kind.errors}; blank: "
         "no such step."
     )
-    output: list[RenderableType] = [table(title, columns, rows, caption=caption)]
+    output: list[RenderableType] = [Table(title, columns, rows, caption=caption)]
     learnt = [(number, policy) for number, policy in enumerate(scored, start=1) if policy.folder is not None]
     return output + [f"{number} {policy.label}: {policy.folder}" for number, policy in learnt]
 

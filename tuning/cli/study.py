@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,55 +18,43 @@ from rich.progress import (
 )
 
 from thruster_env.core.files import check_target
-from thruster_env.core.text_tables import table
+from thruster_env.core.text_tables import Table
+from tuning.api.markers import INPUT, OUTPUT, RUNS, Option
+from tuning.api.result import Printed
 from tuning.cli.app import Command, Group
-from tuning.cli.options import INPUT, OUTPUT, RUNS, JsonOption
-from tuning.cli.output import announce_compilation, emit, progress_console
+from tuning.cli.output import progress_console
+from tuning.cli.verbs import command_of
 
 USERS_FOLDER = Path("out") / "users"
 
 
+@contextmanager
+def progress_of(title: str, out: Path) -> Iterator[Callable[[str, int, int], None]]:
+    """A bar of long work: the callback takes what is running, how much is done, and how much there is."""
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    try:
+        with Progress(*columns, console=progress_console) as progress:
+            bar = progress.add_task(title, total=None)
+            yield lambda text, done, count: progress.update(bar, description=text, completed=done, total=count)
+    except KeyboardInterrupt:
+        progress_console.print(f"Interrupted: finished work is in {out}, and the same command continues.")
+        raise
+
+
 def users(
-    problem: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--problem",
-            metavar="MODULE:OBJECT",
-            help="A problem, may be repeated; by default the twelve of tests/users in a checkout of the project.",
-            rich_help_panel=INPUT,
-        ),
-    ] = None,
-    filters: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--filter",
-            help="A filter, may be repeated; by default ekf, ukf, enkf, ekf-robust.",
-            rich_help_panel=RUNS,
-        ),
-    ] = None,
-    trials: Annotated[
-        int | None, typer.Option(min=1, max=1_000_000, help="Trials of each study; 50.", rich_help_panel=RUNS)
-    ] = None,
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, max=2**31 - 1, help="Seed of all studies.", rich_help_panel=RUNS)
-    ] = 0,
-    quick: Annotated[
-        bool,
-        typer.Option(
-            "--quick",
-            help="Two problems, one filter, four trials: a test run without meaningful results.",
-            rich_help_panel=RUNS,
-        ),
-    ] = False,
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="Folder of results; existing ones are not recomputed. Use another one after changes in the code.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = USERS_FOLDER,
-    json: JsonOption = None,
-) -> None:
+    problem: Annotated[Sequence[str], Option(INPUT, metavar="MODULE:OBJECT")] = (),
+    filters: Annotated[Sequence[str], Option(RUNS, ("--filter",))] = (),
+    trials: Annotated[int | None, Option(RUNS, least=1, most=1_000_000)] = None,
+    seed: Annotated[int, Option(RUNS, least=0, most=2**31 - 1)] = 0,
+    quick: Annotated[bool, Option(RUNS)] = False,
+    out: Annotated[Path, Option(OUTPUT)] = USERS_FOLDER,
+) -> Printed:
     """Tune filters on users' problems, and compare each with its user's baselines.
 
     The table has the held-out score of the tuned filter over that of each baseline, with 95 % intervals paired by
@@ -72,6 +62,14 @@ def users(
     finished cases, and the same command continues. All cases take about an hour on one core.
 
     Example: thruster study users --quick
+
+    Args:
+        problem: a problem, may be repeated; by default the twelve of tests/users in a checkout of the project.
+        filters: a filter, may be repeated; by default ekf, ukf, enkf, ekf-robust.
+        trials: trials of each study; 50.
+        seed: seed of all studies.
+        quick: two problems, one filter, four trials: a test run without meaningful results.
+        out: folder of results; existing ones are not recomputed. Use another one after changes in the code.
     """
     from thruster_env.core.files import check_target, write_whole
     from tuning.experiments.users import (
@@ -93,20 +91,8 @@ def users(
     files = out / "users.csv", out / "users.md"
     for file in files:
         check_target(file)
-    announce_compilation()
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    try:
-        with Progress(*columns, console=progress_console) as progress:
-            bar = progress.add_task("tuning", total=None)
-            cases = run_panel(
-                panel,
-                out,
-                lambda text, done, count: progress.update(bar, description=text, completed=done, total=count),
-            )
-            progress.update(bar, description="tuned", completed=len(cases), total=len(cases))
-    except KeyboardInterrupt:
-        progress_console.print(f"Interrupted: finished work is in {out}, and the same command continues.")
-        raise
+    with progress_of("tuning", out) as progress:
+        cases = run_panel(panel, out, progress)
     for file, text in zip(files, (csv_text(cases), markdown(cases) + "\n"), strict=True):
         write_whole(file, text)
     conclusions = sentences(cases)
@@ -126,37 +112,17 @@ def users(
         "files": [str(file) for file in files],
     }
     title = f"scores of tuned filters over those of baselines, held out; {panel.trials} trials"
-    emit([table(title, heads, rows), *conclusions, *[f"wrote {file}" for file in files]], data, json)
+    return Printed([Table(title, heads, rows), *conclusions, *[f"wrote {file}" for file in files]], data)
 
 
 RECORDINGS_FILE = Path("out") / "recordings.json"
 
 
 def recordings(
-    data: Annotated[
-        Path,
-        typer.Option(
-            help="Folder with the recorded runs as .csv files, or with a folder closed_loop_25Hz.",
-            rich_help_panel=INPUT,
-        ),
-    ],
-    identify: Annotated[
-        bool,
-        typer.Option(
-            "--identify",
-            help="Identify all parameters again, of nine structures, with and without each run: a quarter of "
-            "an hour.",
-            rich_help_panel=RUNS,
-        ),
-    ] = False,
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="With --identify: file of results; existing ones are not recomputed.", rich_help_panel=OUTPUT
-        ),
-    ] = RECORDINGS_FILE,
-    json: JsonOption = None,
-) -> None:
+    data: Annotated[Path, Option(INPUT)],
+    identify: Annotated[bool, Option(RUNS)] = False,
+    out: Annotated[Path, Option(OUTPUT)] = RECORDINGS_FILE,
+) -> Printed:
     """Compare estimates of a recorded thruster's thrust with its load cell, and with the recorder's own estimate.
 
     The filter sees command and tachometer. By default its parameters are the project's, identified from six runs;
@@ -164,6 +130,12 @@ def recordings(
     J. A. Boehm (University of Maryland, 2019), which are not part of this project: see docs/real_data.md.
 
     Example: thruster study recordings --data rov_thruster
+
+    Args:
+        data: folder with the recorded runs as .csv files, or with a folder closed_loop_25Hz.
+        identify: identify all parameters again, of nine structures, with and without each run: a quarter of an
+            hour.
+        out: with --identify: file of results; existing ones are not recomputed.
     """
     from tuning.experiments.recordings.identification import estimates_of, identify_all, sentences, tables_of
     from tuning.experiments.recordings.model import read_recordings
@@ -171,23 +143,10 @@ def recordings(
     runs = read_recordings(data)
     if identify:
         check_target(out)
-    announce_compilation()
     tasks = None
     if identify:
-        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-        try:
-            with Progress(*columns, console=progress_console) as progress:
-                bar = progress.add_task("identifying", total=None)
-                tasks = identify_all(
-                    runs,
-                    out,
-                    progress=lambda name, done, count: progress.update(
-                        bar, description=name, completed=done, total=count
-                    ),
-                )
-        except KeyboardInterrupt:
-            progress_console.print(f"Interrupted: finished work is in {out}, and the same command continues.")
-            raise
+        with progress_of("identifying", out) as progress:
+            tasks = identify_all(runs, out, progress=progress)
     estimates = estimates_of(runs, tasks)
     which = "parameters identified without the run" if identify else "the project's parameters"
     titles = {
@@ -198,60 +157,31 @@ def recordings(
         "numbers": "numbers found",
     }
     tables = tables_of(runs, estimates, tasks)
-    output = [table(titles[name], *content) for name, content in tables.items()]
+    output = [Table(titles[name], *content) for name, content in tables.items()]
     named = {
         name: [dict(zip(content.header, row, strict=True)) for row in content.rows]
         for name, content in tables.items()
     }
     answers = sentences(estimates, runs)
-    emit([*output, *answers], {**named, "answers": answers}, json)
+    return Printed([*output, *answers], {**named, "answers": answers})
 
 
 METHODS_FOLDER = Path("out") / "methods"
 
 
 def methods(
-    groups: Annotated[str, typer.Option(help="Groups of problems.", rich_help_panel=RUNS)] = "ABCDEFGH",
-    method: Annotated[
-        list[str] | None,
-        typer.Option("--method", help="A method, may be repeated; by default all.", rich_help_panel=RUNS),
-    ] = None,
-    sets: Annotated[int | None, typer.Option(min=2, max=20, help="Data sets; 20.", rich_help_panel=RUNS)] = None,
-    runs: Annotated[
-        float | None,
-        typer.Option(min=100, max=1e7, help="Passes that a method may take; 1e5.", rich_help_panel=RUNS),
-    ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(min=0.1, max=1e4, help="Seconds of one core; 100.", rich_help_panel=RUNS)
-    ] = None,
-    many: Annotated[
-        int | None, typer.Option(min=10, max=10**5, help="Runs of the reference; 2000.", rich_help_panel=RUNS)
-    ] = None,
-    starts: Annotated[
-        int | None, typer.Option(min=1, max=100, help="Starts of the reference; 20.", rich_help_panel=RUNS)
-    ] = None,
-    jobs: Annotated[int, typer.Option(min=1, max=1000, help="Processes.", rich_help_panel=RUNS)] = 1,
-    quick: Annotated[
-        bool,
-        typer.Option("--quick", help="A test run without meaningful results.", rich_help_panel=RUNS),
-    ] = False,
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="Folder of results, which several hosts may share; existing ones are not recomputed.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = METHODS_FOLDER,
-    page: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.md",
-            help="Page whose tables are rewritten, with the picture beside it.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    json: JsonOption = None,
-) -> None:
+    groups: Annotated[str, Option(RUNS)] = "ABCDEFGH",
+    method: Annotated[Sequence[str], Option(RUNS)] = (),
+    sets: Annotated[int | None, Option(RUNS, least=2, most=20)] = None,
+    runs: Annotated[float | None, Option(RUNS, least=100, most=1e7)] = None,
+    seconds: Annotated[float | None, Option(RUNS, least=0.1, most=1e4)] = None,
+    many: Annotated[int | None, Option(RUNS, least=10, most=10**5)] = None,
+    starts: Annotated[int | None, Option(RUNS, least=1, most=100)] = None,
+    jobs: Annotated[int, Option(RUNS, least=1, most=1000)] = 1,
+    quick: Annotated[bool, Option(RUNS)] = False,
+    out: Annotated[Path, Option(OUTPUT)] = METHODS_FOLDER,
+    page: Annotated[Path | None, Option(OUTPUT, metavar="FILE.md")] = None,
+) -> Printed:
     """Run every method of tuning on the same data within the same budget, and score it on held-out truth.
 
     The regret of a method is its score over that of the best constant parameters, found by gradients from many
@@ -259,6 +189,19 @@ def methods(
     the options reduce it, and results of different budgets are stored separately.
 
     Example: thruster study methods --quick
+
+    Args:
+        groups: groups of problems.
+        method: a method, may be repeated; by default all.
+        sets: data sets; 20.
+        runs: passes that a method may take; 1e5.
+        seconds: seconds of one core; 100.
+        many: runs of the reference; 2000.
+        starts: starts of the reference; 20.
+        jobs: processes.
+        quick: a test run without meaningful results.
+        out: folder of results, which several hosts may share; existing ones are not recomputed.
+        page: page whose tables are rewritten, with the picture beside it.
     """
     from thruster_env.core.files import write_whole
     from thruster_env.core.text_tables import with_tables
@@ -272,22 +215,8 @@ def methods(
     changes["cases"] = tuple(case for case in protocol.cases if case.group in groups) or None
     protocol = protocol._replace(**{name: value for name, value in changes.items() if value is not None})
     text = None if page is None else page.read_text(encoding="utf-8")
-    announce_compilation()
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    try:
-        with Progress(*columns, console=progress_console) as progress:
-            bar = progress.add_task("methods", total=None)
-            results = run_protocol(
-                protocol,
-                out,
-                jobs,
-                lambda description, done, count: progress.update(
-                    bar, description=description, completed=done, total=count
-                ),
-            )
-    except KeyboardInterrupt:
-        progress_console.print(f"Interrupted: finished results are in {out}, and the same command continues.")
-        raise
+    with progress_of("methods", out) as progress:
+        results = run_protocol(protocol, out, jobs, progress)
     makers = tables(results, protocol)
     picture, written = "methods_groups.png", []
     if page is None or text is None or picture in text:
@@ -301,76 +230,22 @@ def methods(
         "predictions": [prediction._asdict() for prediction in PREDICTIONS],
         "files": [str(path) for path in written],
     }
-    emit(
-        [*(f"{name}\n\n{content}" for name, content in texts.items()), *[f"wrote {path}" for path in written]],
-        data,
-        json,
-    )
+    parts = [*(f"{name}\n\n{content}" for name, content in texts.items()), *[f"wrote {path}" for path in written]]
+    return Printed(parts, data)
 
 
 POLICIES_FOLDER = Path("out") / "comparison"
 
-app = typer.Typer(cls=Group, help="Long comparisons.", no_args_is_help=True)
 
-
-@app.callback()
-def _callback() -> None:
-    pass
-
-
-app.command("recordings", cls=Command)(recordings)
-app.command("users", cls=Command)(users)
-app.command("methods", cls=Command)(methods)
-
-
-@app.command("policies", cls=Command)
 def policies(
-    quick: Annotated[
-        bool,
-        typer.Option(
-            "--quick",
-            help="One noise, two seeds, few steps: a test run without meaningful results.",
-            rich_help_panel=RUNS,
-        ),
-    ] = False,
-    seeds: Annotated[
-        int | None,
-        typer.Option(
-            min=1, max=1000, help="Training seeds of each learned policy; 5 by default.", rich_help_panel=RUNS
-        ),
-    ] = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            max=10**12,
-            help="Training steps of each policy; by default those of `thruster train`.",
-            rich_help_panel=RUNS,
-        ),
-    ] = None,
-    recurrent: Annotated[
-        bool,
-        typer.Option(
-            "--recurrent", help="Also PPO with an LSTM on raw measurements: many hours.", rich_help_panel=RUNS
-        ),
-    ] = False,
-    jobs: Annotated[
-        int | None,
-        typer.Option(min=1, max=1000, help="Number of processes; as many as cores.", rich_help_panel=RUNS),
-    ] = None,
-    out: Annotated[
-        Path, typer.Option(help="Folder of results; existing ones are not recomputed.", rich_help_panel=OUTPUT)
-    ] = POLICIES_FOLDER,
-    page: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.md",
-            help="Page whose tables are rewritten, with the pictures beside it.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    json: JsonOption = None,
-) -> None:
+    quick: Annotated[bool, Option(RUNS)] = False,
+    seeds: Annotated[int | None, Option(RUNS, least=1, most=1000)] = None,
+    steps: Annotated[int | None, Option(RUNS, least=1, most=10**12)] = None,
+    recurrent: Annotated[bool, Option(RUNS)] = False,
+    jobs: Annotated[int | None, Option(RUNS, least=1, most=1000)] = None,
+    out: Annotated[Path, Option(OUTPUT)] = POLICIES_FOLDER,
+    page: Annotated[Path | None, Option(OUTPUT, metavar="FILE.md")] = None,
+) -> Printed:
     """Train policies on raw, filtered and true state, and compare them with model-predictive control, PI and LQG.
 
     It trains PPO at three noise levels of the thrust sensor, SAC, and policies that correct the controller, scores
@@ -378,6 +253,15 @@ def policies(
     and the same command continues. On two cores it takes an hour or more.
 
     Example: thruster study policies --quick
+
+    Args:
+        quick: one noise, two seeds, few steps: a test run without meaningful results.
+        seeds: training seeds of each learned policy; 5 by default.
+        steps: training steps of each policy; by default those of `thruster train`.
+        recurrent: also PPO with an LSTM on raw measurements: many hours.
+        jobs: number of processes; as many as cores.
+        out: folder of results; existing ones are not recomputed.
+        page: page whose tables are rewritten, with the pictures beside it.
     """
     from tuning.policies.algorithms import check_installed
 
@@ -398,36 +282,30 @@ def policies(
     comparison = comparison._replace(**{name: value for name, value in changes.items() if value is not None})
     target = page or out / PAGE
     check_page(target)
-    announce_compilation()
-    columns = [
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    ]
-    try:
-        with Progress(*columns, console=progress_console) as progress:
-            task = progress.add_task("policies", total=None)
-            results = run_comparison(
-                comparison,
-                out,
-                jobs,
-                lambda run, done, count: progress.update(task, description=run.name, completed=done, total=count),
-            )
-    except KeyboardInterrupt:
-        progress_console.print(f"Interrupted: finished work is in {out}, and the same command continues.")
-        raise
+    with progress_of("policies", out) as progress:
+        results = run_comparison(comparison, out, jobs, lambda run, *counts: progress(run.name, *counts))
     written = write_report(results, comparison, target, rough=quick)
     rows = {noise: rows_of(results, noise) for noise in comparison.noises}
     conclusions, files = answers(results), [str(path) for path in written]
     summary = summary_rows(results)
-    tables = [table(f"{noise} noise; thrust errors in N", HEADER, rows[noise]) for noise in rows]
+    tables = [Table(f"{noise} noise; thrust errors in N", HEADER, rows[noise]) for noise in rows]
     data = {
         "policies": {noise: [dict(zip(HEADER, row, strict=True)) for row in rows[noise]] for noise in rows},
         "summary": summary,
         "answers": conclusions,
         "files": files,
     }
-    tables.append(table("in short, with 95 % intervals", ["", *comparison.noises], summary))
-    emit([*tables, *conclusions, *[f"wrote {path}" for path in files]], data, json)
+    tables.append(Table("in short, with 95 % intervals", ["", *comparison.noises], summary))
+    return Printed([*tables, *conclusions, *[f"wrote {path}" for path in files]], data)
+
+
+app = typer.Typer(cls=Group, help="Long comparisons.", no_args_is_help=True)
+
+
+@app.callback()
+def _callback() -> None:
+    pass
+
+
+for function in (recordings, users, methods, policies):
+    app.command(function.__name__, cls=Command)(command_of(function))

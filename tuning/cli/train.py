@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,16 +9,17 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.console import RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import at_least
-from thruster_env.core.text_tables import table
-from tuning.api.run import file_name
-from tuning.cli.options import FILTER, INPUT, LEARNING, OUTPUT, JsonOption, OfPresetOption, spelt
-from tuning.cli.output import announce_compilation, emit, progress_console
+from thruster_env.core.text_tables import Table
+from tuning.api.markers import FILTER, INPUT, LEARNING, OUTPUT, READ, Option, PresetOption
+from tuning.api.result import Printed
+from tuning.api.study import INTERRUPTED
+from tuning.api.tune import file_name
+from tuning.cli.output import progress_console
 from tuning.policies.algorithms import ALGORITHMS, check_installed
 from tuning.policies.observations import OBSERVATION_SETS
 from tuning.policies.plants import PLANTS, TASKS, plant_of
@@ -32,94 +32,29 @@ if TYPE_CHECKING:
 
 POLICIES = Path("out") / "policies"
 SHOWN_EVALUATIONS = 8
-LEARNABLE = ", ".join(name for plant in PLANTS.values() for name in plant.scenarios)
+LEARNABLE = ", ".join([*(name for plant in PLANTS.values() for name in plant.scenarios), "or a .toml file"])
 DEFAULTS = ", ".join(f"{plant.scenario} for the {name}" for name, plant in PLANTS.items())
 CORRECTABLE = ", ".join(name for plant in PLANTS.values() for name in plant.correctable)
 FEWEST_STEPS = ", ".join(f"{name} {algorithm.steps}" for name, algorithm in ALGORITHMS.items())
 
 
 def command(
-    task: Annotated[
-        str, typer.Option(help=f"{', '.join(TASKS)}.", callback=spelt(TASKS), rich_help_panel=INPUT)
-    ] = "tracking",
-    observe: Annotated[
-        str,
-        typer.Option(
-            metavar="ARM",
-            help=f"What the policy sees: {', '.join(OBSERVATION_SETS)}.",
-            callback=spelt(OBSERVATION_SETS),
-            rich_help_panel=FILTER,
-        ),
-    ] = "ekf",
-    algo: Annotated[
-        str, typer.Option(help=f"{', '.join(ALGORITHMS)}.", callback=spelt(ALGORITHMS), rich_help_panel=LEARNING)
-    ] = "ppo",
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help=f"Training steps of the env; by default {FEWEST_STEPS}.",
-            rich_help_panel=LEARNING,
-        ),
-    ] = None,
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            help=f"The plant and its noise: {LEARNABLE}, or a .toml file; by default {DEFAULTS}.",
-            rich_help_panel=INPUT,
-        ),
-    ] = None,
-    preset: OfPresetOption = None,
-    tuned: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Tuned file of the filter, from `thruster tune`.", rich_help_panel=FILTER
-        ),
-    ] = None,
-    untuned: Annotated[
-        bool,
-        typer.Option(
-            "--untuned",
-            help="Give the filter R from the sensor's data sheet and Q from a rule of thumb.",
-            rich_help_panel=FILTER,
-        ),
-    ] = False,
-    controller: Annotated[
-        str | None,
-        typer.Option(
-            help=f"Let the policy correct one of {CORRECTABLE} instead of acting alone.",
-            rich_help_panel=LEARNING,
-        ),
-    ] = None,
-    envs: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Copies of the env, stepped together.", rich_help_panel=LEARNING),
-    ] = None,
-    evaluations: Annotated[
-        int,
-        typer.Option(
-            metavar="N", help="Number of validations of the policy during training.", rich_help_panel=LEARNING
-        ),
-    ] = 20,
-    checkpoints: Annotated[
-        int, typer.Option(metavar="N", help="Number of checkpoints during training.", rich_help_panel=OUTPUT)
-    ] = 10,
-    no_tensorboard: Annotated[
-        bool, typer.Option("--no-tensorboard", help="Do not write logs for TensorBoard.", rich_help_panel=OUTPUT)
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="By default one in out/policies, named after these options.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the network, the noise and the episodes.", rich_help_panel=LEARNING)
-    ] = 0,
-    json: JsonOption = None,
-) -> None:
+    task: Annotated[str, Option(INPUT, choices=TASKS)] = "tracking",
+    observe: Annotated[str, Option(FILTER, metavar="ARM", choices=OBSERVATION_SETS)] = "ekf",
+    algo: Annotated[str, Option(LEARNING, choices=ALGORITHMS)] = "ppo",
+    steps: Annotated[int | None, Option(LEARNING, metavar="N", listed=f"{FEWEST_STEPS}.")] = None,
+    scenario: Annotated[str | None, Option(INPUT, listed=f"{LEARNABLE}; by default {DEFAULTS}.")] = None,
+    preset: Annotated[str | Path | None, PresetOption] = None,
+    tuned: Annotated[Path | None, Option(FILTER, metavar="FILE", file=READ)] = None,
+    untuned: Annotated[bool, Option(FILTER)] = False,
+    controller: Annotated[str | None, Option(LEARNING, listed=f"{CORRECTABLE}.")] = None,
+    envs: Annotated[int | None, Option(LEARNING, metavar="N")] = None,
+    evaluations: Annotated[int, Option(LEARNING, metavar="N")] = 20,
+    checkpoints: Annotated[int, Option(OUTPUT, metavar="N")] = 10,
+    no_tensorboard: Annotated[bool, Option(OUTPUT)] = False,
+    out: Annotated[Path | None, Option(OUTPUT, metavar="FOLDER")] = None,
+    seed: Annotated[int, Option(LEARNING, least=0)] = 0,
+) -> Printed:
     """Train a policy on raw, filtered or true state, with Stable-Baselines3.
 
     The reward depends on the true thrust, whatever the policy sees. A filter uses the plant's Q and R, unless
@@ -138,6 +73,23 @@ def command(
     tensorboard --logdir out/policies
 
     Example: thruster train --task manoeuvre --observe enkf --seed 1
+
+    Args:
+        task: what the policy does:
+        observe: what the policy sees:
+        algo: how it learns:
+        steps: training steps of the env, by default:
+        scenario: the plant and its noise:
+        preset: the scenario of another thruster:
+        tuned: tuned file of the filter, from `thruster tune`.
+        untuned: give the filter R from the sensor's data sheet and Q from a rule of thumb.
+        controller: let the policy correct a controller instead of acting alone:
+        envs: copies of the env, stepped together.
+        evaluations: number of validations of the policy during training.
+        checkpoints: number of checkpoints during training.
+        no_tensorboard: do not write logs for TensorBoard.
+        out: by default one in out/policies, named after these options.
+        seed: seed of the network, the noise and the episodes.
     """
     plant = plant_of(task)
     scenario = plant.scenario if scenario is None else scenario
@@ -168,7 +120,6 @@ def command(
         )
     with progress_console.status("loading torch ..."):
         from tuning.policies.learn import train
-    announce_compilation()
     with _bar(f"{algo} on {observe}", setup.steps) as on_progress:
         trained = train(
             setup,
@@ -178,9 +129,7 @@ def command(
             tensorboard=not no_tensorboard,
             on_progress=on_progress,
         )
-    emit(report(setup, trained), as_json(setup, trained), json)
-    if trained.interrupted:
-        sys.exit(130)
+    return Printed(report(setup, trained), as_json(setup, trained), INTERRUPTED if trained.interrupted else 0)
 
 
 def name_of(setup: TrainingConfiguration, tuned: Path | None = None, untuned: bool = False) -> str:
@@ -203,7 +152,7 @@ def report(setup: TrainingConfiguration, trained: Trained) -> list[RenderableTyp
     output: list[RenderableType] = []
     if rows:
         caption = f"0 is perfect; actions of zero have {trained.idle:.3f} on the same episodes."
-        output += [title, table("", ["steps", "mean return"], rows, caption=caption)]
+        output += [title, Table("", ["steps", "mean return"], rows, caption=caption)]
         if curve[-1][1] <= trained.idle:
             output.append("At the end the policy is no better than actions of zero: it needs more --steps.")
     output.append(f"{trained.steps} steps, {trained.learnt} of them now in {trained.seconds:.1f} s: {speed}.")

@@ -1,8 +1,8 @@
 """Make the commands of the verbs: `thruster evaluate` from the function `tuning.evaluate`, and so on.
 
 Types and defaults of options are those of the signature, their help is that of the docstring, and the rest stands
-in the markers of `tuning.api.markers`. A result has `tables()` for the terminal, `as_dict()` for --json and,
-unless it is 0, an `exit_code`.
+in the markers of `tuning.api.markers`. What a command prints and writes is the `Result` of the function; a page
+that is served has `serve()` instead.
 """
 
 from __future__ import annotations
@@ -12,16 +12,15 @@ import inspect
 import re
 import sys
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from inspect import Parameter
+from os import fspath
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 import typer
 
-from thruster_env.core.checks import short_repr
-from thruster_env.thruster.channels import CHANNELS
-from thruster_env.thruster.parameters import PRESETS
+from thruster_env.core.checks import any_case, short_repr
 from tuning.api.markers import (
     OUTPUT,
     READ,
@@ -34,10 +33,8 @@ from tuning.api.markers import (
     ProblemOption,
     PythonOnly,
 )
-from tuning.api.read_logs import read_logs
-from tuning.cli.options import spelt
+from tuning.api.result import Result, check_page
 from tuning.cli.output import announce_compilation, check_targets, emit
-from tuning.problems.plant_packages import built_in
 
 SHARED = {"preset", "model"}  # of recorded runs, and of tuned files
 CHANGES = {"preset", "augment"}  # of a problem that is named
@@ -46,19 +43,38 @@ SAME, AGAIN = "The same as the argument.", "_again"
 SIMPLE = (bool, int, float, str, Path)
 
 
+def spelt(choices: Iterable[str]) -> Callable:
+    """A callback for an option or argument that accepts names of choices in upper or lower case."""
+    known = tuple(choices)
+
+    def callback(value):
+        return [any_case(choice, known) for choice in value] if isinstance(value, list) else any_case(value, known)
+
+    return callback
+
+
 def names_in(choices: str) -> tuple[Sequence[str], str]:
     """The names in a list, and what follows the description of a parameter whose value is such a name."""
+    if choices == "filters":
+        from filters.registry import FILTERS
+
+        return [*FILTERS, "auto"], ""
     if choices == "presets":
+        from thruster_env.thruster.parameters import PRESETS
+
         return [*PRESETS], f"{', '.join(PRESETS)}, or a FILE.toml of `thruster new preset` or `thruster identify`."
     if choices == "sensors":
+        from thruster_env.thruster.channels import CHANNELS
+
         return [*CHANNELS], f"{', '.join(CHANNELS)}."
     if choices == "objectives":
         from tuning.search.objectives import OBJECTIVES  # which imports optuna
 
         return [*OBJECTIVES], f"{', '.join(OBJECTIVES)}, output:SYMBOL."
-    from tuning.cli.problems import PROBLEMS  # which imports all plants
+    from tuning.problems.find import built_in
 
-    return [*built_in()], PROBLEMS
+    code = "module:object: a tuning.problems.problem.Problem, or a function that returns one."
+    return [*built_in()], f"{', '.join(built_in())}, a .toml file, or {code}"
 
 
 class Part(NamedTuple):
@@ -80,23 +96,39 @@ def command_of(verb: Callable) -> Callable:
     parts, fixed = parts_of(verb)
     help_text = "Also write the result as JSON; - for standard output."
     json = typer.Option("--json", metavar="FILE", help=help_text, rich_help_panel=OUTPUT)
-    of_json = parameter_of("json", str | None, json, None)
+    of_result, returned = [], hints_of(verb)["return"][0]
+    if has_figures(returned):
+        help_text = "Also write a page with all tables and figures, and the tables as Markdown beside it."
+        report = typer.Option("--report", metavar="FILE.html", help=help_text, rich_help_panel=OUTPUT)
+        of_result.append(parameter_of("report", Path | None, report, None))
+    is_served = hasattr(returned, "serve")  # until one ends it, so that it has no JSON
+    of_result += [] if is_served else [parameter_of("json", str | None, json, None)]
 
     def command(**values: Any) -> None:
-        target = values.pop("json")
+        target, page = values.pop("json", None), values.pop("report", None)
         arguments = arguments_of(verb, parts, values)
-        check_targets(files_of(parts, values, WRITTEN), target, read=files_of(parts, values, READ))
+        written = [*files_of(parts, values, WRITTEN), *([] if page is None else [check_page(page)])]
+        check_targets(written, target, read=files_of(parts, values, READ))
         announce_compilation()
         result = verb(**fixed, **arguments)
-        emit(result.tables(), result.as_dict(), target)
+        if is_served:
+            result.serve()
+        else:
+            pages = [] if page is None else [f"Page: {fspath(result.report(page))}"]
+            emit([*result.tables(), *pages], result.document() if target else {}, target)
         if code := getattr(result, "exit_code", 0):
             sys.exit(code)
 
     taking: Any = command
-    taking.__signature__ = inspect.Signature([*(part.parameter for part in parts), of_json])
+    taking.__signature__ = inspect.Signature([*(part.parameter for part in parts), *of_result])
     taking.__annotations__ = {name: part.annotation for name, part in taking.__signature__.parameters.items()}
     taking.__doc__ = shell_text(described(verb)[0], parts)
     return taking
+
+
+def has_figures(returned: Any) -> bool:
+    """Whether results of a class have figures of their own."""
+    return isinstance(returned, type) and issubclass(returned, Result) and returned.figures is not Result.figures
 
 
 def parts_of(verb: Callable, last: str = "") -> tuple[list[Part], dict[str, Any]]:
@@ -114,9 +146,13 @@ def parts_of(verb: Callable, last: str = "") -> tuple[list[Part], dict[str, Any]
             continue
         text = texts.get(name, "")
         if isinstance(marker, LogsArgument):
+            from tuning.api.read_logs import read_logs
+
             text = f"{text} {described(read_logs)[1]['files']}"
         parts += parts_of_parameter(parameter, kind, marker, text)
         if isinstance(marker, LogsArgument | ProblemOption):
+            from tuning.api.read_logs import read_logs
+
             files, *of_logs = parts_of(read_logs, marker.last)[0]
             if isinstance(marker, ProblemOption):
                 kind, info = get_args(files.parameter.annotation)
@@ -139,9 +175,11 @@ def parts_of_parameter(parameter: Parameter, kind: Any, marker: Option, text: st
     if default == () or (get_origin(kind) is list and default is not Parameter.empty):
         default = None  # the docstring says what is taken then
     kind = kind | None if default is None else kind
-    choices, listed = marker.choices, ""
+    choices, listed = marker.choices, marker.listed
     if isinstance(choices, str):
         choices, listed = names_in(choices)
+    elif choices is not None and text.endswith(":") and not listed:
+        listed = f"{', '.join(choices)}."
     options: dict[str, Any] = {"metavar": marker.metavar, "min": marker.least, "max": marker.most}
     options |= {
         "callback": None if choices is None else spelt(choices),
@@ -181,6 +219,8 @@ def arguments_of(verb: Callable, parts: Sequence[Part], values: Mapping[str, Any
     for name, parameter in inspect.signature(verb).parameters.items():
         marker = hints_of(verb)[name][1]
         if isinstance(marker, LogsArgument) and name in arguments:
+            from tuning.api.read_logs import read_logs
+
             arguments[name] = read_logs(arguments[name], **reading)
         elif isinstance(marker, ProblemOption):
             problem_in(arguments, name, marker, reading, chosen)
@@ -200,6 +240,8 @@ def problem_in(
         if name in arguments:
             got = f"both, {files[0]} and {arguments[name]}"
             raise ValueError(f"a problem must be of --log or of --problem, but got {got}")
+        from tuning.api.read_logs import read_logs
+
         shared = {key: arguments.pop(key) for key in SHARED & arguments.keys()}
         arguments[name] = read_logs(files, **reading, **shared)
         return
@@ -267,7 +309,7 @@ class Names(dict):
 
 def simplified(hint: Any) -> Any:
     """The type of an option: of a union the first that a command line can express, a list for a sequence."""
-    if hint in SIMPLE:
+    if hint in SIMPLE or get_origin(hint) is tuple:
         return hint
     if get_origin(hint) in (Union, types.UnionType):
         return next((kind for kind in map(simplified, get_args(hint)) if kind is not None), None)

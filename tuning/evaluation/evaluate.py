@@ -20,13 +20,14 @@ from filters.consistency.intervals import (
     rmse_intervals,
     without_interval,
 )
+from filters.consistency.nees import blow_up_sentence
 from filters.consistency.report import ConsistencyReport, findings, joined, report_of
 from filters.consistency.time_constants import TimeConstants
+from filters.engine.batch import Estimates
 from filters.ensembles.square_root import record_members
 from filters.filter import Filter
 from filters.starts import Restarts, restarts_of
 from thruster_env.model.quantities import Quantity
-from tuning.evaluation.blow_up import blow_up
 from tuning.evaluation.runs import RunMetrics, metrics_of_all, variance_ratios
 from tuning.problems.data import Data, estimates_in_parts
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 MEMBER_RUNS, MEMBER_STEPS = 40, 5  # runs and step interval of rank histograms
 NOTHING = Interval(np.nan, np.nan, np.nan)
+BLOW_UP_RUNS = 20  # that tell whether a model blows up
 FARTHEST_NEES = 3.0  # factor on the expected mean NEES, beyond which a headline says so
 
 
@@ -330,3 +332,29 @@ def _check_paired(a: Evaluation, b: Evaluation) -> None:
         raise ValueError(
             f"a paired comparison needs the same seeds, but got {len(a.mean_squares)} and {len(b.mean_squares)}"
         )
+
+
+# Whether a filter's model blows up between samples, by its innovations on a problem's data.
+
+
+def blow_up(filter_: Filter, estimates: Estimates, data: Data, dt: float | None) -> str:
+    """A sentence on a filter whose model blows up between samples, from its scored innovations; empty otherwise.
+
+    Args:
+        filter_: the filter of the estimates.
+        estimates: on the same data.
+        data: inputs and measurements.
+        dt: sample time [s], if there is one.
+    """
+    names = [channel.name for channel in filter_.model.measurements]
+    innovations, measurements = (data.late_scored(values) for values in (estimates.innovations, data.measurements))
+    return blow_up_sentence(innovations, measurements, names, dt)
+
+
+def blow_up_on(filter_: Filter, data: Data, dt: float | None) -> str:
+    """`blow_up` of a filter on the first runs of some data."""
+    first_runs = data.slice(0, BLOW_UP_RUNS)
+    sentences = [
+        blow_up(filter_, estimates, part, dt) for part, estimates in estimates_in_parts(filter_, first_runs)
+    ]
+    return next((sentence for sentence in sentences if sentence), "")

@@ -1,6 +1,6 @@
 """The tuned file: one JSON file with a filter's parameters, their origin and their held-out metrics.
 
-`verify` recomputes the metrics on the file's own seeds.
+`tuning.verify` recomputes the metrics on the file's own seeds.
 """
 
 from __future__ import annotations
@@ -8,9 +8,8 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,14 +38,12 @@ from tuning.evaluation.held_out import (
     ROLES,
     Comparison,
     comparison_as_data,
-    evaluate_held_out,
     sizes_as_data,
     summary,
     versions,
 )
 from tuning.problems.assumed import augmented, name_and_unknown, suited
-from tuning.problems.find import find_given, find_problem, scenario_of
-from tuning.problems.plant_packages import built_in
+from tuning.problems.find import built_in, find_given, find_problem, scenario_of
 from tuning.problems.problem import Problem
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
@@ -55,7 +52,6 @@ from tuning.search.study import StudyResult
 from tuning.search.validation import as_data
 
 SAME_NOISE = 1e-6  # relative difference of two covariances, above which they are not the same
-TOLERANCE = 1e-9  # relative: the effect of the order of a sum
 
 
 def write_tuned(
@@ -332,123 +328,3 @@ def consistency(result: StudyResult) -> dict:
     """Whether any trial of a study was consistent, and the mean NIS of its choice, as plain numbers for JSON."""
     nis = [ratio if math.isfinite(ratio) else None for ratio in result.nis]
     return {"any_trial_consistent": result.consistent, "mean_nis": nis, "nis_band": list(NIS_BAND)}
-
-
-# Verification of a tuned file: its held-out metrics, recomputed.
-
-
-LATER = (
-    "scaled",
-    "scaled_default",
-    "given",
-    "noise",
-    "log_score",
-    "restarts",
-    "state_nees",
-    "time_constants",
-    "oracle",
-    "advised",
-    "uneven",
-)  # keys that older files lack
-
-
-class Difference(NamedTuple):
-    """A number of a tuned file that differs from the recomputed one."""
-
-    place: str  # such as "mismatch: tuned nees 0"
-    stored: Any
-    found: Any
-
-    @property
-    def relative(self) -> float:
-        """The difference over the larger magnitude; infinite if one of them is not a number."""
-        if not isinstance(self.stored, int | float) or not isinstance(self.found, int | float):
-            return float("inf")
-        return abs(self.stored - self.found) / max(abs(self.stored), abs(self.found))
-
-
-class Verification(NamedTuple):
-    """The result of recomputing a tuned file's metrics."""
-
-    checked: int  # numbers that were compared
-    differences: list[Difference]  # beyond rounding, the largest first
-    packages: dict[str, tuple[str, str]]  # of another version here: version in the file, and installed version
-
-    @property
-    def holds(self) -> bool:
-        """Whether every number is the same within rounding."""
-        return not self.differences
-
-
-def verify(path: str | Path, problems: Sequence[Problem] = ()) -> Verification:
-    """Recompute the held-out metrics of a tuned file, on its seeds of each scenario.
-
-    Args:
-        path: the tuned file.
-        problems: the problems it was tuned on, if these are code: names in a file are never imported.
-
-    Raises:
-        ValueError: if the file is not a complete, unchanged tuned file, or has no metrics.
-    """
-    content, (choice, _, seed) = read_tuned_file(path), read_tuned(path, problems)
-    held_out = content.get("held_out")
-    if not isinstance(held_out, dict) or not held_out:
-        raise ValueError(
-            f"a tuned file must have held-out metrics to verify, but {path} has {short_repr(held_out)}"
-        )
-    count, differences = 0, []
-    for name, stored in held_out.items():
-        comparison = evaluate_held_out(
-            choice, problem_in(content, name, path, problems), seed, _count(stored, path)
-        )
-        pairs = _numbers(stored), _numbers(_as_old_as(stored, metrics(comparison)))
-        names = list(dict.fromkeys([*pairs[0], *pairs[1]]))
-        differing = [Difference(f"{name}: {key}", *(part.get(key) for part in pairs)) for key in names]
-        count += len(names)
-        differences += [
-            difference
-            for difference in differing
-            if difference.stored != difference.found and not difference.relative <= TOLERANCE
-        ]
-    differences.sort(key=lambda difference: -difference.relative)
-    stored_versions, here = content.get("made_with", {}), versions()
-    packages = {
-        name: (stored_versions.get(name, "not stored"), version)
-        for name, version in here.items()
-        if stored_versions.get(name) != version
-    }
-    return Verification(count, differences, packages)
-
-
-def _as_old_as(stored: Any, recomputed: Any) -> Any:
-    """The recomputed metrics without keys that came later than the file."""
-    if not (isinstance(stored, dict) and isinstance(recomputed, dict)):
-        return recomputed
-    known = {key: value for key, value in recomputed.items() if key in stored or key not in LATER}
-    return {key: _as_old_as(stored.get(key), value) for key, value in known.items()}
-
-
-def _count(stored, path: str | Path) -> int:
-    """Number of held-out seeds of a scenario's entry."""
-    try:
-        first, beyond = stored["seeds"]
-        return beyond - first
-    except (KeyError, TypeError, ValueError):
-        raise ValueError(
-            "held-out metrics of a tuned file must give their first seed and the one after the last, but "
-            f"{path} has {short_repr(stored)}"
-        ) from None
-
-
-def _numbers(value, path: str = "") -> dict[str, Any]:
-    """All values within nested mappings and lists, by their path."""
-    return dict(_leaves(value, path))
-
-
-def _leaves(value, path: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, dict | list | tuple):
-        parts = value.items() if isinstance(value, dict) else enumerate(value)
-        for key, part in parts:
-            yield from _leaves(part, f"{path} {key}".strip())
-    else:
-        yield path, value

@@ -139,7 +139,8 @@ def find_benchmark(name: str) -> Benchmark:
 
 def run_in_memory(plan: Plan, trials: int, start: Choice | None = None) -> StudyResult:
     """The result of a study that is not stored; its first trial is `start`, by default the untuned filter."""
-    from tuning.search.study import open_study, quiet_optuna, run_study
+    from tuning.search.storage import quiet_optuna
+    from tuning.search.study import open_study, run_study
 
     quiet_optuna()
     return run_study(open_study("in memory", plan, None, start), plan, trials).or_interrupted()

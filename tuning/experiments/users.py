@@ -23,7 +23,7 @@ import tuning
 from filters.consistency.intervals import Interval, pooled_mean, slightly
 from thruster_env.core.files import write_whole
 from thruster_env.core.text_tables import markdown_table
-from tuning.api.run import short_name
+from tuning.api.tune import short_name
 from tuning.evaluation.baselines import ORACLE, TUNED
 from tuning.evaluation.evaluate import Evaluation, score_ratio
 from tuning.problems.find import find_problem
@@ -147,7 +147,7 @@ def tuned_case(problem: Problem, name: str, trials: int, seed: int) -> Case:
         return Case(name_of(problem), name, nothing, nothing, 0, "", {}, seconds, str(error))
     if study.interrupted:
         raise KeyboardInterrupt
-    validation = getattr(study.tuning.result, "validation", None)
+    validation = getattr(study.result, "validation", None)
     gave_way = validation.chosen if validation is not None and validation.gave_way else ""
     seconds = time.perf_counter() - started
     return compared(name_of(problem), name, study.held_out.comparison.evaluations, seconds, gave_way)

@@ -40,15 +40,15 @@ from tuning.exploring.view import (
     view_of,
 )
 from tuning.problems.data import Data
-from tuning.problems.find import find_problem
+from tuning.problems.find import built_in, find_problem
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import Parameter, Problem
 from tuning.problems.scenario import plain
 from tuning.search.objectives import LIKELIHOOD, SCORE, find_objective, nis_ratio
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, everything_of, fits, has_search_space, neutral, parameters, untuned_choice
-from tuning.search.study import FINISHED, StudyResult, finished_trials, open_study, quiet_optuna, run_trials
+from tuning.search.storage import quiet_optuna
+from tuning.search.study import FINISHED, StudyResult, finished_trials, open_study, run_trials
 
 CHANGED = (SENSORS, AMPLIFIER)  # fields of a scenario that a bench changes
 BY_HAND = "by hand"  # the method of a tuned file whose numbers a person chose

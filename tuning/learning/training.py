@@ -28,7 +28,6 @@ from thruster_env.core.threads import one_thread
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import ORACLE, baselines
 from tuning.evaluation.evaluate import NOTHING, Evaluation, evaluate, score_ratio, values_of
-from tuning.learning.settings import Settings
 from tuning.problems.check import data_of
 from tuning.problems.data import Data
 from tuning.problems.env_problem import measurement_noise
@@ -41,6 +40,25 @@ START = "ekf"
 SMALLEST = 1e-12  # of a scale: a quantity that stays at zero is divided by this, and stays there
 LARGER = 4.0  # factor on R
 HELD_OUT, LONGER, NOISIER = "held out", "twice as long", f"R x {LARGER:g}"
+
+
+class Settings(NamedTuple):
+    """How an estimator is trained.
+
+    Attributes:
+        steps: updates of the network's weights.
+        batch: runs in each.
+        window: steps of a run over which gradients go back; the next window begins where the last one ended.
+        rate: Adam's step size at first; it falls to a hundredth along half a cosine.
+        checks: evaluations on validation runs.
+    """
+
+    steps: int
+    batch: int
+    window: int
+    rate: float
+    checks: int = 20
+
 
 # What the training of an estimator minimises: squared errors, or the log density of the truth.
 

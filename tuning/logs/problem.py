@@ -24,10 +24,9 @@ from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification, write_values
 from tuning.logs.read import check_model, name_of, read_named, texts
 from tuning.problems.assumed import name_and_unknown
-from tuning.problems.find import named
+from tuning.problems.find import logs_package, named
 from tuning.problems.log_parts import check_apart, check_times
 from tuning.problems.log_problem import MISSING, LogProblem, without_outliers
-from tuning.problems.plant_packages import logs_package
 from tuning.problems.problem import Parameter, Problem
 
 OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid", "stamps")  # of `read_named`

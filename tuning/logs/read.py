@@ -23,7 +23,7 @@ from thruster_env.logs.table import SUFFIXES
 from thruster_env.model.affine import LETTERS, AffineModel, affine_model
 from thruster_env.model.continuous import ContinuousModel, in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.problems.plant_packages import logs_package
+from tuning.problems.find import logs_package
 
 Named = Mapping[str, Any] | Sequence[str] | None  # a mapping, or texts NAME=VALUE as on a command line
 

@@ -35,7 +35,8 @@ from tuning.policies.saved import FINAL, Policy, Scores, classical_policy, load,
 from tuning.policies.setup import TrainingConfiguration, make_configuration
 from tuning.problems.data import held_out_seeds
 from tuning.search.plan import Plan
-from tuning.search.study import open_study, quiet_optuna, run_study, without_interrupts
+from tuning.search.storage import quiet_optuna
+from tuning.search.study import open_study, run_study, without_interrupts
 from tuning.thruster.scenario import Scenario, find_scenario
 
 TASK = "manoeuvre"

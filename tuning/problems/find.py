@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar
 
 from thruster_env.core.checks import FEW, any_case, meant, one_of, short_repr
@@ -13,14 +15,33 @@ from thruster_env.core.files import read_toml
 from thruster_env.core.modules import error_line, is_code, object_named
 from tuning.problems.assumed import augmented, name_and_unknown
 from tuning.problems.check import checked_problem
-from tuning.problems.plant_packages import PLANT_PACKAGES, built_in, plant_package
 from tuning.problems.problem import Problem
 from tuning.problems.scenario import BaseScenario
 
+# Packages that know a plant, named as text: they are imported when a scenario is looked up.
+# Each has the class Scenario, NAMES of scenarios, the NOMINAL one, find_scenario(name) and
+# computed_scale(scenario, sequences).
+PLANT_PACKAGES = {"thruster": "tuning.thruster.scenario", "auv": "tuning.auv.scenario"}
+LOGS = "tuning.thruster.logs"
 FILE_SEQUENCES = 200  # input sequences for the scale of a file that gives none
 PLANT = "plant"  # the key that names the plant
 BASE = "base"
 S = TypeVar("S", bound=BaseScenario)
+
+
+def plant_package(plant: str) -> ModuleType:
+    """The package of a plant by its key in `PLANT_PACKAGES`."""
+    return importlib.import_module(PLANT_PACKAGES[plant])
+
+
+def logs_package() -> ModuleType:
+    """The package of the plant of logs without a model, `tuning.thruster.logs`."""
+    return importlib.import_module(LOGS)
+
+
+def built_in() -> dict[str, ModuleType]:
+    """Names of the built-in problems, and the package of each."""
+    return {name: room for room in map(plant_package, PLANT_PACKAGES) for name in room.NAMES}
 
 
 def read_scenario(path: str | Path) -> BaseScenario:

@@ -49,7 +49,7 @@ class BaseScenario(Problem):
     `make`.
 
     Attributes:
-        plant_kind: key of its plant in `plant_packages.PLANT_PACKAGES`.
+        plant_kind: key of its plant in `find.PLANT_PACKAGES`.
         name: its name; that of its file if it was read from one.
         about: one line for tables and help.
         scale: by which the score divides the error of each state, fixed numbers.

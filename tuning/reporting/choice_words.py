@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from math import floor, isfinite, isnan, log10
+from collections.abc import Callable, Mapping, Sequence
+from math import isfinite, isnan
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.residuals import noise_estimation, tails_in_words
 from tuning.evaluation.worth import LARGEST_RATIO, scaling_sentence, sized, times, without_truth
 from tuning.problems.assumed import may_estimate_constants, within
-from tuning.problems.plant_packages import logs_package
+from tuning.problems.find import logs_package
 from tuning.problems.problem import Problem
 from tuning.search.measures import LEVEL
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MOST_PRICE, MSE, NIS_BAND, PROPER, nis_ratio
@@ -44,8 +44,6 @@ MADE_UP = "made consistent by Q and R, not by the model"
 JOINTLY = "consistent jointly, but not in each state"
 
 # Of parameters in words.
-SMALL_SHARE, LARGE = 1e-3, 1e5  # what is smaller or larger is told in a unit with a power of ten
-RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 MOST_CORRELATIONS = 3  # of three states or channels: more are one row with the largest
 ALIKE = 4  # so many numbers of one kind and more, which are the same in every column, share a row
 
@@ -473,43 +471,10 @@ def consistency_sentence(comparison: Comparison) -> str:
     return f"{sentence} RMSE and NIS do not fully test the covariance."
 
 
-def typeset(text: str) -> str:
-    """Units in a text as pages have them: m^3/s is m³/s."""
-    return re.sub(r"(?<=[A-Za-z)])\^(-?\d+)", lambda match: match[1].translate(RAISED), text)
-
-
-def power_of_ten(values: Iterable[float]) -> int:
-    """The exponent, of three or a multiple, that some numbers in one column share; 0 where they need none."""
-    sizes = [abs(value) for value in values if isfinite(value) and value]
-    largest = max(sizes, default=1.0)
-    return 0 if SMALL_SHARE <= largest < LARGE else 3 * floor(log10(largest) / 3)
-
-
-def scaled_unit(unit: str, power: int) -> str:
-    """A unit with a power of ten before it: "10⁻⁶ m"."""
-    factor = f"10{str(power).translate(RAISED)}" if power else ""
-    return " ".join(filter(None, (factor, unit)))
-
-
-def labels(names: Iterable[str], kind: str, problem: Problem, square: str = "^2") -> dict[str, str]:
-    """The labels of a filter's parameters in tables: Q11 of the thruster is "Q11 [(rad/s)^2]".
-
-    Args:
-        names: of trial parameters.
-        kind: name of the filter.
-        problem: whose parameters have the units.
-        square: what stands for "squared".
-    """
-    known = parameters(kind, problem, **everything_of(problem))
-    units = {parameter.name: parameter.unit.replace("^2", square) for parameter in known}
-    wordings = {name: index_pairs(name.replace("_", " ")) for name in names}
-    return {name: f"{words} [{units[name]}]" if units.get(name) else words for name, words in wordings.items()}
-
-
-def number_rows(
-    choices: Sequence[Choice], kind: str, problem: Problem, word: Callable, square: str = "^2"
-) -> list[list[str]]:
+def number_rows(choices: Sequence[Choice], kind: str, problem: Problem, word: Callable) -> list[list[str]]:
     """Rows of a table of choices' numbers, a column each: a label, and what `word` makes of each number or None.
+
+    The label of Q11 of the thruster is "Q11 [(rad/s)^2]".
 
     Q11, Q22, ... and such that are the same in every column share a row.
 
@@ -518,10 +483,13 @@ def number_rows(
         kind: its name.
         problem: whose parameters have the units.
         word: of a number, or of None where a choice does not say it.
-        square: what stands for "squared".
     """
     columns = [parameters_of(choice) for choice in choices]
-    names = labels(dict.fromkeys(name for column in columns for name in column), kind, problem, square)
+    units = {parameter.name: parameter.unit for parameter in parameters(kind, problem, **everything_of(problem))}
+    names: dict[str, str] = {}
+    for name in (name for column in columns for name in column):
+        words = index_pairs(name.replace("_", " "))
+        names[name] = f"{words} [{units[name]}]" if units.get(name) else words
     rows = []
     for letter in ("", "R "):
         correlations = [name for name in names if name.startswith(f"{letter}correlation ".replace(" ", "_"))]

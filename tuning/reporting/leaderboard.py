@@ -8,13 +8,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from math import inf, isfinite, isnan, log10
+from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import RenderableType
-from rich.table import Table
 
 from filters.consistency.intervals import Interval, slightly
-from thruster_env.core.text_tables import table
+from thruster_env.core.text_tables import Table
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.compare import Leaderboard, Row, belief_sentences, noise_sentence, winners
 from tuning.evaluation.evaluate import Evaluation, restart_sentences
@@ -43,20 +42,87 @@ def comparison_table(
     first = next(iter(evaluations.values()))
     if not first.has_truth:
         return _innovations_table(evaluations, where)
+    cells = zip(*map(consistency_cells, evaluations.values()), strict=True)
+    of_filter = [Column("NEES", [*next(cells)], str(len(bound))), Column("NIS", [*next(cells)], right_nis(first))]
+    ideal = f"±: half of the 95 % interval. Ideal: NEES {len(bound)}, NIS {right_nis(first)}."
+    return errors_table(evaluations, bound, f"RMSE on {where}", ideal, scale_about, of_filter=of_filter)
+
+
+class Column(NamedTuple):
+    """A column beside errors: its head, a cell for each filter (of states a list), and that of the last row."""
+
+    head: str
+    cells: Sequence[Any]
+    last: str = ""
+
+
+def errors_table(
+    evaluations: Mapping[str, Evaluation],
+    bound: np.ndarray,
+    title: str,
+    caption: str,
+    scale_about: str = "",
+    of_state: Sequence[Column] = (),
+    of_filter: Sequence[Column] = (),
+) -> Table:
+    """RMSE and the distance from the bound, with further columns; the best score stands out.
+
+    A row is a filter, or where states and outputs do not fit side by side one of them.
+    """
+    first = next(iter(evaluations.values()))
     outputs = {symbol: output for e in evaluations.values() for symbol, output in e.outputs.items()}
-    layout = _across if 2 * len(first.states) + len(outputs) <= MOST_COLUMNS else _below
-    columns, rows = layout(evaluations, bound, outputs)
-    has_bound = not np.isnan(bound).all()
-    if has_bound:
-        above = "above: the bound. "
+    outputs = outputs if of_filter else {}
+    digits, states, rows = decimals(first), first.states, []
+    across = 2 * len(states) + len(outputs) <= MOST_COLUMNS
+    for number, (name, evaluation) in enumerate(evaluations.items()):
+        above = [unless_blank(part, "+.0f") for part in above_bound(evaluation, bound)]
+        errors = [about(rmse, count) for rmse, count in zip(evaluation.rmse, digits, strict=True)]
+        further = [column.cells[number] for column in of_state]
+        values, last = [_output(evaluation, symbol) for symbol in outputs], [c.cells[number] for c in of_filter]
+        if across:
+            pairs = [cell for pair in zip(errors, above, strict=True) for cell in pair]
+            rows.append([name, *pairs, *values, *(cell for cells in further for cell in cells), *last])
+            continue
+        block = [[s.short_label, *cells] for s, *cells in zip(states, errors, above, *further, strict=True)]
+        block += [
+            [o.short_label, v, "", *[""] * len(of_state)] for o, v in zip(outputs.values(), values, strict=True)
+        ]
+        rows += _block(name, block, last)
+    limits, has_bound = list(map(limit_cell, bound, digits)), not np.isnan(bound).all()
+    word, last = "bound" if has_bound else "expected", [column.last for column in of_filter]
+    blank, heads = [""] * len(of_state), [column.head for column in of_filter]
+    if across:
+        pairs = [cell for limit in limits for cell in (limit, "")]
+        rows.append([word, *pairs, *("" for _ in outputs), *blank * len(states), *last])
+        of_states = [
+            f"{'' if i else column.head}\n{f'[{state.unit}]' if state.unit else ''}"
+            for column in of_state
+            for i, state in enumerate(states)
+        ]
+        errors = [head for state in states for head in (two_lines(state), ABOVE)]
+        columns = ["filter", *errors, *map(two_lines, outputs.values()), *of_states, *heads]
     else:
-        above = f"No bound; the score is RMSE over {scale_about}. " if scale_about else ""
+        labels = [state.short_label for state in states] if has_bound else [""]
+        rows += _block(
+            word, [[label, limit, "", *blank] for label, limit in zip(labels, limits, strict=False)], last
+        )
+        columns = ["filter", "state", "RMSE", ABOVE, *(column.head for column in of_state), *heads]
+    if not has_bound:
+        rows = rows if of_filter else rows[:-1]
         columns, rows = without(columns, rows, ABOVE)
-    caption = f"{above}±: half of the 95 % interval. Ideal: NEES {len(bound)}, NIS {right_nis(first)}."
-    lines = 1 if layout is _across else len(first.states) + len(outputs)
+    above_words = "above: the bound. " if has_bound else ""
+    if not has_bound and scale_about:
+        above_words = f"No bound; the score is RMSE over {scale_about}. "
+    lines = 1 if across else len(states) + len(outputs)
     index = lowest([evaluation.score.value for evaluation in evaluations.values()])
     best = range(index * lines, (index + 1) * lines) if index is not None else ()
-    return table(f"RMSE on {where}", columns, rows, caption=caption, best=best)
+    return Table(title, columns, rows, f"{above_words}{caption}", best=best)
+
+
+def _block(name: str, rows: Sequence[list[str]], last: Sequence[str]) -> list[list[str]]:
+    """Rows of one filter: its name and last cells stand in the first."""
+    blank = [""] * len(last)
+    return [[*(("",) if i else (name,)), *row, *(blank if i else last)] for i, row in enumerate(rows)]
 
 
 def lowest(values: Sequence[float]) -> int | None:
@@ -69,41 +135,6 @@ def without(columns: Sequence[str], rows: Sequence[Sequence[str]], head: str) ->
     """Columns and rows less the columns of one head."""
     indices = [i for i, column in enumerate(columns) if column != head]
     return [columns[i] for i in indices], [[row[i] for i in indices] for row in rows]
-
-
-def _across(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: Mapping[str, Quantity]) -> tuple:
-    """Columns and rows with all states side by side."""
-    first = next(iter(evaluations.values()))
-    digits, rows = decimals(first), []
-    for name, evaluation in evaluations.items():
-        above = [unless_blank(part, "+.0f") for part in above_bound(evaluation, bound)]
-        pairs = zip(evaluation.rmse, digits, above, strict=True)
-        states = [cell for rmse, count, over in pairs for cell in (about(rmse, count), over)]
-        rows.append(
-            [name, *states, *(_output(evaluation, symbol) for symbol in outputs), *consistency_cells(evaluation)]
-        )
-    limits = [cell for limit, count in zip(bound, digits, strict=True) for cell in (limit_cell(limit, count), "")]
-    rows.append([expected_word(bound), *limits, *("" for _ in outputs), str(len(bound)), right_nis(first)])
-    heads = [head for state in first.states for head in (two_lines(state), ABOVE)]
-    return ["filter", *heads, *map(two_lines, outputs.values()), "NEES", "NIS"], rows
-
-
-def _below(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: Mapping[str, Quantity]) -> tuple:
-    """Columns and rows with a filter's states and outputs one below the other."""
-    first = next(iter(evaluations.values()))
-    digits, rows = decimals(first), []
-    for name, evaluation in evaluations.items():
-        above = [unless_blank(part, "+.0f") for part in above_bound(evaluation, bound)]
-        columns = evaluation.states, evaluation.rmse, digits, above
-        block = [[s.short_label, about(rmse, d), over] for s, rmse, d, over in zip(*columns, strict=True)]
-        block += [[outputs[symbol].short_label, _output(evaluation, symbol), ""] for symbol in outputs]
-        heads = [[name, *consistency_cells(evaluation)]] + [["", "", ""]] * (len(block) - 1)
-        rows += [[head[0], *cells, *head[1:]] for head, cells in zip(heads, block, strict=True)]
-    limits = [[s.short_label, limit_cell(b, d), ""] for s, b, d in zip(first.states, bound, digits, strict=True)]
-    limits = limits if any(cells[1] for cells in limits) else [["", "", ""]]
-    heads = [[expected_word(bound), str(len(bound)), right_nis(first)]] + [["", "", ""]] * (len(limits) - 1)
-    rows += [[head[0], *cells, *head[1:]] for head, cells in zip(heads, limits, strict=True)]
-    return ["filter", "state", "RMSE", ABOVE, "NEES", "NIS"], rows
 
 
 def _innovations_table(evaluations: Mapping[str, Evaluation], where: str) -> Table:
@@ -119,7 +150,7 @@ def _innovations_table(evaluations: Mapping[str, Evaluation], where: str) -> Tab
         for name, evaluation in evaluations.items()
     ]
     caption = f"log L: of a run, higher is better. Ideal: NIS {right_nis(first)}. div.: restarts."
-    return table(f"Innovations on {where}", ["filter", "log L", "NIS", "div."], rows, caption=caption)
+    return Table(f"Innovations on {where}", ["filter", "log L", "NIS", "div."], rows, caption=caption)
 
 
 def above_bound(evaluation: Evaluation, bound: np.ndarray) -> list[float]:
@@ -151,11 +182,6 @@ def two_lines(quantity: Quantity) -> str:
     return f"{quantity.symbol}\n[{quantity.unit}]" if quantity.unit else f"{quantity.symbol}\n"
 
 
-def expected_word(bound: np.ndarray) -> str:
-    """The label of the row below the filters: without a bound it has the expected NEES and NIS."""
-    return "expected" if np.isnan(bound).all() else "bound"
-
-
 def limit_cell(bound: float, digits: int) -> str:
     """A bound with so many decimals; empty where there is none."""
     return unless_blank(bound, ".2e" if digits > MOST_DECIMALS else f".{digits}f")
@@ -180,7 +206,7 @@ def unless_blank(value: float, form: str) -> str:
     return "" if isnan(value) else re.sub(r"^-(0(?:\.0*)?)$", r"\1", format(value, form))  # no -0
 
 
-def report(board: Leaderboard) -> list[RenderableType]:
+def report(board: Leaderboard) -> list[Table | str]:
     """Two tables of a scenario, one without truth, and a sentence on the winner."""
     scenario, evaluation = board.scenario, board.rows[0].evaluation
     title = f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name
@@ -189,8 +215,7 @@ def report(board: Leaderboard) -> list[RenderableType]:
         tables = [_predictions(board, f"{title}\nInnovations on {seeds}")]
         remarks = [without_truth(scenario.name)]
     else:
-        errors = _errors_across if 2 * len(evaluation.states) < MOST_COLUMNS else _errors_below
-        tables, remarks = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], []
+        tables, remarks = [_errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], []
     noise = noise_sentence(board.rows, "--knows")
     beliefs = belief_sentences(board.rows)
     hint = ["--augment NAME:STD:WALK changes these assumptions."] if beliefs else []
@@ -205,60 +230,18 @@ def winner(board: Leaderboard) -> int | None:
     return lowest([e.score.value if e.has_truth else -e.log_likelihood for e in evaluations])
 
 
-def _errors_across(board: Leaderboard, title: str) -> Table:
-    """RMSE of all states side by side, a row per filter."""
-    states, digits = board.rows[0].evaluation.states, decimals(board.rows[0].evaluation)
-    rows = []
-    for row in board.rows:
-        cells = []
-        for rmse, above, count in zip(row.evaluation.rmse, row.above_bound, digits, strict=True):
-            cells += [about(rmse, count), unless_blank(100.0 * above, "+.0f")]
-        rows.append([row.label, *cells, *map(_start_up, row.evaluation.start_up_rmse)])
-    limits = [
-        cell for bound, count in zip(board.bound, digits, strict=True) for cell in (limit_cell(bound, count), "")
+def _errors(board: Leaderboard, title: str) -> Table:
+    """RMSE of all states, also of the first steps, and of many states over those of the first filter."""
+    rows, first = board.rows, board.rows[0]
+    of_state = [
+        Column("start-up", [[unless_blank(e, ".3g") for e in row.evaluation.start_up_rmse] for row in rows])
     ]
-    if not np.isnan(board.bound).all():
-        rows.append(["bound", *limits, *("" for _ in states)])
-    heads = [head for state in states for head in (two_lines(state), ABOVE)]
-    begun = [f"{'' if i else 'start-up'}\n{f'[{s.unit}]' if s.unit else ''}" for i, s in enumerate(states)]
-    columns, rows, caption = _with_bound_or_not(board, ["filter", *heads, *begun], rows)
-    return table(title, columns, rows, caption=caption, best=[winner(board)])
-
-
-def _errors_below(board: Leaderboard, title: str) -> Table:
-    """RMSE of many states, a row per state of a filter."""
-    states, digits, rows = board.rows[0].evaluation.states, decimals(board.rows[0].evaluation), []
-    for row in board.rows:
-        first = row.label == board.rows[0].label
-        evaluation = row.evaluation
-        columns = states, evaluation.rmse, digits, row.above_bound, evaluation.start_up_rmse, row.ratios
-        block = [
-            [state.short_label, about(rmse, count), unless_blank(100.0 * above, "+.0f"), _start_up(begun)]
-            + ["1" if first else about(ratio, 3)]
-            for state, rmse, count, above, begun, ratio in zip(*columns, strict=True)
-        ]
-        rows += [[row.label if i == 0 else "", *cells] for i, cells in enumerate(block)]
-    limits = zip(states, board.bound, digits, strict=True)
-    bounds = [[state.short_label, limit_cell(bound, count), "", "", ""] for state, bound, count in limits]
-    if any(cells[1] for cells in bounds):
-        rows += [["bound" if i == 0 else "", *cells] for i, cells in enumerate(bounds)]
-    heads = ["filter", "state", "RMSE", ABOVE, "start-up", f"over\n{board.rows[0].label}"]
-    index, lines = winner(board), len(states)
-    best = () if index is None else range(index * lines, (index + 1) * lines)
-    heads, rows, caption = _with_bound_or_not(board, heads, rows)
-    return table(title, heads, rows, caption=caption, best=best)
-
-
-def _with_bound_or_not(board: Leaderboard, heads: list[str], rows: list[list[str]]) -> tuple:
-    """Columns, rows and caption; without a bound the caption describes the scale."""
-    rest = "±: half of the 95 % interval. start-up: the first 50 steps."
-    if not np.isnan(board.bound).all():
-        return heads, rows, f"above: the bound. {rest}"
-    return *without(heads, rows, ABOVE), f"No bound; the score is RMSE over {board.scenario.scale_about}. {rest}"
-
-
-def _start_up(rmse: float) -> str:
-    return unless_blank(rmse, ".3g")
+    if 2 * len(first.evaluation.states) > MOST_COLUMNS:
+        ratios = [["1" if row is first else about(ratio, 3) for ratio in row.ratios] for row in rows]
+        of_state.append(Column(f"over\n{first.label}", ratios))
+    caption = "±: half of the 95 % interval. start-up: the first 50 steps."
+    evaluations = {row.label: row.evaluation for row in rows}
+    return errors_table(evaluations, board.bound, title, caption, board.scenario.scale_about, of_state)
 
 
 def _against(board: Leaderboard) -> Table:
@@ -279,7 +262,7 @@ def _against(board: Leaderboard) -> Table:
     heads = ["filter", *(state.symbol for state in listed), "score", "NEES", "NIS", "div.", "us/step"]
     caption = f"±: half of the 95 % interval. Ideal: {right}. div.: restarts."
     title = f"Over {first}, paired; consistency and cost"
-    return table(title, heads, rows, caption=caption, best=[winner(board)])
+    return Table(title, heads, rows, caption=caption, best=[winner(board)])
 
 
 def _median(n: int) -> str:
@@ -302,7 +285,7 @@ def _predictions(board: Leaderboard, title: str) -> Table:
     right = right_nis(board.rows[0].evaluation)
     caption = f"log L: of a run. ±: half of the 95 % interval. Ideal: NIS {right}. div.: restarts."
     heads = ["filter", "log L", f"less that\nof {first}", "NIS", "div.", "us/step"]
-    return table(title, heads, rows, caption=caption, best=[winner(board)])
+    return Table(title, heads, rows, caption=caption, best=[winner(board)])
 
 
 def as_json(boards: list[Leaderboard]) -> dict:

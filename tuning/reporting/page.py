@@ -13,6 +13,7 @@ import re
 import unicodedata
 from collections.abc import Mapping, Sequence
 from html import escape
+from itertools import groupby
 from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,10 +22,10 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.engine.batch import Estimates
 from filters.filter import Filter
+from thruster_env.core.text_tables import Table, markdown_text, typeset, typeset_html
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.data import Data
-from tuning.reporting.choice_words import typeset
 from tuning.reporting.style import SCRIPT, STYLE
 from tuning.reporting.time_figures import one_run
 from tuning.search.objectives import reported, reported_name
@@ -48,10 +49,7 @@ FONTS = re.compile(r"'DejaVu Sans',[^;\"]*sans-serif")
 COLOUR = re.compile(r"#([0-9a-fA-F]{6})\b")
 
 # Of tables and pictures on a page.
-INTERVAL = re.compile(r"(\S+) (\[\S+, \S+\])")
 WIDE = 480.0  # [pt] pictures beyond this are scrolled on a phone
-MANY = 9  # columns of a table that is set small on paper
-FOLDED = 4  # columns from which a row is folded on a phone
 NARROW = 5  # columns of a table that fits beside another
 NO_TRIALS = "No trial was finished."
 TWO_SIDED = 1.96
@@ -177,41 +175,6 @@ def _hex(parts: tuple[float, ...]) -> str:
     return "#" + "".join(f"{round(255 * part):02x}" for part in parts)
 
 
-class Table(NamedTuple):
-    """A table of words: the first column names the row."""
-
-    caption: str
-    columns: Sequence[str]  # empty for a list of names and what they are
-    rows: Sequence[Sequence[str]]
-
-    def html(self) -> str:
-        """The table for a page: on a phone a row of many columns is folded; if still too wide, it scrolls."""
-        head = "".join(f'<th scope="col">{_text(column)}</th>' for column in self.columns)
-        rows = "\n".join(
-            f'<tr><th scope="row">{_text(row[0])}</th>{self._cells(row[1:])}</tr>' for row in self.rows
-        )
-        head = f"<thead><tr>{head}</tr></thead>\n" if head else ""
-        kind, label = ("", _text(self.caption)) if self.columns else (' class="words"', "a list")
-        if len(self.columns) >= MANY:
-            kind = ' class="many fold"'
-        elif len(self.columns) >= FOLDED:
-            kind = ' class="fold"'
-        caption = f'<p class="caption">{_text(self.caption)}</p>\n' if self.caption else ""
-        scroll = f'<div class="scroll" role="region" aria-label="{label}" tabindex="0">'
-        return f"{caption}{scroll}<table{kind}>\n{head}<tbody>\n{rows}\n</tbody></table></div>"
-
-    def _cells(self, cells: Sequence[str]) -> str:
-        """Cells of a row, each with the head of its column where there is one, for a folded row."""
-        heads = self.columns[1:] if len(self.columns) >= FOLDED else ("",) * len(cells)
-        return "".join(_cell(cell, head) for cell, head in zip(cells, heads, strict=True))
-
-    def markdown(self) -> str:
-        """The table for a Markdown file, its caption above."""
-        columns = self.columns or ("",) * len(self.rows[0])
-        lines = [_line(columns), _line(["---", *["---:"] * (len(columns) - 1)]), *map(_line, self.rows)]
-        return "\n".join([*([f"**{_plain(self.caption)}**", ""] if self.caption else []), *lines])
-
-
 class Picture(NamedTuple):
     """A picture with a caption and a text alternative."""
 
@@ -228,10 +191,10 @@ class Picture(NamedTuple):
         kinds = [name for name, applies in (("read", self.readings), ("wide", width > WIDE)) if applies]
         marks = f' class="{" ".join(kinds)}"' if kinds else ""
         read = f' data-read="{typeset(self.readings)}"' if self.readings else ""
-        svg = typeset(self.svg).replace("<svg", f'<svg role="img" aria-label="{_text(self.alt)}" {size}', 1)
+        svg = typeset(self.svg).replace("<svg", f'<svg role="img" aria-label="{typeset_html(self.alt)}" {size}', 1)
         return (
             f'<figure{marks}{read}><div class="picture">{svg}</div>'
-            f"<figcaption>{_text(self.caption)}</figcaption></figure>"
+            f"<figcaption>{typeset_html(self.caption)}</figcaption></figure>"
         )
 
 
@@ -258,8 +221,18 @@ class Words(NamedTuple):
     def html(self) -> str:
         """A paragraph or a list."""
         if len(self.sentences) == 1:
-            return f"<p>{_text(self.sentences[0])}</p>"
-        return f"<ul>{''.join(f'<li>{_text(sentence)}</li>' for sentence in self.sentences)}</ul>"
+            return f"<p>{typeset_html(self.sentences[0])}</p>"
+        return f"<ul>{''.join(f'<li>{typeset_html(sentence)}</li>' for sentence in self.sentences)}</ul>"
+
+
+def as_parts(results: Sequence[Table | str]) -> list[Part]:
+    """Tables and sentences of a result as parts of a page."""
+    parts: list[Part] = []
+    for is_text, group in groupby(results, lambda part: isinstance(part, str)):
+        entries: list[Any] = list(group)
+        sentences = [line for text in entries for line in text.splitlines() if line] if is_text else []
+        parts += entries if not is_text else [Words(sentences)] if sentences else []
+    return parts
 
 
 class Pair(NamedTuple):
@@ -330,33 +303,10 @@ def html_page(
     )
 
 
-def markdown_page(title: str, advice: str, tables: Sequence[Table]) -> str:
-    """Title, advice and tables as Markdown."""
-    return "\n\n".join([f"# {_plain(title)}", _plain(advice), *(table.markdown() for table in tables)]) + "\n"
-
-
-def _cell(text: str, head: str = "") -> str:
-    """A cell of a page; the interval of a value stands below it, and the head of its column is kept with it."""
-    match = INTERVAL.fullmatch(text)
-    value, below = (match[1], f"<small>{escape(match[2])}</small>") if match else (text, "")
-    named = f' data-head="{_text(head)}"' if head else ""
-    return f"<td{named}>{_text(value)}{below}</td>"
-
-
-def _text(text: str) -> str:
-    """Text of a page, its units typeset."""
-    return escape(typeset(text))
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(_plain(cell) for cell in cells) + " |"
-
-
-def _plain(text: str) -> str:
-    """Text that Markdown takes as it is."""
-    text = re.sub(r"([\\|*_`<$~])", r"\\\1", " ".join(text.split()))
-    text = text.replace("](", "\\](").replace("![", "!\\[").replace("&", "&amp;")
-    return f"\\{text}" if text[:1] in ("#", ">") else text
+def markdown_page(title: str, results: Sequence[Table | str]) -> str:
+    """A title, tables and sentences as Markdown."""
+    parts = [part.markdown() if isinstance(part, Table) else markdown_text(str(part)) for part in results]
+    return "\n\n".join([f"# {markdown_text(title)}", *filter(None, parts)]) + "\n"
 
 
 def of_history(trials: Sequence[FrozenTrial], objective: str) -> str:

@@ -11,20 +11,20 @@ from textwrap import fill
 import numpy as np
 from numpy import isfinite
 from optuna import Study
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import TrialState
 
 from filters.consistency.report import rounded, sentences
 from filters.registry import filter_type
 from thruster_env.core.sources import is_array
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import TUNED, baseline_size, baselines
-from tuning.evaluation.evaluate import check_consistency, restart_sentences
+from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison, versions
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.worth import all_warnings, memory_sentence, scaling_sentence, tuning_effect, without_truth
+from tuning.evaluation.worth import all_warnings, tuning_effect
 from tuning.problems.assumed import within
+from tuning.problems.find import built_in
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.plant_packages import built_in
 from tuning.problems.problem import BOUND, OPEN_LOOP, Problem, score_label
 from tuning.reporting.choice_words import choice_sentences, consistency_of, model_doubts
 from tuning.reporting.matlab import matlab_function
@@ -35,6 +35,7 @@ from tuning.reporting.page import (
     Section,
     Table,
     Words,
+    as_parts,
     of_comparison,
     of_estimates,
     of_front,
@@ -58,7 +59,7 @@ from tuning.reporting.search_figures import (
     importances,
 )
 from tuning.reporting.subject import Subject
-from tuning.reporting.tables import errors_table
+from tuning.reporting.tables import kinds_table
 from tuning.reporting.time_figures import draw_estimates, draw_gains, draw_innovations, draw_signal, gains
 from tuning.search.among_types import filter_types_tried, trials_of_type
 from tuning.search.objectives import NIS_BAND, find_objective, reported_about, reported_name
@@ -125,21 +126,21 @@ def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen
     return " ".join([*choice_sentences(chosen, plan), "; ".join(parts) + ".", *warned, *sum(doubts, [])])
 
 
-def held_out_section(book: Sketchbook, subject: Subject, comparisons: Sequence[Comparison]) -> Section:
-    """Errors before and after, scenario by scenario; without truth metrics of the innovations."""
+def held_out_section(
+    book: Sketchbook,
+    subject: Subject,
+    comparisons: Sequence[Comparison],
+    results: Sequence[Sequence[Table | str]],
+) -> Section:
+    """Errors before and after, scenario by scenario, with the tables and sentences of each held-out evaluation."""
     parts: list[Part] = []
-    for scenario, comparison in zip(subject.plan.scenarios, comparisons, strict=True):
-        restarts = [*restart_sentences(comparison.evaluations), memory_sentence(comparison.tuned, scenario)]
+    for scenario, comparison, tables in zip(subject.plan.scenarios, comparisons, results, strict=True):
+        parts += as_parts(tables)
         if not comparison.tuned.has_truth:
-            parts += [Words([without_truth(scenario.name)]), errors_table(scenario, comparison)]
-            parts.append(Words(restarts))
             continue
         where = f"{len(comparison.seeds)} held-out {scenario.seed_word} of {scenario.name}"
         bound = ", and the bound" if isfinite(comparison.bound).any() else ""
         name, title = subject.choice.name, f"{subject.choice.name} on {scenario.name}"
-        scaling = scaling_sentence(comparison)
-        remarks = [*([scaling] if scaling else []), *restarts]
-        parts += [errors_table(scenario, comparison), Words(remarks)]
         caption = f"RMSE on {where} with 95 % intervals{bound}. Each panel has its own axis."
         parts.append(book.picture(draw_comparison(comparison, title, name), caption, of_comparison(comparison)))
     return Section(f"Before and after, on held-out {subject.plan.scenarios[0].seed_word}", parts)
@@ -173,7 +174,7 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
     of_kind = trials_of_type(trials, subject.choice.name)
     parts.append(book.picture(draw_slices(of_kind, labels[0], objectives[0]), caption, of_slices(of_kind)))
     if subject.plan.filter == AUTO:
-        parts.append(_kinds_table(trials, objectives[0]))
+        parts.append(kinds_table(filter_types_tried(trials), subject.plan))
     if len(objectives) > 1:
         caption = "Trials by both objectives; no trial is better than those of the Pareto front in both."
         picture = draw_front(trials, study.best_trials, labels, objectives)
@@ -194,19 +195,6 @@ def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Wor
         f"its values there and those of all trials (PED-ANOVA): {complete} complete trials{pruned}{rough}."
     )
     return book.picture(draw_importance(shares), caption, of_importances(shares))
-
-
-def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
-    """Filter types that the trials chose, the best first."""
-    columns = ["filter", "trials", "pruned", "over budget", f"best {reported_name(objective)}", "µs/step"]
-    rows = [
-        [kind.name, f"{kind.trials}", f"{kind.pruned}", f"{kind.over_budget}"]
-        + [kind.best(objective)]
-        + ["" if kind.microseconds is None else f"{kind.microseconds:.4g}"]
-        for kind in filter_types_tried(trials)
-    ]
-    caption = "Filters that were tried; the slices are those of the best"
-    return Table(f"{caption}. *: mean NIS outside its band, chosen only if all are", columns, rows)
 
 
 def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:

@@ -1,120 +1,99 @@
-"""Tables of a report: metrics of filters on held-out seeds, and their parameters."""
+"""Tables of parameters, of what a search tried, and of what data determine."""
 
 from __future__ import annotations
 
-from math import isnan
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from filters.consistency.intervals import Interval
-from filters.consistency.report import rounded
-from tuning.evaluation.baselines import TUNED, Scaled, baseline_size, baselines
-from tuning.evaluation.evaluate import NOTHING
-from tuning.evaluation.held_out import Comparison
+from thruster_env.core.text_tables import Table
+from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import Identifiability
 from tuning.problems.problem import Problem
-from tuning.reporting.choice_words import number_rows, power_of_ten, scaled_unit
-from tuning.reporting.page import Table
+from tuning.reporting.choice_words import number_rows
+from tuning.search.among_types import TypeResult
+from tuning.search.objectives import LIKELIHOOD, PROPER, reported, reported_name
+from tuning.search.parameters import index_pairs
+from tuning.search.plan import Plan
 from tuning.search.space import Choice
 
-MOST_ACROSS = 3  # errors of states and outputs side by side; more stand one below the other
-RATIO = "score of tuned over this"
+
+def choice_table(choices: Mapping[str, Choice], scenario: Problem) -> Table:
+    """The parameters of filters of one type, a column each."""
+    kind, caption = next(iter(choices.values())).name, ""
+    model = scenario.model()
+    rows = number_rows(list(choices.values()), kind, scenario, _number)
+    if kind == "kf" and model.operating_input is not None:
+        pairs = zip(model.operating_input, model.input_quantities, strict=True)
+        about = ", ".join(f"{value:g} {quantity.unit}".rstrip() for value, quantity in pairs)
+        caption = f"kf: on the affine approximation about {about}"
+    return Table(f"Parameters of the {kind} filter", ["", *choices], rows, caption=caption)
 
 
-def errors_table(scenario: Problem, comparison: Comparison) -> Table:
-    """Metrics of a tuned filter and its baselines on held-out seeds, and the bound.
-
-    A row is a filter; of more states than fit side by side, and of derived outputs then, a row is a state and a
-    column a filter. Without truth the metrics are those of the innovations.
-    """
-    seeds = f"{scenario.seed_word} {comparison.seeds.start} to {comparison.seeds.stop - 1}"
-    where = f"{scenario.name}, held-out {seeds}, with 95 % intervals"
-    if not comparison.tuned.has_truth:
-        return _innovations_table(comparison, where)
-    count = len(comparison.bound) + len(comparison.tuned.outputs)
-    return _errors_across(comparison, where) if count <= MOST_ACROSS else _errors_below(comparison, where)
+def _number(value) -> str:
+    return "default" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _errors_across(comparison: Comparison, where: str) -> Table:
-    ratios, tuned, errors = comparison.ratios, comparison.tuned, _errors(comparison)
+def front_table(plan: Plan, front: Sequence) -> Table:
+    """The Pareto front of trials, the best in the first objective first."""
+    names = list(dict.fromkeys(name for trial in front for name in trial.params))
     rows = [
-        [name, _span(ratios.get(name, NOTHING)), _span(evaluation.score)]
-        + [*(cells[column] for _, cells, _ in errors), *map(_span, (evaluation.nees, evaluation.nis))]
-        for column, (name, evaluation) in enumerate(comparison.evaluations.items())
+        [str(trial.number + 1)]
+        + [f"{reported(*pair):.4g}" for pair in zip(plan.objectives, trial.values, strict=True)]
+        + [_number(trial.params.get(name, "")) for name in names]
+        for trial in sorted(front, key=lambda trial: trial.values)
     ]
-    right = [str(len(comparison.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
-    rows.append([_expected(comparison), "", "", *(bound for *_, bound in errors), *right])
-    columns = ["filter", RATIO, "score", *(label for label, *_ in errors), "mean NEES", "mean NIS"]
-    return Table(where, columns, rows)
-
-
-def _errors_below(comparison: Comparison, where: str) -> Table:
-    ratios, evaluations, tuned = comparison.ratios, comparison.evaluations, comparison.tuned
-    right = [str(len(comparison.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
-    rows = [
-        [RATIO, *(_span(ratios.get(name, NOTHING)) for name in evaluations), ""],
-        ["score", *(_span(e.score) for e in evaluations.values()), ""],
-        *([label, *cells, bound] for label, cells, bound in _errors(comparison)),
-        ["mean NEES", *(_span(e.nees) for e in evaluations.values()), right[0]],
-        ["mean NIS", *(_span(e.nis) for e in evaluations.values()), right[1]],
-    ]
-    return Table(where, ["", *evaluations, _expected(comparison)], rows)
-
-
-def _errors(comparison: Comparison) -> list[tuple[str, list[str], str]]:
-    """RMSE of each state and output: label, a cell per filter, and the bound, all with one power of ten."""
-    evaluations, rows = comparison.evaluations.values(), []
-    parts = [
-        (state.text_symbol, state.unit, [e.rmse[i] for e in evaluations], float(comparison.bound[i]))
-        for i, state in enumerate(comparison.tuned.states)
-    ]
-    parts += [
-        (output.name, output.unit, [e.output_rmse.get(symbol, NOTHING) for e in evaluations], float("nan"))
-        for symbol, output in comparison.tuned.outputs.items()
-    ]
-    for name, unit, values, bound in parts:
-        power = power_of_ten([value.value for value in values])
-        cells = [_span(Interval(*(part / 10.0**power for part in value))) for value in values]
-        label = scaled_unit(unit, power)
-        limit = "" if isnan(bound) else rounded(bound / 10.0**power)
-        rows.append((f"RMSE {name} [{label}]" if label else f"RMSE {name}", cells, limit))
-    return rows
-
-
-def _expected(comparison: Comparison) -> str:
-    """The label of the row beside the metrics."""
-    return "expected" if np.isnan(comparison.bound).all() else "bound; expected"
-
-
-def _innovations_table(comparison: Comparison, where: str) -> Table:
-    gains = comparison.likelihood_gains
-    rows = [
-        [name, "" if isnan(e.log_likelihood) else f"{e.log_likelihood:.2f}", _span(e.nis)]
-        + [_span(gains.get(name, NOTHING)), str(e.divergences)]
-        for name, e in comparison.evaluations.items()
-    ]
-    right = "" if isnan(comparison.tuned.nis.value) else f"{comparison.tuned.expected_nis:.3g}"
-    rows.append(["expected", "", right, "", ""])
-    columns = ["filter", "log-likelihood of a run", "mean NIS", "tuned less this", "restarts"]
-    return Table(where, columns, rows)
-
-
-def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled | None = None) -> Table:
-    """The parameters of a tuned filter and of its baselines; the scaled default is computed unless given."""
-    reference = baselines(choice.name, scenario, seed, default, baseline_size(choice))
-    choices, usual = {TUNED: choice, **reference}, next(iter(reference.values())).numbers
-    complete = [each._replace(numbers={**usual, **each.numbers}) for each in choices.values()]
-    rows = number_rows(complete, choice.name, scenario, _number, "²")
+    caption = "No other trial is better in both objectives. The first one is the tuned filter."
     return Table(
-        f"Parameters of the {choice.name} filter",
-        ["", *choices],
+        f"Pareto front on the training {plan.scenarios[0].seed_word}",
+        ["trial", *map(reported_name, plan.objectives), *names],
         rows,
+        caption=caption,
     )
 
 
-def _number(value: float | None) -> str:
-    """A parameter of a filter; empty if a choice lacks it."""
-    return "" if value is None else f"{value:.4g}"
+def kinds_table(kinds: Sequence[TypeResult], plan: Plan) -> Table:
+    """Filter types that a study tried, the best first."""
+    objective = plan.objectives[0]
+    rows = [
+        [kind.name, str(kind.trials), str(kind.pruned), str(kind.over_budget), kind.best(objective)]
+        + ["" if kind.microseconds is None else f"{kind.microseconds:.3g}"]
+        for kind in kinds
+    ]
+    columns = ["filter", "trials", "pruned", "over\nbudget", f"best\n{reported_name(objective)}", "us/step"]
+    caption = (
+        "us/step: time of the best trial, or of the fastest if none is complete. *: mean NIS outside its band."
+    )
+    best = [0] if len(rows) > 1 else []
+    title = f"Filters that were tried, on the training {plan.scenarios[0].seed_word}"
+    return Table(title, columns, rows, caption=caption, best=best)
+
+
+MOST_FACTORS = 4  # of a start, that fit into a caption
+
+
+def gradient_table(result: GradientResult, seed_word: str = "seeds") -> Table:
+    """Where each start led, and how well the data determine the optimum."""
+    likeliest = result.objective == LIKELIHOOD
+    starts = "; ".join(", ".join(f"{factor:g}" for factor in factors) for factors in result.starts)
+    caption = f"starts: factors {starts} on the untuned values" if len(result.free) <= MOST_FACTORS else ""
+    rows = []
+    for i, (parameter, error) in enumerate(zip(result.free, result.standard_errors.tolist(), strict=True)):
+        of_factor = f"± {100 * error:.0f} %" if error < 1 else f"x/: {np.exp(error):.2g}"
+        values = [f"{optimum.parameters[i]:.4g}" for optimum in result.optima]
+        name = index_pairs(parameter.name) + (f" [{parameter.unit}]" if parameter.unit else "")
+        rows.append([name, *values, of_factor if parameter.log else f"± {error:.2g}"])
+    levels = [
+        optimum.level if likeliest else reported(result.objective, optimum.level) for optimum in result.optima
+    ]
+    rows.append(
+        [reported_name(result.objective), *(f"{level:{'.2f' if likeliest else '.6g'}}" for level in levels), ""]
+    )
+    rows.append(["evaluations", *(str(optimum.evaluations) for optimum in result.optima), ""])
+    what = f"{'Maximum' if result.objective in PROPER else 'Minimum'} of {reported_name(result.objective)}"
+    what = "Maximum of the innovations' likelihood" if likeliest else what
+    titles = [f"start {i + 1}" for i in range(len(result.starts))]
+    return Table(f"{what} on the training {seed_word}", ["", *titles, "standard error"], rows, caption=caption)
 
 
 def known_table(result: Identifiability) -> Table:
@@ -132,9 +111,3 @@ def known_table(result: Identifiability) -> Table:
     return Table(
         "Parameters determined by the innovations of the training runs, with 95 % probability", header, rows
     )
-
-
-def _span(value: Interval) -> str:
-    """A value with its 95 % interval in brackets; empty if there is no value."""
-    middle, low, high = (f"{part:#.4g}".rstrip(".") for part in value)
-    return "" if isnan(value.value) else f"{middle} [{low}, {high}]"

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 from math import isfinite
 from shlex import quote
-
-from rich.console import RenderableType
+from typing import TYPE_CHECKING
 
 from filters.consistency.intervals import slightly, span
 from thruster_env.core.modules import is_code
-from tuning.api.run import Tuning
+from thruster_env.core.text_tables import Table
 from tuning.evaluation.baselines import (
     GIVEN,
     NOISE,
     ORACLE,
     RULE,
     SCALED,
-    TUNED,
     baseline_size,
     baselines,
     called,
     same_filter,
 )
-from tuning.evaluation.blow_up import blow_up_on
-from tuning.evaluation.evaluate import likelihood_gain, score_ratio
+from tuning.evaluation.evaluate import blow_up_on, likelihood_gain, score_ratio
 from tuning.evaluation.held_out import Comparison, numbers
 from tuning.evaluation.sizes import SIZE_TOLERANCE, left_out
 from tuning.evaluation.tuned import consistency, metrics
@@ -33,10 +30,9 @@ from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.logs.problem import model_named_in
 from tuning.problems.assumed import within
-from tuning.problems.plant_packages import built_in
+from tuning.problems.find import built_in
 from tuning.reporting.choice_words import apart, consistency_sentence, gains, model_doubts, residual_sentences
-from tuning.reporting.leaderboard import comparison_table
-from tuning.reporting.terminal import choice_table, front_table, gradient_table, kinds_table
+from tuning.reporting.tables import front_table, gradient_table, kinds_table
 from tuning.search.among_types import filter_types_tried
 from tuning.search.objectives import LIKELIHOOD, NIS_BAND, PROPER, reported, reported_name
 from tuning.search.parameters import index_pairs, size_ladder
@@ -46,13 +42,16 @@ from tuning.search.study import StudyResult
 from tuning.search.trials import is_over_budget
 from tuning.search.validation import as_data as as_data_of_choice
 
+if TYPE_CHECKING:
+    from tuning.api.study import Study
+
 MOST_VALUES = 8  # of a baseline, in a sentence
 
 
-def report(tuning: Tuning) -> list[RenderableType]:
+def report(tuning: Study) -> list[Table | str]:
     """The gain of a tuning, the path of its filter and the next command; then tables and sentences."""
     result, plan = tuning.result, tuning.plan
-    output: list[RenderableType] = [*tuning.chosen]
+    output: list[Table | str] = [*tuning.chosen]
     for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
         where = f"{scenario.name}: " if len(tuning.comparisons) > 1 else ""
         gained, doubts = gains(comparison, scenario.seed_word), model_doubts(scenario, comparison, plan.seed)
@@ -62,17 +61,9 @@ def report(tuning: Tuning) -> list[RenderableType]:
         output.append(_none_consistent(result, plan))
     output += [*(blown_up(tuning) or way_out(tuning)), *next_steps(tuning), ""]
     output += [remark for scenario in plan.scenarios for remark in scenario.remarks]
-    for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True):
-        choice, size = result.choice, baseline_size(result.choice)
-        known = {TUNED: choice, **baselines(choice.name, scenario, plan.seed, comparison.default, size)}
-        evaluations = comparison.evaluations
-        choices = {name: known[name] for name in evaluations}
-        span_of_seeds = f"{scenario.seed_word} {comparison.seeds.start} to {comparison.seeds.stop - 1}"
-        where = f"held-out {span_of_seeds}, scenario {scenario.name}"
-        output += [
-            choice_table(choices, scenario),
-            comparison_table(comparison.evaluations, comparison.bound, where, scenario.scale_about),
-        ]
+    for scenario, evaluation in zip(plan.scenarios, tuning.evaluations, strict=True):
+        comparison = evaluation.comparison
+        output += evaluation.numbers_and_errors()
         output += [consistency_sentence(comparison), memory_sentence(comparison.tuned, scenario)]
         output += residual_sentences(scenario, plan.seed)
     output += at_ends(result.choice, plan)
@@ -81,10 +72,10 @@ def report(tuning: Tuning) -> list[RenderableType]:
     trained = f"{result.finished} trials, {result.pruned} of them pruned, {result.seconds:.1f} s in this run"
     over = sum(map(is_over_budget, result.trials))
     trained += f"; {over} stopped at the budget" if over else ""
-    return [*output, f"Study {tuning.study!r}: {trained}."]
+    return [*output, f"Study {tuning.name!r}: {trained}."]
 
 
-def blown_up(tuning: Tuning) -> list[str]:
+def blown_up(tuning: Study) -> list[str]:
     """Advice on a model that diverges between samples, where no Q and R help; empty if it does not."""
     advice = []
     for scenario, comparison in zip(tuning.plan.scenarios, tuning.comparisons, strict=True):
@@ -93,7 +84,7 @@ def blown_up(tuning: Tuning) -> list[str]:
     return [sentence for sentence in dict.fromkeys(advice) if sentence]
 
 
-def way_out(tuning: Tuning) -> list[str]:
+def way_out(tuning: Study) -> list[str]:
     """Advice if the tuned filter is significantly worse than a baseline but the oracle; empty otherwise."""
     better = [name for comparison in tuning.comparisons if (name := _best_instead(comparison))]
     if not better:
@@ -128,7 +119,7 @@ def _best_instead(comparison: Comparison) -> str:
     return max(margins, key=lambda name: margins[name], default="")
 
 
-def _noise_words(tuning: Tuning, name: str) -> str:
+def _noise_words(tuning: Study, name: str) -> str:
     """The values of a baseline, after its name; of many where they are."""
     choice, plan = tuning.result.choice, tuning.plan
     choices = baselines(choice.name, plan.scenarios[0], plan.seed, ensemble_size=baseline_size(choice))
@@ -142,7 +133,7 @@ def _noise_words(tuning: Tuning, name: str) -> str:
     return f" ({', '.join(f'{index_pairs(key)} = {value:.4g}' for key, value in values.items())})"
 
 
-def next_steps(tuning: Tuning) -> list[str]:
+def next_steps(tuning: Study) -> list[str]:
     """The path of the tuned filter, and the next command; for an interrupted study how to continue it."""
     output = [f"Tuned filter: {tuning.file}"]
     problems = tuning.plan.scenarios
@@ -159,13 +150,13 @@ def next_steps(tuning: Tuning) -> list[str]:
     return output
 
 
-def _search_sentences(tuning: Tuning) -> list[RenderableType]:
+def _search_sentences(tuning: Study) -> list[Table | str]:
     """Results of the search: sizes, the price of consistency, optimism, a front, a maximum."""
-    result, plan, word = tuning.result, tuning.plan, tuning.scenario.seed_word
+    result, plan, word = tuning.result, tuning.plan, tuning.problem.seed_word
     if tuning.gradient is not None and tuning.rival is not None:  # which come together
         text = _gradient_sentences(tuning, tuning.gradient, tuning.rival)
         return [gradient_table(tuning.gradient, word), *text]
-    output: list[RenderableType] = []
+    output: list[Table | str] = []
     kinds = filter_types_tried(result.trials)
     if kinds:
         output.append(kinds_table(kinds, plan))
@@ -239,7 +230,7 @@ def gave_way(result: StudyResult) -> bool:
     return result.validation is not None and result.validation.gave_way
 
 
-def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Comparison) -> list[str]:
+def _gradient_sentences(tuning: Study, gradient: GradientResult, rival: Comparison) -> list[str]:
     ours, theirs = tuning.comparison.tuned, rival.tuned
     loose = [name for name, known in zip(gradient.names, gradient.identified, strict=True) if not known]
     words = []
@@ -255,7 +246,7 @@ def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Compari
         else f"Starts reach different {optima}: the best is kept."
     )
     over = (
-        f"Score of the tuned filter over Optuna's on the held-out {tuning.scenario.seed_word}: "
+        f"Score of the tuned filter over Optuna's on the held-out {tuning.problem.seed_word}: "
         f"{span(score_ratio(ours, theirs), 3)}."
     )
     if not ours.has_truth:
@@ -268,7 +259,7 @@ def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Compari
     return words
 
 
-def as_json(tuning: Tuning) -> dict:
+def as_json(tuning: Study) -> dict:
     """The result of a tuning as plain data."""
     result, plan = tuning.result, tuning.plan
     held_out = {
@@ -281,7 +272,7 @@ def as_json(tuning: Tuning) -> dict:
         for scenario, comparison in zip(plan.scenarios, tuning.comparisons, strict=True)
     }
     data = {
-        "study": tuning.study,
+        "study": tuning.name,
         "plan": plan.identity,
         "filter": result.choice._asdict(),
         "trials": result.finished,

@@ -13,8 +13,8 @@ import re
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, suppress
 from functools import wraps
 from itertools import count
 from pathlib import Path
@@ -508,12 +508,9 @@ def is_alive(process: int) -> bool:
     return True
 
 
-@contextmanager
-def quiet_optuna() -> Iterator[None]:
-    """Within this context Optuna reports only errors, since we show our own progress."""
-    before = optuna.logging.get_verbosity()
+def quiet_optuna() -> ExitStack:
+    """Let Optuna report errors only, since we show our own progress: from now on, or within the context."""
+    before, context = optuna.logging.get_verbosity(), ExitStack()
+    context.callback(optuna.logging.set_verbosity, before)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    try:
-        yield
-    finally:
-        optuna.logging.set_verbosity(before)
+    return context

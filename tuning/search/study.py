@@ -83,11 +83,6 @@ def without_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def quiet_optuna() -> None:
-    """Let Optuna report errors only, for programs that show their own progress."""
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-
-
 class StudyResult(NamedTuple):
     """The result of a study, before held-out evaluation."""
 

@@ -31,12 +31,11 @@ from tuning.problems.find import find_same
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
 from tuning.search.plan import Plan
-from tuning.search.storage import drop_waiting, open_storage, retry_orphans, this_process
+from tuning.search.storage import drop_waiting, open_storage, quiet_optuna, retry_orphans, this_process
 from tuning.search.study import (
     OnTrial,
     finished_trials,
     open_study,
-    quiet_optuna,
     run_trials,
     stop_on_interrupt,
     without_interrupts,

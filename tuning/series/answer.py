@@ -8,8 +8,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import RenderableType
-from rich.text import Text
 from scipy.stats import chi2
 
 from filters.bounds import steady_state
@@ -17,9 +15,9 @@ from filters.consistency.nees import LAGS, Whiteness, whiteness
 from filters.engine.batch import Estimates
 from filters.gaussian.kalman import KalmanFilter
 from filters.models import named_model
-from thruster_env.core.text_tables import plain_text, table
+from thruster_env.core.text_tables import Table
 from thruster_env.model.affine import AffineModel
-from tuning.api.display import frame, html
+from tuning.api.result import Result, frame
 from tuning.identification.objective import climb
 from tuning.series.column import Column
 from tuning.series.fit import Candidate, Number, behind, filtered
@@ -35,7 +33,7 @@ LARGE = 0.05  # correlation of innovations that matters
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SeriesFit:
+class SeriesFit(Result):
     """The model of a column of numbers, its Q and R, and what they mean.
 
     Attributes:
@@ -178,7 +176,7 @@ class SeriesFit:
             "sentences": self.sentences(),
         }
 
-    def tables(self) -> list[RenderableType]:
+    def tables(self) -> list[Table | str]:
         """Half a page for the terminal: the model, its numbers with intervals, and what they mean."""
         column, first = self.column, []
         count = int(column.measured.any(axis=1).sum())
@@ -200,7 +198,7 @@ class SeriesFit:
             for number in self.numbers
         ]
         about = " plus ".join(part.about for part in named_model(self.name).parts)
-        numbers = table(
+        numbers = Table(
             f"Model: {self.name}, {about}", ["", "value", "95 % from", "to", "unit", ""], rows, words=True
         )
         lines = [
@@ -215,9 +213,12 @@ class SeriesFit:
             sentences.append(f"Log-likelihood of unseen blocks less the best model's: {', '.join(rivals)}.")
         heading = f"{heading}, {missing} missing" if missing else heading
         return [
-            *(Text(line) for line in (heading, *first, "")),
+            heading,
+            *first,
+            "",
             numbers,
-            *(Text(line) for line in (*lines, *sentences)),
+            *lines,
+            *sentences,
         ]
 
     def _standings(self) -> list[tuple[str, float, float]]:
@@ -229,16 +230,9 @@ class SeriesFit:
         values = ", ".join(f"{number.name} {number.value:.4g}" for number in self.numbers)
         return f"SeriesFit({self.name}: {values})"
 
-    def __str__(self) -> str:
-        return plain_text(self.tables())
-
-    def _repr_html_(self) -> str:
-        rows = [
-            [name, f"{value:.4g}", f"{low:.3g}", f"{high:.3g}", unit]
-            for name, _, value, low, high, unit, _ in self.numbers
-        ]
-        columns = ["", "value", "95 % from", "to", "unit"]
-        return html(f"Model: {self.name}", columns, rows, " ".join(self.sentences()))
+    def figures(self) -> dict[str, Figure]:
+        """The data with the estimate, and the innovations."""
+        return {"The data with the estimate and its 95 % band, and the innovations": self.plot()}
 
     def plot(self) -> Figure:
         """The data with the estimate and its 95 % band, and the normalised innovations."""

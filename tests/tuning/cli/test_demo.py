@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -10,9 +11,9 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
 from thruster_env.core.text_tables import console
+from tuning.api.report import Report
 from tuning.cli import demo
 from tuning.cli.main import main
-from tuning.reporting.report import Report
 from tuning.search.space import AUTO_FILTER_TYPES
 
 
@@ -57,13 +58,13 @@ def test_demo_tells_its_result_in_36_lines_and_draws_what_it_tuned(run_demo, tmp
 
 
 def test_a_demo_whose_search_was_interrupted_says_so_and_exits_with_130(run_demo, monkeypatch):
-    tune, page = demo.tune, Path("out/page.html")
+    tune, page = demo.run_tuning, Path("out/page.html")
 
     def interrupted(*arguments, **options):
         tuning = tune(*arguments, **options)
-        return tuning._replace(result=tuning.result._replace(interrupted=True))
+        return replace(tuning, result=tuning.result._replace(interrupted=True))
 
-    monkeypatch.setattr(demo, "tune", interrupted)
+    monkeypatch.setattr(demo, "run_tuning", interrupted)
     monkeypatch.setattr(demo, "draw", lambda *_: {})
     monkeypatch.setattr(demo, "write_report", lambda *_: Report(page, page, "Tuning lowers the score."))
     code, lines = run_demo()
@@ -71,7 +72,7 @@ def test_a_demo_whose_search_was_interrupted_says_so_and_exits_with_130(run_demo
 
 
 def test_a_demo_that_is_interrupted_later_exits_with_130(run_demo, monkeypatch):
-    monkeypatch.setattr(demo, "tune", failing(KeyboardInterrupt))
+    monkeypatch.setattr(demo, "run_tuning", failing(KeyboardInterrupt))
     assert run_demo() == (130, [])
 
 

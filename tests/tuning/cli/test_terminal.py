@@ -18,9 +18,9 @@ from filters.registry import FILTERS
 from tests.linear_problem import LinearProblem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.checks import any_case, listening, meant, one_of
-from thruster_env.core.text_tables import plain_text, table
+from thruster_env.core.text_tables import Table, plain_text
 from tuning.api.progress import trial_bar
-from tuning.api.run import file_name
+from tuning.api.tune import file_name
 from tuning.cli import output
 from tuning.cli.app import COMMANDS, PANELS, listed
 from tuning.cli.reproduce import fitted
@@ -133,8 +133,8 @@ def drawn(made, width, terminal=False, **environment):
 @pytest.mark.parametrize("framed", [False, True])
 def test_a_table_has_the_same_columns_at_any_width(monkeypatch, width, framed):
     monkeypatch.setattr(output.console, "width", width)
-    made = table("a title that is longer than the table", HEADS, ROWS, caption="of nothing")
-    said = drawn(fitted(made, ROWS) if framed else made, width)
+    made = Table("a title that is longer than the table", HEADS, ROWS, caption="of nothing")
+    said = drawn(fitted(made) if framed else made, width)
     assert max(map(len, said.splitlines())) <= width and "…" not in said
     lines = said.splitlines()
     below = lines[next(i for i, line in enumerate(lines) if "──" in line) + 1]
@@ -144,7 +144,7 @@ def test_a_table_has_the_same_columns_at_any_width(monkeypatch, width, framed):
 
 
 def test_a_winner_stands_out_on_terminals_only():
-    made = table("", HEADS, ROWS, best=[1])
+    made = Table("", HEADS, ROWS, best=[1])
     assert drawn(made, 80, terminal=True).count("\x1b[1;32m") > 3
     assert "\x1b" not in drawn(made, 80)
     assert "\x1b[1;32m" not in drawn(made, 80, terminal=True, NO_COLOR="1")
@@ -161,7 +161,7 @@ def test_a_word_stands_there_while_a_command_is_imported(monkeypatch, capsys):
     from tuning.cli.app import LOADING, imported
 
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    assert imported("tuning.cli.verify").__name__ == "tuning.cli.verify"
+    assert imported("tuning.cli.methods").__name__ == "tuning.cli.methods"
     assert capsys.readouterr().err.startswith(LOADING)
 
 
@@ -252,7 +252,7 @@ def test_a_table_whose_words_fit_is_never_wider_than_the_terminal(monkeypatch):
     words = "a covariance of innovations " * 3
     rows = [["expectation-maximisation", words, words, "true states, a gradient"]]
     monkeypatch.setattr("thruster_env.core.text_tables.console", Console(width=80))
-    lines = plain_text([table("", ["method", "what it does", "use it", "needs"], rows)], 80).splitlines()
+    lines = plain_text([Table("", ["method", "what it does", "use it", "needs"], rows)], 80).splitlines()
     assert max(map(len, lines)) <= 80 and all(
         word in " ".join(lines).split() for word in "gradient states,".split()
     )

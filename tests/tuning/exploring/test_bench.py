@@ -15,7 +15,8 @@ from tuning.evaluation.tuned import read_tuned
 from tuning.exploring.bench import Bench
 from tuning.problems.find import find_problem
 from tuning.search.plan import Plan
-from tuning.search.study import open_study, quiet_optuna, run_study
+from tuning.search.storage import quiet_optuna
+from tuning.search.study import open_study, run_study
 
 OWN = {"Q11": 1.0, "Q22": 4e-4, "R": 0.25}
 

@@ -5,16 +5,15 @@ import re
 import stat
 import urllib.error
 import urllib.request
+import webbrowser
 
 import pytest
 
 pytest.importorskip("bokeh")
 
 import tuning
-import tuning.cli.explore as command
 from tests.linear_problem import LinearProblem
-from tuning.cli.explore import _bench, _forward
-from tuning.cli.options import BlockOptions, GridOptions
+from tuning.api.explore import _forward
 from tuning.exploring.page.session import Server
 
 
@@ -47,19 +46,13 @@ def test_own_numbers_are_where_one_starts(as_python):
     [
         (dict(problem="outliers", filter="open-loop"), "filter must be one that has a number to change"),
         (dict(problem="outliers", seeds=0), "seeds must be"),
+        (dict(tuned="tuned.json", filter="ekf"), "give either a tuned file or a filter"),
     ],
     ids=str,
 )
 def test_what_cannot_be_explored_is_refused(arguments, says):
     with pytest.raises(ValueError, match=says):
         tuning.explore(**arguments)
-
-
-def test_a_tuned_file_comes_without_a_filter_or_a_log(tmp_path):
-    with pytest.raises(ValueError, match="give either a tuned file or --filter NAME"):
-        _bench(tmp_path / "tuned.json", "ekf", None, BlockOptions(), GridOptions(), 0)
-    with pytest.raises(ValueError, match="give either a tuned file or --log"):
-        _bench(tmp_path / "tuned.json", None, None, BlockOptions(log=[tmp_path / "run.csv"]), GridOptions(), 0)
 
 
 def test_the_browser_is_led_to_the_page_by_a_file_that_others_cannot_read(tmp_path):
@@ -71,9 +64,8 @@ def test_the_browser_is_led_to_the_page_by_a_file_that_others_cannot_read(tmp_pa
 @pytest.mark.slow
 def test_the_command_prints_the_address_and_opens_no_token_on_a_command_line(monkeypatch, capsys, as_python):
     opened, served = [], []
-    monkeypatch.setattr(command.webbrowser, "open", opened.append)
+    monkeypatch.setattr(webbrowser, "open", opened.append)
     monkeypatch.setattr(Server, "run", lambda self: served.append(self.url))
-    monkeypatch.setattr(command, "problems_of", lambda *_: (LinearProblem(n=2, m=1),))
-    command.command(None, "kf", seeds=2)
+    tuning.explore(LinearProblem(n=2, m=1), "kf", seeds=2).serve()
     (url,) = served
     assert url in capsys.readouterr().out and opened[0].startswith("file://") and url not in opened[0]

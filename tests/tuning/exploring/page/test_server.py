@@ -17,7 +17,7 @@ from bokeh.util.token import generate_jwt_token
 from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
-from tuning.cli import explore
+from tuning.api import explore
 from tuning.exploring.page import session
 from tuning.exploring.page.session import LOOPBACK, Server
 

@@ -1,13 +1,17 @@
-"""A study from its plan to its held-out evaluation, for `tuning.tune` and `thruster tune`."""
+"""`tuning.tune` and `thruster tune`: a study from its plan to its held-out evaluation.
+
+In order: the function; methods that run alone, stored as studies; a study from its plan to its evaluation; names.
+"""
 
 from __future__ import annotations
 
 import re
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import optuna
@@ -18,26 +22,41 @@ from filters.estimators.find import label_of
 from filters.registry import filter_type
 from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.files import check_target
-from tuning.api.progress import trial_bar, working
+from tuning.api.markers import (
+    FILTER,
+    INPUT,
+    OUTPUT,
+    READ,
+    SEARCH,
+    WRITTEN,
+    FilterOption,
+    Group,
+    Option,
+    ProblemOption,
+    Progress,
+    Seed,
+)
+from tuning.api.problems import problems_of
+from tuning.api.progress import console_for, trial_bar, working
+from tuning.api.read_logs import RecordedRuns
+from tuning.api.study import STUDIES, MethodAnswer, Study
 from tuning.evaluation.baselines import noise_estimated, same_filter
-from tuning.evaluation.held_out import Comparison, evaluate_held_out
-from tuning.evaluation.tuned import write_tuned
-from tuning.evaluation.worth import all_warnings
+from tuning.evaluation.held_out import evaluate_held_out
+from tuning.evaluation.tuned import check_keepable
 from tuning.likelihood.family import check_gradient
-from tuning.likelihood.gradient import OF_STATES, GradientResult, tune_by_gradient
-from tuning.likelihood.identifiability import Identifiability, identify
+from tuning.likelihood.gradient import OF_STATES, tune_by_gradient
+from tuning.likelihood.identifiability import identify
 from tuning.methods.registry import DEFAULT, GRADIENT_METHOD, METHODS, ONLY, find_method
 from tuning.methods.task import Budget, Refused, Task
 from tuning.problems.assumed import AssumedProblem, within
 from tuning.problems.data import Data
-from tuning.problems.plant_packages import built_in
+from tuning.problems.find import built_in
 from tuning.problems.problem import Problem
-from tuning.reporting.choice_words import choice_sentences
 from tuning.search.compiling import compile_filters
 from tuning.search.measures import measured
-from tuning.search.objectives import LIKELIHOOD, SCORE, reported, reported_name
+from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.parameters import R
-from tuning.search.plan import HELD_OUT_SEEDS, Plan, range_warning
+from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.space import (
     AUTO,
     Choice,
@@ -47,7 +66,7 @@ from tuning.search.space import (
     untuned_choice,
     within_ranges,
 )
-from tuning.search.storage import open_storage, quiet_optuna
+from tuning.search.storage import open_storage, quiet_optuna, storage_text
 from tuning.search.study import (
     FINISHED,
     OnTrial,
@@ -61,24 +80,176 @@ from tuning.search.study import (
     stop_on_interrupt,
 )
 from tuning.search.trials import run_trial
-from tuning.search.validation import as_data
 from tuning.search.workers import run_in_workers
+from tuning.series.column import column_alone
+
+
+@dataclass(frozen=True)
+class SearchSpace:
+    """Which parameters a study searches, and what they must obey.
+
+    Attributes:
+        hold_r: keep R from the sensor's data sheet, tune only Q.
+        full_q: tune the correlations of Q, too.
+        full_r: tune the correlations of R, too.
+        where: a relation that parameters must obey: 'Q22 = 4 Q11', 'Q33 = Q11', 'R = 0.01' (not tuned),
+            'Q11 = 1e-6..1e-2' (its range); may be repeated.
+        forget: longest time constant of the filter's gain that is allowed; a smaller Q is raised to it.
+    """
+
+    hold_r: Annotated[bool, Option(SEARCH)] = False
+    full_q: Annotated[bool, Option(SEARCH)] = False
+    full_r: Annotated[bool, Option(SEARCH)] = False
+    where: Annotated[Sequence[str], Option(SEARCH, metavar="RELATION")] = ()
+    forget: Annotated[float | None, Option(SEARCH, metavar="SECONDS")] = None
+
+
+def tune(
+    problem: Annotated[
+        Any,
+        ProblemOption(
+            INPUT,
+            ("--problem", "--scenario"),
+            type=list[str],
+            default=["mismatch"],
+            choices="problems",
+            file=READ,
+            last="augment",
+        ),
+    ],
+    filter: Annotated[str, replace(FilterOption, default="enkf")] = "ekf",
+    *,
+    space: Annotated[SearchSpace, Group(SearchSpace)] = SearchSpace(),  # noqa: B008 - it is frozen
+    budget: Annotated[float | None, Option(FILTER, metavar="MICROSECONDS")] = None,
+    trials: Annotated[int, Option(SEARCH)] = 50,
+    objective: Annotated[str | Sequence[str] | None, Option(SEARCH, type=list[str], choices="objectives")] = None,
+    worst: Annotated[bool, Option(SEARCH)] = False,
+    consistent: Annotated[bool, Option(SEARCH, ("--consistency/--no-consistency",))] = True,
+    prune: Annotated[bool, Option(SEARCH, ("--pruning/--no-pruning",))] = True,
+    method: Annotated[str, Option(SEARCH, choices=METHODS)] = DEFAULT,
+    workers: int = 1,
+    storage: Annotated[str | Path | None, Option(OUTPUT, default=STUDIES)] = None,
+    name: Annotated[str | None, Option(OUTPUT, ("--study",))] = None,
+    out: Annotated[str | Path | bool | None, Option(OUTPUT, type=Path, file=WRITTEN, unset=True)] = None,
+    seed: Seed = 0,
+    progress: Progress = None,
+) -> Study:
+    """Find the Q, R and ensemble size that give a filter's best estimate, and evaluate it on held-out seeds.
+
+    The score is the mean over states of RMSE over its scale, on 32 training seeds that every trial shares. The
+    first trial is the rule of thumb: R from the sensor's data sheet, Q from 1 % of each state's range. Ctrl-C
+    keeps all finished trials, and the same command continues the study. The report compares the filter with its
+    baselines, first with your model's own Q and R, on 200 seeds that no trial saw.
+
+        study = tuning.tune("mismatch", filter="enkf", trials=50)
+        study.save("tuned.json")
+        study.plot_errors()
+
+        study = tuning.tune((model, ["run1.csv", "run2.csv"]), trials=100)
+
+    Q's variances and R are searched from 1e-10 to 1e4 times the rule of thumb, on logarithmic scales, beginning
+    from 1e-5 to 1e2 (R: 1e-2 to 1e3) and ten times beyond the best trial; given values lie inside, and the report
+    flags a parameter at an end of its range. Besides sampled trials the study tries the baselines (given, rule of
+    thumb, scaled default, noise estimation) and the maximum-likelihood values. At the end the best trials are
+    compared with the baselines on 100 validation seeds. If none is significantly better, the best baseline is
+    chosen, and the report names the runs in which what was given fails.
+
+    RMSE alone barely determines Q and R: only their ratio affects the estimate. The study therefore keeps the mean
+    NIS in a band, unless that is switched off, as long as it costs at most 5 % of the score. With true states
+    it chooses the trial with the best log score among those within 5 % of the least error. If no trial is in the
+    band, the report and the file say so, and the command's exit code is 3.
+
+    --method also selects another sampler, gradients, or a published method, which runs alone: samplers end after
+    --trials trials, the others by their own criterion. With a right model and true states use noise-estimation.
+    With true states use log-score if the covariance matters, mse if only the estimate does. Without true states
+    use likelihood, or als for a linear model on long runs, which accepts --full-q and --full-r. For an ensemble
+    use the default, or desroziers without true states. With true states and a wrong model, or a dead band, add
+    --full-q (and --full-r) to mse or log-score. `thruster methods` lists all methods.
+
+    With --log the study uses recorded runs, cut into blocks of which every third is held out. It minimises the
+    negative log-likelihood of the innovations, unless the logs contain the true states.
+
+    Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100
+
+    Example: thruster tune --filter ekf --log run1.csv --log run2.csv --trials 100
+
+    Example: thruster tune --filter ekf --method log-score --scenario mismatch
+
+    Example: thruster tune --filter auto --budget 2 --scenario published_noise --trials 100
+
+    Example: thruster tune --filter ekf --augment voltage_gain --scenario mismatch
+
+    Args:
+        problem: name of a problem; several for their mean, or the worst with `worst`; mismatch by default. In
+            Python also a `Problem`, `tuning.find_problem(...)`, `tuning.read_logs(...)`, a pair (model, data) of a
+            model, or a thruster's preset, and recorded runs, or a list.
+        filter: name of a filter, as `thruster filters` lists them, or auto: the best of all within `budget`. In
+            Python also "module:object" for an estimator of your own, which can be used, but not saved.
+        space: what is searched.
+        budget: time limit of a step of the filter on one core; of auto by default 2.5 n^2 for n states.
+        trials: total number of finished trials of the study.
+        objective: what to minimise, two for a Pareto front; by default the score, or without true states the
+            negative log-likelihood.
+        worst: minimise the worst of several problems instead of their mean.
+        consistent: whether to keep the mean NIS between 0.8 and 1.25 of its expected value.
+        prune: whether to end trials that are significantly worse than the best on the same seeds.
+        method: a study by a sampler (tpe, gp, cma-es, nsga-ii, random, grid), gradient for Kalman filters, or a
+            published method; `thruster methods` lists them and when to use which.
+        workers: processes on this host that share the study; several need a storage.
+        storage: journal file for one host; for several, a database (docs/workers.md). In Python by default none:
+            the study ends with the process.
+        name: name of the study; by default from the options above.
+        out: tuned file; out/STUDY.json by default. In Python none by default, and True for that one.
+        seed: seed of all randomness; the same seed gives the same results.
+        progress: whether to show progress; by default only in terminals and notebooks.
+
+    Returns:
+        `Study`: `filter`, `choice`, `held_out`, `save(path)`, `to_frame()`, `plot_history()`, `plot_errors()`.
+
+    Raises:
+        ValueError: states the rule and the value.
+        KeyboardInterrupt: after Ctrl-C before any trial is complete, or during the held-out evaluation.
+    """
+    if isinstance(problem, RecordedRuns) and (column := column_alone(problem.files, problem.reading)) is not None:
+        rule = "a log to tune a filter on must have the columns of a model, a thruster's by default"
+        way_out = f"`thruster fit {column}` (tuning.fit) finds a model, Q and R"
+        raise ValueError(f"{rule}, but {column} has one column of numbers: {way_out}")
+    if not isinstance(filter, str):
+        raise ValueError(
+            f"filter must be a name or 'module:object', by which trials keep it, but got {short_repr(filter)}"
+        )
+    if out is not None:
+        check_keepable(filter)
+    sampler, problems = sampler_of(method), problems_of(problem)
+    asked = [objective] if isinstance(objective, str) else None if objective is None else list(objective)
+    plan = Plan(
+        filter,
+        problems,
+        seed,
+        tuple(asked or ["score" if problems[0].scale is not None else "likelihood"]),
+        consistent=consistent,
+        sampler=sampler,
+        hold_r=space.hold_r,
+        prune=prune,
+        budget=budget,
+        full_q=space.full_q,
+        full_r=space.full_r,
+        where=(space.where,) if isinstance(space.where, str) else tuple(space.where),
+        worst=worst,
+        forget=space.forget,
+    )
+    plan, aim = with_budget(plan), aim_of(asked)
+    study = name or name_of(plan, method, aim)
+    file = None if out in (None, False) else Path("out") / f"{study}.json" if out is True else Path(str(out))
+    journal, console = None if storage is None else storage_text(storage), console_for(progress)
+    return run_tuning(plan, trials, console, journal, study, file, method=method, aim=aim, workers=workers)
+
 
 # A method that runs alone, stored as a study: the values on its path are the trials, and its answer is the choice.
 
 
 ANSWER = "answer of the method"  # attribute of a study
 OLD_ANSWER, OLD_NAME = "answer of the way", "-way-"  # the same, and a part of its name, in journals until 2026
-
-
-class MethodAnswer(NamedTuple):
-    """The answer of a method that ran alone, and its cost."""
-
-    name: str
-    choice: Choice
-    runs: float  # passes of the filter over one run each
-    seconds: float  # of processor time, without compilation
-    refused: Refused | None = None  # where the choice is what the method was given
 
 
 def check_method(plan: Plan, name: str, workers: int) -> None:
@@ -196,20 +367,6 @@ def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) ->
     )
 
 
-def method_sentence(answer: MethodAnswer, word: str, objective: str) -> str:
-    """How the parameters were found, and the cost."""
-    method = METHODS[answer.name]
-    took = f"It took {answer.seconds:.2g} s, as long as {answer.runs:.0f} runs of the filter over one of the"
-    worse = ""
-    if answer.refused is not None:
-        given_value, value = (reported(objective, value) for value in answer.refused)
-        worse = (
-            f" On these its answer has a {reported_name(objective)} of {value:.4g} and the given filter "
-            f"{given_value:.4g}, so that one is returned."
-        )
-    return f"Method {answer.name}: {method.about} ({method.source}). {took} training {word}.{worse}"
-
-
 def _some(choices: Sequence[Choice], count: int) -> list[Choice]:
     """At most so many of some choices, the last one among them, without two that are the same."""
     if len(choices) <= count or count < 1:
@@ -234,55 +391,6 @@ OPTIMUM = "optimum of the {}"  # the gradient's answer among those that meet, by
 COST = "cost"  # the objective that needs no budget
 
 
-class Tuning(NamedTuple):
-    """All results of a tuning."""
-
-    study: str
-    plan: Plan
-    result: StudyResult
-    comparisons: tuple[Comparison, ...]  # one for each scenario
-    file: Path | None  # the tuned file, where one was written
-    gradient: GradientResult | None = None  # where the choice is the optimum that gradients lead to ...
-    rival: Comparison | None = None  # ... and what the study in its stead would have chosen
-    known: Identifiability | None = None  # what the innovations determine; None without a covariance
-    answer: MethodAnswer | None = None  # where the choice is that of a method that ran alone
-
-    @property
-    def scenario(self) -> Problem:
-        """The first scenario."""
-        return self.plan.scenarios[0]
-
-    @property
-    def comparison(self) -> Comparison:
-        """The held-out evaluation on the first scenario."""
-        return self.comparisons[0]
-
-    @property
-    def chosen(self) -> tuple[str, ...]:
-        """Which trial was chosen and what it replaced, in sentences, and what to beware of in the result."""
-        warned = self.warnings
-        if self.answer is not None:
-            return (method_sentence(self.answer, self.scenario.seed_word, self.plan.objectives[0]), *warned)
-        return (*choice_sentences(as_data(self.result.validation), self.plan), *warned)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What to beware of in the tuned filter: a covariance that is far off, and where the search ended."""
-        messages = all_warnings(self.comparisons, self.plan.scenarios, self.plan.forget)
-        return (*messages, *range_warning(self.result.choice, self.plan))
-
-    @property
-    def method(self) -> str:
-        """Name of the method, one of METHODS."""
-        if self.answer is not None:
-            return self.answer.name
-        return self.plan.sampler if self.gradient is None else GRADIENT_METHOD
-
-    def write(self, file: str | Path) -> None:
-        """Write the tuned file."""
-        write_tuned(file, self.plan, self.result, self.comparisons, self.study, self.method)
-
-
 def run_tuning(
     plan: Plan,
     trials: int,
@@ -294,7 +402,7 @@ def run_tuning(
     method: str | None = None,
     aim: str = LIKELIHOOD,
     workers: int = 1,
-) -> Tuning:
+) -> Study:
     """Run or resume a study with a progress bar, evaluate its choice and, if requested, write the tuned file.
 
     Args:
@@ -375,13 +483,13 @@ def run_tuning(
                 f"study {name!r} keeps its trials: the same command continues with the held-out evaluation"
             )
         raise
-    tuning = Tuning(name, plan, result, comparisons, out, gradient, rival, answer=answer)
+    tuned = Study(name, plan, result, comparisons, out, gradient, rival, answer=answer)
     if out is not None:
-        tuning.write(out)
+        tuned.write(out)
     if gradient is not None:
-        return tuning
+        return tuned
     known = identify(result.choice, plan.scenarios, plan.training_data(), plan.space(), plan.where)
-    return tuning._replace(known=known)
+    return replace(tuned, known=known)
 
 
 def with_budget(plan: Plan) -> Plan:
