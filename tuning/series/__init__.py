@@ -1,7 +1,8 @@
 """Q and R of one column of numbers, in one line: `tuning.fit`.
 
-column   the numbers and their times, read as logs are
-fit      named models by maximum likelihood, with intervals, and the choice among them
-answer   what is found, on half a page, with a picture
-paste    the filter as lines of other packages and of a controller
+column      the numbers and their times, read as logs are
+likelihood  of the numbers under a named model, with its gradient
+fit         named models by maximum likelihood, with intervals, and the choice among them
+answer      what is found, on half a page, with a picture
+paste       the filter as lines of other packages and of a controller
 """
