@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import tuning
+from filters import affine_model
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
 from thruster_env.logs.write import write_log
@@ -179,3 +180,13 @@ def test_the_model_of_a_tuned_file_s_logs_may_be_given_as_an_object(tmp_path, mo
     assert by_object.evaluation.log_likelihood == study.held_out.evaluation.log_likelihood
     with pytest.raises(ValueError, match="must be the one it was tuned on"):
         tuning.evaluate(file, model=lambda dt: model(dt, 0.5))
+
+
+def test_the_input_of_a_row_acts_from_it_on_or_until_it():
+    table = {"t": [0.0, 0.1, 0.2, 0.3], "u_1": [1.0, 2.0, 3.0, 4.0], "z_1": [0.0, 1.0, 2.0, 3.0]}
+    model = affine_model(F=[[0.9]], B=[[1.0]], H=[[1.0]], Q=[1.0], R=[1.0], x0=[0.0], P0=[1.0])
+    for act, inputs in ((None, [1.0, 2.0, 3.0]), ("from", [1.0, 2.0, 3.0]), ("until", [2.0, 3.0, 4.0])):
+        log, _ = tuning.read_logs(table, model=model, inputs_act=act).read()
+        assert log.inputs.ravel().tolist() == inputs
+    with pytest.raises(ValueError, match="inputs_act must be one of from, until, but got 'since'"):
+        tuning.read_logs(table, model=model, inputs_act="since").read()

@@ -41,6 +41,7 @@ from thruster_env.logs.table import Table, read_table, table_of
 from thruster_env.model.state_space import StateSpaceModel
 
 SECOND = "s"
+INPUTS_ACT = ("from", "until")  # when the input of a row acts: from it on, or until it
 MOST_STEPS = 10_000_000
 MOST_DOUBLED = 0.1  # of the rows, with the time of the row before; of more the times are wrong
 
@@ -126,7 +127,7 @@ def read_log(
         Description(columns or {}, {}, clock_offset or {}, dt, stamps, inputs_act)
     )
     act = description.inputs_act or ("until" if model.feeds else "from")
-    until = one_of("inputs_act", act, ("from", "until")) == "until"
+    until = one_of("inputs_act", act, INPUTS_ACT) == "until"
     wanted = quantities_of(model)
     form = format_of(path) if is_file else None
     if form is not None:

@@ -11,6 +11,7 @@ from filters.starts import STARTS
 from thruster_env.core.checks import one_of, short_repr
 from thruster_env.logs.findings import OUTLIERS
 from thruster_env.logs.log import Log
+from thruster_env.logs.read import INPUTS_ACT
 from thruster_env.logs.recorders.bags import STAMPS
 from tuning.api.markers import LOGS, READ, Augment, ModelOption, Option, PresetOption
 from tuning.logs.read import model_of_logs, name_of, read_named
@@ -93,6 +94,7 @@ def read_logs(
     ] = None,
     dt: Annotated[float | None, Option(LOGS)] = None,
     grid: Annotated[bool, Option(LOGS, ("--grid/--no-grid",))] = True,
+    inputs_act: Annotated[str | None, Option(LOGS, choices=INPUTS_ACT)] = None,
     stamps: Annotated[str | None, Option(LOGS, choices=STAMPS)] = None,
     held_out: Annotated[Any, Option(LOGS, type=list[Path], file=READ)] = None,
     hold_gaps: Annotated[bool, Option(LOGS)] = False,
@@ -121,6 +123,8 @@ def read_logs(
         dt: sample time [s] of a log without times, or of the grid for irregular ones; variances are per step.
         grid: whether to put irregular logs on a grid, or to use their own time stamps, for a model in continuous
             time.
+        inputs_act: when the input of a row acts: "from" it on, as a command that is sent then, or "until" it, as a
+            current that is sampled with a voltage; "until" by default for models h(x, u, c), "from" for others.
         stamps: clock of all topics of a bag: header (stamps of their headers) or receipt (when messages were
             received); by default that of the headers if all have one clock.
         held_out: held-out run, never used by a search; by default every third one.
@@ -145,7 +149,8 @@ def read_logs(
         if value is not None:
             one_of(name, value, choices)
     reading = {"preset": preset, "model": model, "sensors": sensors, "columns": columns}
-    reading |= {"clock_offset": clock_offset, "dt": dt, "grid": None if grid else False, "stamps": stamps}
+    reading |= {"clock_offset": clock_offset, "dt": dt, "grid": None if grid else False}
+    reading |= {"inputs_act": inputs_act, "stamps": stamps}
     splits = {"held_out": held_out, "hold_gaps": hold_gaps or None, "outliers": outliers}
     cuts = {"blocks": blocks, "lead": lead, "start": start}
     reading, splits, cuts = ({k: part[k] for k in part if part[k] is not None} for part in (reading, splits, cuts))

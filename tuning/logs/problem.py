@@ -29,9 +29,8 @@ from tuning.problems.log_parts import check_apart, check_times
 from tuning.problems.log_problem import MISSING, LogProblem, without_outliers
 from tuning.problems.problem import Parameter, Problem
 
-OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid", "stamps")  # of `read_named`
-
-
+# Of `read_named`.
+OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid", "inputs_act", "stamps")
 CUTS = ("held_out", "blocks", "lead", "hold_gaps", "start", "outliers")
 EVERY_THIRD = 3
 SHORTEST_PIECE = 10  # rows of a run between gaps: fewer tell little beside how they begin

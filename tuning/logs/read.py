@@ -38,6 +38,7 @@ def read_named(
     dt: float | None = None,
     name: str | None = None,
     grid: bool = True,
+    inputs_act: str | None = None,
     stamps: str | None = None,
 ) -> tuple[Log, Any]:
     """A log, and the source of its model at its sample time.
@@ -53,6 +54,7 @@ def read_named(
         dt: sample time [s].
         name: name of a log that is not a file.
         grid: whether samples are put on a grid; else the log is on its own stamps.
+        inputs_act: whether the input of a row acts "from" it on or "until" it (`thruster_env.logs.read.read_log`).
         stamps: "header" or "receipt" of a bag.
 
     Raises:
@@ -68,6 +70,7 @@ def read_named(
         "clock_offset": {key: _seconds(key, value) for key, value in offsets.items()},
         "dt": dt,
         "grid": None if grid else False,
+        "inputs_act": inputs_act,
         "stamps": stamps,
     }
     if isinstance(path, Log):
