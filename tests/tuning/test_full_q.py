@@ -95,7 +95,7 @@ def test_a_study_of_a_full_q_ends_in_a_file_that_everything_reads(tmp_path):
     env = EstimateState(gym.make("BowThruster-v0"), tuned=str(path))
     np.testing.assert_array_equal(env.filter.model.process_noise_cov, q)
     shown = choice_table({"untuned": untuned_choice("ekf", MISMATCH), "tuned": result.choice}, MISMATCH)
-    assert "correlation 12" in [str(cell) for cell in shown.columns[0].cells]
+    assert "correlation 12" in [row[0] for row in shown.rows]
 
     content = read_tuned_file(path)
     content["filter"]["model"]["process_noise_cov"][0][1] *= -1

@@ -144,7 +144,7 @@ def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
     assert report.page.as_posix() == "out/front.html"
     page = Page(report.page.read_text())
     words = " ".join(page.words)
-    assert "Pareto front" in words and "mismatch, held-out seeds" in words and "outliers, held-out seeds" in words
+    assert "Pareto front" in words and "scenario mismatch" in words and "scenario outliers" in words
     assert " on mismatch and " in report.advice and len(page.pictures()) == 2 + 4 + 5
 
 

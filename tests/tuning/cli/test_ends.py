@@ -85,7 +85,7 @@ def process(before, name, arguments="filters", **options):
     ("module", "arguments"),
     slow_but(
         [
-            *((name, "simulate --steps 3 --out run.csv") for name in ("typer", "numpy.linalg", "numba")),
+            *((name, "simulate --steps 3 --out run.csv") for name in ("typer", "numpy.linalg", "llvmlite")),
             ("optuna.samplers", "tune --trials 1"),
         ],
         [("optuna.samplers", "tune --trials 1")],
