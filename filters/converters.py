@@ -44,7 +44,8 @@ def from_filterpy(kf: Any, *, update_first: bool = False, first_input: ArrayLike
             rule = f"a filter of FilterPy must have {name} = {neutral:g}"
             raise ValueError(f"{rule}, but got {short_repr(getattr(kf, name))}")
     b = getattr(kf, "B", None)
-    b = np.zeros((len(f), 0)) if b is None or np.ndim(b) < 2 else as_floats(b)
+    b = np.zeros((len(f), 0)) if b is None or not np.ndim(b) and not b else as_floats(b)
+    b = b[:, None] if b.ndim == 1 else np.atleast_2d(b)  # FilterPy takes one column as it is
     mean, cov = np.ravel(x), p
     if not update_first:
         u = np.zeros(b.shape[1]) if first_input is None else vector("first_input", first_input, b.shape[1])
@@ -94,7 +95,7 @@ def from_pykalman(kf: Any) -> KalmanFilter:
     Raises:
         ValueError: for another class or matrices of each step.
     """
-    if not hasattr(kf, "_initialize_parameters"):
+    if not hasattr(kf, "_initialize_parameters") or not hasattr(kf, "transition_matrices"):
         raise ValueError(f"kf must be a pykalman.KalmanFilter, but got {short_repr(kf)}")
     names = (
         *("transition_matrices", "transition_offsets", "transition_covariance"),
@@ -181,7 +182,10 @@ def from_control(
             f"D must be zero, but got {d.tolist()}: affine_model(d=) takes the D of the input until then"
         )
     n, own_dt = len(a), getattr(system, "dt", None)
-    g = np.eye(n) if noise_input is None else as_floats(noise_input).reshape(n, -1)
+    g = np.eye(n) if noise_input is None else as_floats(noise_input)
+    g = g[:, None] if g.ndim == 1 else g
+    if g.ndim != 2 or len(g) != n:
+        raise ValueError(f"noise_input must have shape (n, w) with n = {n}, but got {g.shape}")
     q = g @ covariance("process_noise_cov", process_noise_cov, g.shape[1]) @ g.T
     if own_dt is None or own_dt is False or own_dt == 0:
         if dt is None:
@@ -196,7 +200,11 @@ def from_control(
     if prior_cov is None:
         from filters.bounds import steady_state
 
-        prior_cov = steady_state(a, c, q, r)[0]
+        try:
+            prior_cov = steady_state(a, c, q, r)[0]
+        except np.linalg.LinAlgError:
+            rule = "a system without a steady state must have a first covariance (prior_cov=)"
+            raise ValueError(f"{rule}, but got none") from None
     return _filter(a, b, c, q, r, np.zeros(n) if prior_mean is None else prior_mean, prior_cov)
 
 

@@ -29,6 +29,7 @@ from thruster_env.model.continuous import noise_of_densities
 from thruster_env.model.quantities import Quantity
 
 MOST_HARMONICS = 6
+UNDAMPED = 1e-6  # share of decay in a rate, below which it is that of a harmonic
 WIDE = 100.0  # spreads of the data in the prior's deviation: a start that knows nothing
 
 
@@ -398,8 +399,18 @@ class Sum(NamedTuple):
             spread: of the data [U]; the prior is a hundred times as wide, and as fast as that within a step.
             offset: the mean of the data on each axis, about which the signal varies, or one for all.
             quantities: name, symbol and unit of the measurement on each axis.
+
+        Raises:
+            ValueError: for a wrong number, and for a harmonic of fewer than two samples, which looks like another.
         """
         signal, axes = self.signal(values), len(quantities)
+        rates = np.linalg.eigvals(signal.slope)
+        fastest = float(rates.imag[np.abs(rates.real) < UNDAMPED * np.abs(rates)].max(initial=0.0))
+        if fastest * dt > math.pi * (1.0 + UNDAMPED):
+            rule = f"each harmonic of {self.name} must have two samples in its period or more"
+            raise ValueError(
+                f"{rule}, but one has a period of {2.0 * math.pi / fastest:.4g} s, and dt is {dt:g} s"
+            )
         n, orders, each = len(signal.output), np.array(signal.orders), np.eye(axes)
         offset = np.broadcast_to(np.asarray(offset, dtype=np.float64), axes)
         level = np.eye(n)[int(np.argmax(signal.output))]

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 STEP = PREDICT + UPDATE
 NO_EXTRAS, FEW = np.empty(0), 100  # numbers, whose sum Python finds as fast as NumPy
+FLAWS = TypeError, ValueError, LookupError, OverflowError  # of what are no numbers of float64
 TASKS = {"start": START, "predict": PREDICT, "update": UPDATE}
 
 
@@ -263,7 +264,7 @@ class Session:
             if type(u) is MaskedArray or len(u) != self._p:
                 raise TypeError
             self._u[:] = u
-        except (TypeError, ValueError, LookupError):
+        except FLAWS:
             self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
         divergences = self._operate(PREDICT)
         if divergences == REFUSED:
@@ -276,7 +277,7 @@ class Session:
             if type(z) is MaskedArray or len(z) != self._m:
                 raise TypeError
             self._z[:] = z
-        except (TypeError, ValueError, LookupError):
+        except FLAWS:
             self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
         divergences = self._operate(UPDATE)
         if divergences == REFUSED:
@@ -297,7 +298,7 @@ class Session:
                 self._values[0], self._values[1] = u[0], z[0]
             else:
                 self._u[:], self._z[:] = u, z
-        except (TypeError, ValueError, LookupError):  # `_set` checks only if this fails: a step has to be quick
+        except FLAWS:  # `_set` checks only if this fails: a step has to be quick
             self._set(u, z)
         divergences = self._operate(STEP)
         if divergences == REFUSED:
@@ -375,7 +376,7 @@ class Session:
             elif type(signal) not in (list, tuple) or len(signal) != len(target) or sum(signal) is None:
                 return None  # texts, which NumPy takes for numbers, have no sum
             target[:] = signal
-        except (TypeError, ValueError, LookupError):
+        except FLAWS:
             return None
         if self._noise_was is not None:
             self._numbers[:] = self._noise_was

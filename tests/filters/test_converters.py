@@ -113,6 +113,11 @@ def test_what_does_not_fit_is_refused():
         filters.from_filterpy(Fading())
     with pytest.raises(ValueError, match="has no F"):
         filters.from_filterpy(3)
+    kf = filterpy_filter(np.array([0.0, 0.5]))  # which FilterPy multiplies by u, too
+    assert filters.from_filterpy(kf).model.matrices()[1].tolist() == [[0.0], [0.5]]
+    kf.B = 0.5
+    with pytest.raises(ValueError, match="must have shapes"):
+        filters.from_filterpy(kf)
     for converter in (filters.from_pykalman, filters.from_statsmodels):
         with pytest.raises(ValueError, match="but got 3"):
             converter(3)
@@ -120,5 +125,10 @@ def test_what_does_not_fit_is_refused():
         filters.from_control(StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]]), [1.0], [1.0])
     with pytest.raises(ValueError, match="D must be zero"):
         filters.from_control(StateSpace([[-1.0]], [[1.0]], [[1.0]], [[1.0]]), [1.0], [1.0], dt=0.1)
+    resting = StateSpace(np.zeros((2, 2)), np.ones((2, 1)), [[1.0, 0.0]], 0.0)
+    with pytest.raises(ValueError, match=r"\(prior_cov=\), but got none"):
+        filters.from_control(resting, [1.0, 1.0], [1.0], dt=0.1)
+    with pytest.raises(ValueError, match=r"noise_input must have shape \(n, w\) with n = 2, but got \(3, 1\)"):
+        filters.from_control(resting, [1.0], [1.0], dt=0.1, noise_input=[1.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="must be 'kf' of an affine model"):
         filters.to_filterpy(3)

@@ -6,6 +6,7 @@ import math
 import pickle
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -303,10 +304,16 @@ def test_a_daily_course_and_steps_between_numbers():
     fit = tuning.fit(z, model="constant + harmonic:period=24,harmonics=2")
     assert fit.r == pytest.approx(0.09, rel=0.35) and not fit.is_wrong
     assert {number.name for number in fit.numbers} == {"constant_drift", "harmonic_drift", "R"}
+    values = {"constant_drift": 0.01, "harmonic_drift": 0.02, "R": 0.09}  # the quadrature of period 2 is unseen
+    name = "constant + harmonic:period=8,harmonics=4"
+    assert 2.0 < replace(fit, chosen=fit.chosen._replace(name=name, values=values)).memory < 8.0
     steps = np.ones(239)
     steps[100] = 3.0
     column = column_of(z, steps)
     assert len(column.values) == 242 and np.isnan(column.values[101:103]).all()
+    masked = column_of(np.ma.masked_array(z, mask=hours == 7.0))
+    assert np.flatnonzero(np.isnan(masked.values)).tolist() == [7]
+    assert masked.remarks == ("1 of 240 row is missing, in 1 place.",)  # without an input that is held
 
 
 @pytest.mark.parametrize(
@@ -318,7 +325,12 @@ def test_a_daily_course_and_steps_between_numbers():
         (["a"] * 30, {}, "z must be numbers"),
         (np.zeros((30, 9)), {}, "a column of numbers"),
         (np.arange(30.0), {"model": "harmonic"}, "must have a period"),
+        (np.arange(30.0) ** 2, {"model": "harmonic:period=7,harmonics=4"}, "two samples .* a period of 1.75 s"),
         (np.arange(30.0), {"times": np.arange(30.0)[::-1]}, "times must increase"),
+        (np.arange(30.0), {"dt": np.ones(30)}, "a time for each number, so one step .* 30 numbers and 31 times"),
+        (np.arange(30.0), {"dt": np.ones(29), "times": np.arange(30.0)}, "but got both"),
+        ({"z": np.arange(30.0)}, {"dt": np.ones(29)}, "the times of a table or a file must be one of its columns"),
+        (1e-160 * np.arange(30.0), {}, "must vary by 1e-60 to 1e.60.* use another unit"),
         (np.arange(30.0), {"model": "constant-speed"}, "a model must be one of"),
         (np.arange(30.0), {"dt": -1.0}, "dt must be positive"),
         ({"t": np.arange(30.0), "a": np.arange(30.0), "b": np.arange(30.0)}, {}, "one column of numbers beside"),

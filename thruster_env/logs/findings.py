@@ -146,7 +146,8 @@ def _of_rows(log: Log) -> list[Finding]:
     if recording.missing:
         holes = f"{recording.holes} place{'' if recording.holes == 1 else 's'}"
         are = "row is" if recording.missing == 1 else "rows are"
-        text = f"{recording.missing} of {last + 1} {are} missing, in {holes}; the input is held there"
+        inputs = "; the input is held there" * (log.inputs.shape[1] > 0)
+        text = f"{recording.missing} of {last + 1} {are} missing, in {holes}{inputs}"
         findings.append(Finding(MISSING, "", 0, last, recording.missing, text))
     if recording.doubled:
         rows = "row has" if recording.doubled == 1 else "rows have"

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WHITE = 0.001  # probability from which innovations count as white
+HIDDEN = 1e-9  # share of a mode in the measurements, below which they do not show it
 LARGE = 0.05  # correlation of innovations that matters
 
 
@@ -88,9 +89,15 @@ class SeriesFit(Result):
 
     @property
     def memory(self) -> float:
-        """Time in which the filter forgets an error of its state but for 1/e [s]."""
+        """Time in which the filter forgets an error of its state but for 1/e [s], where the data show it.
+
+        They never show the quadrature of a harmonic with two samples in its period.
+        """
         a, _, _, c, _ = self.model.matrices()
-        slowest = np.abs(np.linalg.eigvals(a - self._gains() @ c @ a)).max()
+        rates, modes = np.linalg.eig(a - self._gains() @ c @ a)
+        after, units = a @ modes, np.sqrt(np.diag(self.model.prior_cov))[:, None]
+        hidden = np.abs(c @ after / (np.abs(c) @ units)).max(axis=0) < HIDDEN * np.abs(after / units).max(axis=0)
+        slowest = np.abs(rates[~hidden]).max(initial=0.0)
         return math.inf if slowest >= 1.0 else -self.column.dt / math.log(max(slowest, 1e-300))
 
     @cached_property

@@ -24,6 +24,7 @@ from thruster_env.model.state_space import StateSpaceModel
 
 LEAST_ROWS = 20  # with a number
 MOST_AXES = 6
+RANGES = 1e-60, 1e60  # of a column's numbers, of which Q and R are squares
 WIDTHS, PEAKS = (1, 5, 21), 2  # by how many points a spectrum is smoothed, and how many of its peaks are tried
 
 
@@ -99,8 +100,14 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
         ValueError: states the rule and the value.
     """
     if np.ndim(dt) == 1:
+        if times is not None:
+            raise ValueError("numbers must have times (times=) or the steps between them (dt=), but got both")
         dt, times = None, np.cumsum([0.0, *as_floats(dt)])
-    source: Any = z if isinstance(z, str | Path | Mapping) or hasattr(z, "columns") else _as_columns(z, times)
+    is_table = isinstance(z, str | Path | Mapping) or hasattr(z, "columns")
+    if is_table and times is not None:
+        rule = "the times of a table or a file must be one of its columns"
+        raise ValueError(f"{rule}, but got {short_repr(times)} beside it")
+    source: Any = z if is_table else _as_columns(z, times)
     is_file = isinstance(source, str | Path)
     recorded = is_file and format_of(source) is not None
     named = column.split(",") if isinstance(column, str) else column
@@ -140,6 +147,10 @@ def _check_numbers(header: str, values: np.ndarray) -> None:
     count = int(np.count_nonzero(~np.isnan(values)))
     if count < LEAST_ROWS:
         raise ValueError(f"{header} must have at least {LEAST_ROWS} numbers, but has {count}")
+    width = float(np.nanmax(values)) - float(np.nanmin(values))
+    if 0.0 < width < math.inf and not RANGES[0] < width < RANGES[1]:
+        rule = f"{header} must vary by {RANGES[0]:g} to {RANGES[1]:g}, whose squares are numbers"
+        raise ValueError(f"{rule}, but varies by {width:.3g}: use another unit")
 
 
 def column_alone(files: Any, reading: Mapping[str, Any]) -> str | Path | None:
@@ -165,9 +176,8 @@ def _as_columns(z: Any, times: Any) -> Mapping[str, Any]:
     if hasattr(z, "to_frame") and times is None:
         return z.to_frame(z.name or "z")
     try:
-        values = np.asarray(
-            [math.nan if value is None else value for value in np.asarray(z).tolist()], dtype=float
-        )
+        numbers = (z if isinstance(z, np.ma.MaskedArray) else np.asarray(z)).tolist()  # with None where masked
+        values = np.array(numbers, dtype=float)  # NaN for None
     except (TypeError, ValueError):
         raise ValueError(f"z must be numbers, but got {short_repr(z)}") from None
     if values.ndim == 2 and 1 in values.shape:
@@ -175,6 +185,9 @@ def _as_columns(z: Any, times: Any) -> Mapping[str, Any]:
     if values.ndim not in (1, 2) or values.ndim == 2 and values.shape[1] > MOST_AXES:
         rule = f"z must be a column of numbers, (K,), or one for each of at most {MOST_AXES} axes, (K, axes)"
         raise ValueError(f"{rule}, but has shape {values.shape}: fit each column alone")
+    if times is not None and np.shape(times) != values.shape[:1]:
+        rule = "there must be a time for each number, so one step (dt=) fewer"
+        raise ValueError(f"{rule}, but got {len(values)} numbers and {np.size(times)} times")
     columns = {"z": values} if values.ndim == 1 else {f"z_{i + 1}": axis for i, axis in enumerate(values.T)}
     return columns if times is None else {TIME: np.asarray(times), **columns}
 
