@@ -18,6 +18,7 @@ from filters.engine.batch import Estimates
 from filters.filter import Filter
 from thruster_env.core.checks import at_least, between, one_of
 from thruster_env.core.streams import filter_keys
+from thruster_env.logs.log import seen_by
 from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import Evaluation, compute_metrics
 from tuning.evaluation.runs import RunMetrics, metrics_by_run, metrics_of_all
@@ -71,7 +72,7 @@ def _whole(problem: LogProblem) -> Data:
     data = Data(
         tuple(range(len(logs))),
         padded([log.inputs[: len(log.measurements) - 1] for log in logs], rows - 1, None),
-        padded([log.measurements for log in logs], rows),
+        padded([seen_by(model, log.measurements) for log in logs], rows),
         np.repeat(filter_keys([0]), len(logs), axis=0),
         problem.first_scored_step,
         counted=mask_of([len(log.measurements) for log in logs], rows),

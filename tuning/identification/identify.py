@@ -65,9 +65,9 @@ def outliers_of(model: StateSpaceModel, runs: Data, gate: float, starts: Starts 
 class WithoutOutliers:
     """Data, or a function of parameters that returns them, without some samples."""
 
-    def __init__(self, data: Data | Callable, outliers: np.ndarray):
-        """Take the data of an `Objective`, and a mask (B, K + 1, m) of the samples to leave out."""
-        self._data, self.outliers = data, outliers
+    def __init__(self, data: Data | Callable, outliers: np.ndarray, model: StateSpaceModel):
+        """Take data and model of an `Objective`, and a mask (B, K + 1, m) of the samples to leave out."""
+        self._data, self.outliers, self._model = data, outliers, model
         self.parameters = getattr(data, "parameters", ())
         noise_factors = getattr(data, "noise_factors", None)
         if noise_factors is not None:
@@ -75,13 +75,13 @@ class WithoutOutliers:
 
     def __call__(self, **values: float) -> Data:
         """The runs, NaN where a sample is left out."""
-        runs = runs_of(self._data(**values) if callable(self._data) else self._data)
+        runs = runs_of(self._data(**values) if callable(self._data) else self._data, self._model)
         return runs._replace(measurements=np.where(self.outliers, np.nan, runs.measurements))
 
 
 def without_outliers(objective: Objective, outliers: np.ndarray, gate: float) -> Objective:
     """The same objective without the outliers, which are those beyond a gate."""
-    return objective.with_changes(data=WithoutOutliers(objective.data, outliers), gate=gate)
+    return objective.with_changes(data=WithoutOutliers(objective.data, outliers, objective.first_model), gate=gate)
 
 
 # Whether logs excite the free parameters.

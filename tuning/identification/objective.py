@@ -115,11 +115,12 @@ class Objective:
         """Find the parameters that have sensitivities; see the class for the arguments."""
         self.filter = one_of("filter", filter, FILTERS)
         self.coordinates, self._model, self.degrees, self.simulation = coordinates, model, degrees, simulation
-        self.data: Data | Callable[..., Any] = data if callable(data) else runs_of(data)
+        self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
+        self.first_model = self._given_model(coordinates.start())
+        self.data: Data | Callable[..., Any] = data if callable(data) else runs_of(data, self.first_model)
         self.evaluations, self.starts, self.gate = 0, starts, gate
         self.predicted = tuple(predicted)
         self._captured: CapturedConstants | None = None
-        self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
         self.rough: tuple[int, ...] = ()  # indices of parameters without sensitivities
         at = coordinates.start()
         self._check_factory(at)
@@ -191,7 +192,7 @@ class Objective:
         if not callable(self.data):
             return self.data
         named = self.coordinates.named(at)
-        return runs_of(self.data(**{name: named[name] for name in self._of_data}))
+        return runs_of(self.data(**{name: named[name] for name in self._of_data}), self.first_model)
 
     @property
     def _noise_factors_of(self) -> Callable[..., Mapping[str, float]] | None:

@@ -16,7 +16,7 @@ from filters.starts import Starts, as_the_prior_says, wide_cov
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import short_repr
 from thruster_env.core.streams import filter_keys
-from thruster_env.logs.log import Log, in_steps
+from thruster_env.logs.log import Log, in_steps, seen_by
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data, mask_of, padded
 from tuning.problems.log_parts import LEAD, check_times
@@ -177,10 +177,11 @@ def _is_elsewhere(model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> 
 # Recorded runs as one batch: runs of different lengths are padded with steps in which nothing is measured.
 
 
-def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
+def runs_of(data: Data | Log | Sequence[Data | Log], model: StateSpaceModel | None = None) -> Data:
     """Data and logs as one `Data`; keys and seeds are those of the runs' indices 0, 1, ...
 
-    Logs on their own stamps have step ratios as their last input (`thruster_env.logs.log`).
+    Logs on their own stamps have step ratios as their last input (`thruster_env.logs.log`). The first measurement
+    of a log is left out if h of the model takes the input until then, which it does not have.
 
     Raises:
         ValueError: for anything else, for no run, for runs with different inputs, measurements or sample times.
@@ -196,6 +197,7 @@ def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
     for source in parts:
         if isinstance(source, Log):
             u, z = (source.inputs, source.measurements) if source.stamps is None else in_steps(source)
+            z = z if model is None else seen_by(model, z)
             inputs, measurements = [*inputs, u], [*measurements, z]
             continue
         for part in map(source.one, range(len(source.seeds))):
