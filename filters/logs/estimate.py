@@ -193,7 +193,7 @@ def estimate_with(
         filter_,
         means[0],
         covs[0],
-        np.where(np.isnan(log.measurements), np.nan, estimates.innovations[0]),
+        np.where(np.isnan(measurements), np.nan, estimates.innovations[0]),
         estimates.innovation_covs[0],
         likelihoods if filter_.has_covariance else np.full_like(likelihoods, np.nan),
         int(estimates.divergences[0]),

@@ -261,7 +261,7 @@ def test_the_charge_of_a_cell_is_found_from_a_log_as_it_is():
     assert log.until and (log.inputs[:, 0] == table["i_A"][1:]).all()
     found = estimate_with(make_filter("ekf", cell()), log)
     assert np.sqrt(((found.means[100:, 0] - charges[100:]) ** 2).mean()) < 4e-4
-    assert 0.8 < findings(found).mean_nis < 1.25
+    assert 0.8 < findings(found).mean_nis < 1.25 and np.isnan(found.innovations[0]).all()
     by_clock = estimate_with(make_filter("ekf", cell()), read_log(table, cell(), grid=False))
     np.testing.assert_allclose(by_clock.means, found.means, rtol=1e-9)
     replayed = EstimateState(ReplayEnv(table, cell()), filter="ekf")
