@@ -312,9 +312,9 @@ def _operation(kernels: Kernels, inputs: int, interpreting: bool) -> InParts:
     operate = inlined(build_operation(kernels))
     kept_rows, m, p = kernels.kept_rows, kernels.m, inputs
 
-    def operate_many(first, last, row, table, draws, size, rows, tables, us, zs, numbers, tasks):
+    def operate_many(first, last, row_like, table_like, draws_like, size, rows, tables, us, zs, numbers, tasks):
         # Each thread has its own memory: slices of shared arrays cost contended reference counts.
-        row, table, draws = np.zeros(row.shape), np.zeros(table.shape), np.zeros(draws.shape)
+        row, table, draws = np.zeros(row_like.shape), np.zeros(table_like.shape), np.zeros(draws_like.shape)
         values = np.zeros(p + m)
         for b in range(first, last):
             task = int(tasks[b])

@@ -102,7 +102,10 @@ class Arithmetic:
     def of_two(self, name: str, a: Any, b: Any) -> Any:
         """An operation of Python's syntax tree, such as "Add" or "Lt", on two numbers."""
         if is_known(a) and is_known(b):
-            return OPERATORS[name](a, b)
+            try:
+                return OPERATORS[name](a, b)
+            except (ArithmeticError, ValueError) as error:  # where machine code goes on with inf or NaN
+                raise Untranslated(f"{name} of {a} and {b}: {error}") from None
         if name in ("Is", "IsNot"):  # a number is none of the objects that are known
             return name == "IsNot"
         if name in COMPARISONS:

@@ -52,7 +52,7 @@ class Expressions:
         self._function: Any = None
         self._ways_out: list[tuple[ir.Block, ir.Block]] = []  # of loops: where `continue` and `break` lead
         self._on_heap: list[ir.Value] = []  # slots of addresses that are freed at the end
-        self._makes_arrays = False
+        self._makes_arrays = self._makes_in_loop = False
 
     def call(self, function: Any, arguments: Sequence) -> Any:
         """Call a function with these arguments; return its result."""
@@ -145,6 +145,8 @@ class Expressions:
         cells = dict(zip(function.__code__.co_freevars, function.__closure__ or (), strict=True))
         if node.id in self._names:
             return self._names[node.id]
+        if node.id in function.__code__.co_varnames:  # of another turn of a loop, or of one that has ended
+            raise Untranslated(f"{node.id} of {function.__name__} where it may have no value, or another one")
         if node.id in cells:
             return cells[node.id].cell_contents
         return function.__globals__[node.id] if node.id in function.__globals__ else getattr(builtins, node.id)
@@ -207,22 +209,22 @@ class Expressions:
         return reduce(self._builder.and_, map(self.numbers.truth, values))
 
     def _boolop(self, node: ast.BoolOp) -> Any:
-        """Python's `and` and `or` of conditions: a part that may fail, or takes long, is skipped if it can be."""
+        """Python's `and` and `or`, of numbers, too: what may fail, or takes long, is skipped if it can be."""
         ends = isinstance(node.op, ast.Or)
         first, *rest = node.values
         value = self._value(first)
-        if is_known(value):
-            if bool(value) == ends or not rest:
-                return bool(value)
-            return self._boolop(ast.BoolOp(node.op, rest))
         if not rest:
-            return self.numbers.truth(value)
+            return value
         remaining = ast.BoolOp(node.op, rest)
+        if is_known(value):
+            return value if bool(value) == ends else self._boolop(remaining)
         if not _is_plain(remaining, first):
-            parts = (lambda: ends), (lambda: self._boolop(remaining))
+            parts = (lambda: value), (lambda: self._boolop(remaining))
             return self._either(value, *(parts if ends else parts[::-1]))
-        combine = self._builder.or_ if ends else self._builder.and_
-        return combine(self.numbers.truth(value), self.numbers.truth(self._boolop(remaining)))
+        values = value, self._boolop(remaining)
+        if all(as_value(part).type == BOOL for part in values):
+            return (self._builder.or_ if ends else self._builder.and_)(*map(self.numbers.truth, values))
+        return self._selected(value, values if ends else values[::-1])
 
     def _ifexp(self, node: ast.IfExp) -> Any:
         test = self._value(node.test)
@@ -230,8 +232,11 @@ class Expressions:
             return self._value(node.body if test else node.orelse)
         if not (_is_plain(node.body, node.test) and _is_plain(node.orelse, node.test)):
             return self._either(test, lambda: self._value(node.body), lambda: self._value(node.orelse))
-        test, values = self.numbers.truth(test), (self._value(node.body), self._value(node.orelse))
-        form = common_form(values)
+        return self._selected(test, (self._value(node.body), self._value(node.orelse)))
+
+    def _selected(self, test: Any, values: Sequence) -> Any:
+        """The first of two values if the test is true, else the second."""
+        test, form = self.numbers.truth(test), common_form(values)
         pairs = zip(*(self._numbers_of(form, value) for value in values), strict=True)
         return value_of(form, (self._builder.select(test, *pair) for pair in pairs))
 
@@ -258,12 +263,17 @@ class Expressions:
         indices += [slice(None)] * (len(value.shape) - len(indices))
         at, shape, steps, of_two = 0, [], [], self.numbers.of_two
         for part, size, step in zip(indices, value.shape, value.steps, strict=True):
-            first: Any = part
+            first: Any = _from_the_end(part, size, of_two)
             if isinstance(part, slice):
                 if part.step is not None:
                     raise Untranslated("a slice with a step")
-                first = 0 if part.start is None else part.start
-                shape.append(of_two("Sub", size if part.stop is None else part.stop, first))
+                if all(map(is_known, (part.start, part.stop, size))):
+                    first, stop, _ = part.indices(size)
+                    stop = max(first, stop)
+                else:
+                    first = 0 if part.start is None else _from_the_end(part.start, size, of_two)
+                    stop = size if part.stop is None else _from_the_end(part.stop, size, of_two)
+                shape.append(of_two("Sub", stop, first))
                 steps.append(step)
             at = of_two("Add", at, of_two("Mult", first, step))
         return Array(self._behind(value.pointer, at), tuple(shape), tuple(steps))
@@ -324,8 +334,12 @@ class Expressions:
         self._lead_to(head)
         at = builder.phi(LONG)
         at.add_incoming(first, before)
-        descends = isinstance(step, ir.Constant) and step.constant < 0
-        builder.cbranch(builder.icmp_signed(">" if descends else "<", at, stop), inside, after)
+        up, down = (builder.icmp_signed(sign, at, stop) for sign in "<>")
+        if isinstance(step, ir.Constant):
+            goes_on = up if step.constant > 0 else down
+        else:
+            goes_on = builder.select(builder.icmp_signed(">", step, ir.Constant(LONG, 0)), up, down)
+        builder.cbranch(goes_on, inside, after)
         builder.position_at_end(inside)
         self._ways_out.append((following, after))
         yield at
@@ -348,6 +362,8 @@ class Expressions:
         self.has_loops = True
         program, width, names, scratch = function.program
         arrays = [argument for argument in arguments if isinstance(argument, Array)]
+        if any(isinstance(step, int) and step != 1 for array in arrays for step in array.steps[-1:]):
+            raise Untranslated("a program on every few numbers of an array")
         more: list = []
         if "memory" in names:  # a part of a wider array: the step from row to row is one more argument
             more = [arrays[names.index("memory")].steps[0]]
@@ -392,6 +408,7 @@ class Expressions:
 
     def _new_array(self, shape: Any) -> Array:
         sizes, self._makes_arrays = shape if isinstance(shape, tuple) else (shape,), True
+        self._makes_in_loop |= bool(self._ways_out)
         count = self._count(sizes)
         if not is_known(count) or count > LONGEST:
             return self._new_array_on_heap(sizes, count)
@@ -458,8 +475,22 @@ def new_function(module: ir.Module, kind: ir.FunctionType, name: str) -> ir.Func
     return function
 
 
+def _from_the_end(bound: Any, size: Any, of_two: Callable) -> Any:
+    """A known index or bound that is negative counts from the end; one that is not known must not be negative."""
+    is_negative = isinstance(bound, int | np.integer) and bound < 0
+    return of_two("Add", size, bound) if is_negative else bound
+
+
 def _is_plain(node: ast.expr, test: ast.expr) -> bool:
     """Whether a part may be evaluated where it is not needed: it calls nothing, and reads what the test reads."""
-    alike = {ast.dump(part) for part in ast.walk(test) if isinstance(part, ast.Subscript)}
+    alike = {ast.dump(part) for part in _always_evaluated(test) if isinstance(part, ast.Subscript)}
     skipped = ast.Call, ast.Subscript, ast.FloorDiv, ast.Mod
     return all(not isinstance(part, skipped) or ast.dump(part) in alike for part in ast.walk(node))
+
+
+def _always_evaluated(node: ast.AST) -> Iterator[ast.AST]:
+    """An expression and its parts, without those that `and`, `or` and conditions may skip."""
+    yield node
+    parts = [node.values[0]] if isinstance(node, ast.BoolOp) else ast.iter_child_nodes(node)
+    for part in [node.test] if isinstance(node, ast.IfExp) else parts:
+        yield from _always_evaluated(part)

@@ -8,7 +8,8 @@
 
 What a function has in its closure is known when it is translated, so sizes are constants. A function that it
 calls is translated once for all calls that differ in numbers alone. Whatever else it contains raises
-`Untranslated`; numba then compiles it. The same function runs as Python.
+`Untranslated`; numba then compiles it. The same function runs as Python. Nothing checks indices: one that is not
+known must lie within the array, and counts from its beginning.
 """
 
 from __future__ import annotations
@@ -182,6 +183,8 @@ class _Translator(Expressions):
     def add_body(self, function: types.FunctionType, arguments: Sequence) -> Any:
         """Add the body of a function for its arguments; return the form of its results."""
         node, self._function = _definition(function.__code__), function
+        if len(arguments) != len(node.args.args):
+            raise Untranslated(f"{function.__name__} with arguments by default, or too many")
         self._names = dict(zip((argument.arg for argument in node.args.args), arguments, strict=True))
         counts = Counter(name for part in ast.walk(node) for name in _assigned(part))
         counts.update(name for name in self._names if name in counts)
@@ -267,6 +270,8 @@ class _Translator(Expressions):
                 form = changing_form(value)
                 kinds = [number.type for number in self._numbers_of(form, value)]
                 self._slots[target.id] = form, [(self._slot(kind), kind) for kind in kinds]
+            if self._makes_in_loop and has_array(value):  # the next turn makes it at the same address
+                raise Untranslated("an array that is made in a loop, in a name that changes")
             form, slots = self._slots[target.id]
             for number, (slot, _) in zip(self._numbers_of(form, value), slots, strict=True):
                 self._builder.store(number, slot)
@@ -292,6 +297,7 @@ class _Translator(Expressions):
         for at in self._loop(first, stop, step):
             self._store(statement.target, at)
             self._statements(statement.body)
+        self._forget(statement.target)
 
     def _for_each(self, statement: ast.For, entries: Any) -> None:
         if type(entries) is not tuple:
@@ -305,6 +311,13 @@ class _Translator(Expressions):
             self._ways_out.pop()
             self._lead_to(following)
         self._lead_to(after)
+        self._forget(statement.target)
+
+    def _forget(self, target: ast.expr) -> None:
+        """Forget what counted a loop: after the loop it would be one too many, or the last even after a break."""
+        for part in ast.walk(target):
+            if isinstance(part, ast.Name):
+                self._names.pop(part.id, None)
 
     def _while(self, statement: ast.While) -> None:
         if statement.orelse:
@@ -330,8 +343,9 @@ def _definition(code: types.CodeType) -> ast.FunctionDef:
         node = ast.parse(textwrap.dedent(inspect.getsource(code))).body[0]
     except (OSError, SyntaxError):
         raise Untranslated(f"the source of {code.co_name} cannot be read") from None
-    if not isinstance(node, ast.FunctionDef):
-        raise Untranslated(f"{code.co_name} is no plain function")
+    parts = code.co_name, *code.co_varnames[: code.co_argcount]
+    if not isinstance(node, ast.FunctionDef) or (node.name, *(part.arg for part in node.args.args)) != parts:
+        raise Untranslated(f"{code.co_name} is no plain function, or its file has changed")
     return node
 
 

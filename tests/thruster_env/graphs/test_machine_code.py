@@ -132,6 +132,98 @@ def test_a_value_that_may_not_have_been_computed_is_a_fault():
         machine_code_of(at_times, [(None,)])
 
 
+def after_its_loop(x):
+    for k in range(3):
+        x[0] += k
+    x[1] = k
+
+
+def after_a_break(x):
+    for value in (x[1], x[2], x[0]):
+        if value > 2.5:
+            break
+    x[0] = value
+
+
+def of_the_turn_before(x):
+    for k in range(4):
+        if k > 0:
+            x[0] += NOTHING_YET  # noqa: F823
+        NOTHING_YET = x[1] + k  # noqa: F841, N806
+
+
+def by_default(x):
+    half(x)
+
+
+def half(x, share=0.5):
+    x[0] *= share
+
+
+def made_in_a_loop(x):
+    last = np.zeros(2)
+    for _ in range(4):
+        following = np.zeros(2)
+        following[0] = last[0] + 1.0
+        last = following
+    x[0] = last[0]
+
+
+def divided_by_nothing(x):
+    x[0] = 1.0 / NOTHING
+
+
+NOTHING = 0.0
+NOTHING_YET = 1.0  # not the local of this name
+
+
+def second_column(x):
+    squares(x.reshape((4, 2))[:, 1], x, x)
+
+
+squares = squares_program()
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        after_its_loop,
+        after_a_break,
+        of_the_turn_before,
+        by_default,
+        made_in_a_loop,
+        divided_by_nothing,
+        second_column,
+    ],
+)
+def test_what_would_be_other_numbers_than_pythons_is_refused(function):
+    with pytest.raises(Untranslated):
+        add_function(ir.Module(), "run", function, [(8,)])
+
+
+def of_indices_and_conditions(x, n):
+    part, rest = x[-4:-1], x[n:]
+    x[0] = n or 5
+    x[1] = (x[2] > 1.0 and x[3]) or n
+    x[-1] += part[-1] + x[6:100].shape[0] + rest.shape[0]
+    for k in range(0, 8, n + 1):
+        x[2] = 10.0 * x[2] + k
+    for k in range(7, 0, -n - 1):
+        x[3] = 10.0 * x[3] + k
+    x[4] = x[n + 8] if n < 0 and x[n] > 0.0 else -1.0
+    x[5] = 2.0 if n > 2 and x[n - 3] > 0.0 and x[n - 3] < 1.5 else 3.0
+
+
+def test_indices_from_the_end_values_of_conditions_and_steps_are_those_of_python():
+    run = machine(of_indices_and_conditions, (8,), None)
+    for n in range(5):
+        x = np.arange(1.0, 9.0)
+        expected = x.copy()
+        of_indices_and_conditions(expected, n)
+        run(x, n)
+        assert x.tolist() == expected.tolist()
+
+
 def columns_doubled(x, first, most):
     k = 0
     while k < most and x[0, first] < 100.0:
@@ -295,6 +387,9 @@ model = affine_model(a=0.9 * np.eye(2), b=np.ones((2, 1)), c=np.eye(1, 2), proce
 filter_ = make_filter("ekf", model)
 run(filter_, inputs=np.zeros((9, 3, 1)), measurements=np.ones((9, 4, 1)))
 filter_.update(filter_.predict(filter_.init(), [0.0]), [1.0])
+from filters.engine.batch import Beliefs
+ensembles = Beliefs(make_filter("enkf", model, ensemble_size=9), 2)
+ensembles.start(np.arange(2), np.zeros((2, 2)), np.ones((2, 1)))
 print([name for name in ("numba", "scipy", "gymnasium") if name in sys.modules])
 import gymnasium as gym
 import thruster_env
