@@ -42,7 +42,7 @@ def pushes(seeds, steps):
 
 
 PROBLEM = ModelProblem(MODEL, inputs=pushes, steps=40, first_scored_step=5, scale=[1.0, 2.0], name="plane")
-SETTINGS = Settings(steps=6, batch=8, window=10, checks=3)
+SETTINGS = Settings(steps=6, batch=8, window=10, rate=5e-3, checks=3)
 
 
 @pytest.fixture(scope="module")
