@@ -352,3 +352,11 @@ def test_every_start_lies_in_its_range():
         for number in (number for model in NAMED.values() for number in model.free):
             low, high = number.range(scales)
             assert 0.0 < low < high < math.inf and all(low <= value <= high for value in number.values(scales))
+
+
+def test_data_without_noise_are_called_that():
+    tiny = 1.0 + 1e-13 * np.random.default_rng(0).normal(size=100)
+    fit = tuning.fit(tiny, model="constant")
+    assert fit.is_exact and fit.sentences()[0].startswith("The model predicts all numbers but for their rounding")
+    with pytest.raises(ValueError, match="to the last digit have neither Q nor R"):
+        tuning.fit(3.0 + 2.0 * (0.1 * np.arange(200)), 0.1, model="constant-velocity")

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 WHITE = 0.001  # probability from which innovations count as white
 HIDDEN = 1e-9  # share of a mode in the measurements, below which they do not show it
 LARGE = 0.05  # correlation of innovations that matters
+ROUNDING = 1e-9  # innovations over the largest number, below which they are rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -117,6 +118,12 @@ class SeriesFit(Result):
         correlations = np.abs(self.whiteness.correlations)
         return self.whiteness.p_value < WHITE and float(correlations.max()) > LARGE
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether the model predicts all numbers but for rounding."""
+        innovations = self.estimates.innovations[0][self.column.counted(self.model)]
+        return float(np.abs(innovations).max()) < ROUNDING * float(np.nanmax(np.abs(self.column.table)))
+
     def axes_differ(self) -> float:
         """Probability of so large a likelihood ratio, if all axes have the same numbers; 1 for one axis."""
         axes, candidate = len(self.column.quantities), named_model(self.name)
@@ -136,6 +143,11 @@ class SeriesFit(Result):
         white, sentences = self.whiteness, []
         largest = np.unravel_index(int(np.argmax(np.abs(white.correlations))), white.correlations.shape)
         lag = int(largest[0])
+        if self.is_exact:
+            return [
+                "The model predicts all numbers but for their rounding: Q and R are those of rounding.",
+                *self.column.remarks,
+            ]
         if self.is_wrong:
             correlation, time = white.correlations[largest], (lag + 1) * self.column.dt
             sentences.append(
@@ -191,7 +203,7 @@ class SeriesFit(Result):
         names = ", ".join(quantity.short_label for quantity in column.quantities)
         heading = f"{names}: {count} numbers, one each {column.dt:.4g} s"
         sentences = self.sentences()
-        if self.is_wrong:
+        if self.is_wrong or self.is_exact:
             first, sentences = [sentences[0]], sentences[1:]
         rows = [
             (

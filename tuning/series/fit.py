@@ -162,7 +162,8 @@ def _maximum(candidate: Sum, column: Column) -> Fitted:
     ascents = [climb(objective, at, *bounds) for at in _starts(objective, candidate, column.scales)]
     ascent = climb(objective, max(ascents, key=lambda end: end.found.value).at, *bounds, enough=EXACT)
     if not math.isfinite(ascent.found.value):
-        raise ValueError(f"{candidate.name} must have a likelihood on the data, but has none from any start")
+        rule = f"{candidate.name} must have a likelihood on the data, but has none from any start"
+        raise ValueError(f"{rule}: data that a model predicts to the last digit have neither Q nor R")
     return Fitted(candidate, objective, ascent, tuple(ascents), np.zeros(BLOCKS - 1))
 
 
