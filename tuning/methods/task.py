@@ -29,7 +29,6 @@ from tuning.search.space import Choice, neutral, parameters, untuned_choice
 FEW = 32  # runs, by which passes are priced
 TIMED = 3  # calls, of which the shortest counts, of what is priced
 ROUNDING = 1e-6  # part of an objective: an answer that is worse by less is as good
-SMOOTHER = 2.0  # passes that a smoother counts
 
 
 class Budget(NamedTuple):
