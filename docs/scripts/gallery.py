@@ -13,6 +13,18 @@ from thruster_env.core.files import BLUE, GREY, save_figure
 from tuning.api.fit import SeriesFit
 
 COLOURS = 32
+QUANTITIES = {  # by the beginning of a title: the axis of values, and the unit of time where it is not a second
+    "An encoder": ("angle [rad]", ""),
+    "A barometer": ("altitude [m]", ""),
+    "A kitchen": ("mass [g]", ""),
+    "A share": ("log price", "day"),
+    "The Nile": ("flow [10⁸ m³]", "year"),
+    "A battery": ("voltage [V]", ""),
+    "The heave": ("heave [m]", ""),
+    "A room": ("temperature [°C]", "day"),
+    "A tide": ("level [m]", "day"),
+}
+SECONDS = {"": 1.0, "year": 1.0, "day": 86400.0}  # of the fit's time: the Nile's has a step of 1
 PAGE = DOCS / "gallery.md"
 BLOCK = re.compile(r"\*\*\d+\. (.*?)\.\*\*.*?```python\n(.*?)```", flags=re.DOTALL)
 
@@ -42,13 +54,15 @@ def gallery(path: Path) -> None:
             axis.set_xlabel("east [m]")
             axis.set_ylabel("north [m]")
             continue
-        times = fit.column.dt * np.arange(len(values))
+        label, unit = next(pair for begin, pair in QUANTITIES.items() if title.startswith(begin))
+        times = fit.column.dt * np.arange(len(values)) / SECONDS[unit]
         band = 1.96 * np.sqrt(np.einsum("i,kij,j->k", c[0], fit.estimates.covs[0], c[0]))
         axis.plot(times, values[:, 0], ".", markersize=2, color=GREY)
         axis.plot(times, means[:, 0], color=BLUE, linewidth=1.2)
         axis.fill_between(times, means[:, 0] - band, means[:, 0] + band, color=BLUE, alpha=0.3, linewidth=0)
         axis.set_ylim(np.nanmin(values), np.nanmax(values))  # the band begins wide
-        axis.set_xlabel("time [s]")
+        axis.set_xlabel(f"time [{unit or 's'}]")
+        axis.set_ylabel(label)
     save_figure(figure, path)
     with Image.open(path) as picture:
         few = picture.convert("RGB").quantize(COLOURS)
