@@ -18,7 +18,7 @@ import numpy as np
 
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import as_floats, at_least, one_of, positive, short_repr
-from thruster_env.core.compiled import CompiledOrPython, inlined
+from thruster_env.core.compiled import CompiledOrPython, inlined, is_interpreting
 
 if TYPE_CHECKING:
     from filters.filter import Filter
@@ -347,7 +347,7 @@ class Monitor:
         shape = steps, len(TESTS), m
         raised, since, sizes = np.zeros(shape, dtype=bool), np.zeros(shape), np.zeros(shape)
         state = new_state(m, self.window)
-        _compiled()[1](state, v, s, z, self.limits(m), raised, since, sizes)
+        _compiled(is_interpreting())[1](state, v, s, z, self.limits(m), raised, since, sizes)
         return [
             Alarm(TESTS[test], int(i), int(k), int(since[k, test, i]), float(sizes[k, test, i]))
             for k, test, i in np.argwhere(raised)
@@ -389,8 +389,8 @@ def _limits(monitor: Monitor, channels: int) -> np.ndarray:
 
 
 @cache
-def _compiled() -> tuple[CompiledOrPython, CompiledOrPython]:
-    """`step_tests` and `run_tests`, compiled at their first call."""
+def _compiled(interpreting: bool) -> tuple[CompiledOrPython, CompiledOrPython]:
+    """`step_tests` and `run_tests`, compiled at their first call; those of `interpreted` are others."""
     inlined(squared_innovation)
     inlined(step_tests)
     return CompiledOrPython(step_tests), CompiledOrPython(run_tests)
@@ -430,7 +430,7 @@ class Watch:
         """Take the innovation (m,), its covariance (m, m) and the measurement (m,), NaN where there was none."""
         raised, since, sizes = self._out
         tests = self._state, float(self._k), innovation, cov, z, self._limits, raised, since, sizes
-        dead = _compiled()[0](*tests)
+        dead = _compiled(is_interpreting())[0](*tests)
         alarms: tuple[Alarm, ...] = ()
         if raised.any():
             alarms = tuple(
