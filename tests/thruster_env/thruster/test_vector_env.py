@@ -100,7 +100,9 @@ def assert_info(found, i, expected):
         np.testing.assert_allclose(found[key][i], value, rtol=1e-12, atol=1e-12, err_msg=key)
 
 
-def assert_copies_are_single_envs(name, count, mode, steps, limit, watched, exact=(), inputs=None, **given):
+def assert_copies_are_single_envs(
+    name, count, mode, steps, limit, watched, exact=(), inputs=None, ulps=0, **given
+):
     """Compare some copies, step by step; return how often one was terminated and truncated."""
     vector = make_vec(name, count, mode, limit, **given)
     singles = {i: Single(name, mode, limit, seed=7 + i, **given) for i in watched}
@@ -121,7 +123,8 @@ def assert_copies_are_single_envs(name, count, mode, steps, limit, watched, exac
             assert (terminated[i], truncated[i]) == expected[2:4]
             assert_info(info, i, expected[4])
             for channel in exact:
-                assert info["measurement"][i, channel] == expected[4]["measurement"][channel]
+                pair = info["measurement"][i, channel], expected[4]["measurement"][channel]
+                np.testing.assert_array_max_ulp(*pair, ulps)
             ends += expected[2:4]
             if expected[5]:
                 assert info["_final_obs"][i] and info["_final_info"][i]

@@ -85,9 +85,12 @@ def test_okf_and_the_gradient_of_its_error_go_below_noise_estimation_where_the_m
     for name in ("noise-estimation", "okf", MSE):
         task = Task("ekf", problem, problem.data(range(20)), options=FULL)
         find_method(name).run(name, task)
-        values[name] = task.value(task.best, MSE)
-    assert values["okf"] < values["noise-estimation"]
-    assert values[MSE] < values["okf"] * 1.06  # the last digits decide in which of two minima it ends
+        values[name], best = task.value(task.best, MSE), task.best
+        if name == "okf":  # rounding decides in which of several minima a search from afar ends
+            onward = Task("ekf", problem, problem.data(range(20)), options=FULL, start=best)
+            find_method(MSE).run(MSE, onward)
+            assert onward.value(onward.best, MSE) < values["okf"] < values["noise-estimation"]
+    assert values[MSE] < values["okf"] * 1.06
 
 
 def test_coordinate_steps_go_up_by_a_tenth_or_down_by_half_and_nowhere_else():
