@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 from importlib.util import find_spec
@@ -13,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from benchmarks.rates import arithmetic_limit, normals, operations_of, step_of_filter, times
 from benchmarks.timing import Measure, Row, alone, side_by_side
 from filters import run
 from filters.filter import Filter
@@ -39,8 +37,7 @@ _read_constants = vector_reader(len(Constants._fields))
 _column, _store = column_reader(2), column_writer(2)
 TRAJECTORIES, TRAJECTORY_SIZE = 256, 100
 AGREEMENT = 0.03  # how far the RMSE of two filters that differ in their random numbers alone may lie apart
-ALONE = (("ekf", 2.6), ("ukf", 2.5))  # filters without an ensemble, and the most of the limit that a step may be
-LIMIT_GOAL = 1.9  # of the ensemble filter
+ALONE = "ekf", "ukf"  # filters without an ensemble
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -54,18 +51,15 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     def compute_metrics():
         evaluate(choice.filter(scenario), data, scenario.scale)
 
-    a_step = times(step_of_filter(choice.filter(scenario)), 1 / ENSEMBLE_SIZE)
-    limit = arithmetic_limit(a_step, cores=cores())
     floor = floor_measures(scenario.plant, scenario.steps)
     whole_floor = _sum(*floor.values())
     workload = f"{SEEDS} seeds, N = {ENSEMBLE_SIZE}"
     timing = side_by_side(shared(compute_metrics, count), whole_floor, rounds)
-    yield Row(f"evaluate, {workload}", "floor", timing, ratio_goal=EVALUATE_GOAL, limit=limit)
+    yield Row(f"evaluate, {workload}", "floor", timing, ratio_goal=EVALUATE_GOAL)
     timing = side_by_side(shared(lambda: estimates(choice.filter(scenario), data), count), whole_floor, rounds)
-    yield Row("the same without metrics", "floor", timing, ratio_goal=RUN_GOAL, limit=limit)
-    for (name, measure), count in zip(floor.items(), floor_operations(scenario.plant), strict=True):
-        limit = arithmetic_limit(count, cores=cores())
-        yield Row(f"floor: {name}", None, alone(measure, rounds), limit=limit)
+    yield Row("the same without metrics", "floor", timing, ratio_goal=RUN_GOAL)
+    for name, measure in floor.items():
+        yield Row(f"floor: {name}", None, alone(measure, rounds))
 
 
 def shared(work: Callable[[], object], count: int) -> Measure:
@@ -109,12 +103,6 @@ def floor_measures(plant: Plant, steps: int) -> dict[str, Measure]:
     }
 
 
-def floor_operations(plant: Plant) -> tuple[Counter[str], Counter[str]]:
-    """Operations of the same: of the motion, and of the noise."""
-    motion = operations_of(substep, np.zeros(2), (12.0, plant.ambient_velocity), plant.constants)
-    return times(motion, plant.substeps), normals(NORMALS)
-
-
 @cache
 def _floor_functions() -> tuple[Callable, Callable]:
     fingerprint = function_fingerprint(within=__name__)
@@ -143,20 +131,18 @@ def trajectory_rows(seed: int, quick: bool) -> Iterator[Row]:
     scenario = find_scenario("nominal")
     count = TRAJECTORIES // 4 if quick else TRAJECTORIES
     data, steps = scenario.data(training_seeds(seed, count)), count * scenario.steps
-    for name, goal in ALONE:
+    for name in ALONE:
         filter_ = oracle_choice(name, scenario).filter(scenario)
         measure = shared(partial(estimates, filter_, data), steps)
         timing = alone(measure, 5 if quick else 40)
-        limit = arithmetic_limit(step_of_filter(filter_), cores=cores())
-        yield Row(f"{name.upper()} batch, a step", None, timing, limit=limit, limit_goal=goal)
+        yield Row(f"{name.upper()} batch, a step", None, timing)
 
     filter_ = oracle_choice("enkf", scenario).with_size(TRAJECTORY_SIZE).filter(scenario)
     ours = shared(partial(estimates, filter_, data), steps * TRAJECTORY_SIZE)
     rounds, what = 2 if quick else 10, f"EnKF batch, N = {TRAJECTORY_SIZE}"
-    limit = arithmetic_limit(times(step_of_filter(filter_), 1 / TRAJECTORY_SIZE), cores=cores())
-    yield Row(what, None, alone(ours, 5 * rounds), limit=limit, limit_goal=LIMIT_GOAL)
+    yield Row(what, None, alone(ours, 5 * rounds))
     if find_spec("jax") is None:
-        yield Row(what, "JAX is not installed", alone(ours, rounds), limit=limit)
+        yield Row(what, "JAX is not installed", alone(ours, rounds))
         return
     arrays = data.inputs[..., 0], data.measurements[..., 0]
     parts = gcd(cores(), count)
@@ -164,7 +150,7 @@ def trajectory_rows(seed: int, quick: bool) -> Iterator[Row]:
         estimate = partial(jax_filter(scenario.plant, TRAJECTORY_SIZE, seed, devices), *arrays)
         check_agreement(estimates(filter_, data), estimate()[0], data.states)
         peer = shared(estimate, steps * TRAJECTORY_SIZE)
-        yield Row(what, name, side_by_side(ours, peer, rounds, warm_up=False), ratio_goal=goal, limit=limit)
+        yield Row(what, name, side_by_side(ours, peer, rounds, warm_up=False), ratio_goal=goal)
 
 
 def estimates(filter_: Filter, data: Data) -> np.ndarray:

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from itertools import pairwise
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-import gymnasium as gym
 import numpy as np
 
-from benchmarks.rates import arithmetic_limit, step_of_env, step_of_filtered
-from benchmarks.timing import Measure, Row, alone, seconds_a_call, side_by_side
+from benchmarks.timing import Measure, Row, alone, side_by_side
 from tuning.policies.setup import TrainingConfiguration
 from tuning.problems.data import training_seeds
 from tuning.thruster.scenario import find_scenario
@@ -69,37 +66,6 @@ def _steps_of(model, settings: Callable[[], AbstractContextManager], rollouts: i
     return measure
 
 
-# What a step of learning needs of the processor at least: the products with the weights of its networks.
-
-
-def network_limit(setup: TrainingConfiguration) -> float:
-    """Seconds a step of PPO's products with its networks' weights, at torch's rate in one thread."""
-    from tuning.policies.environments import make_environments
-
-    envs, parameters = make_environments(setup, [0]), dict(setup.hyperparameters)
-    layers = [
-        envs.observation_space.shape[0],
-        *parameters["policy_kwargs"]["net_arch"],
-        envs.action_space.shape[0],
-    ]
-    weights = NETWORKS * sum(a * b for a, b in pairwise(layers))
-    rate = seconds_a_product(parameters["batch_size"], max(layers))
-    return weights * (1 + PASSES * parameters["n_epochs"]) * rate
-
-
-def seconds_a_product(rows: int, width: int) -> float:
-    """Seconds of one multiplication and addition in a product (rows, width) (width, width) of float32."""
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        multiply = seconds_a_call(torch.mm, 50 * [(torch.ones(rows, width), torch.ones(width, width))])
-        return alone(multiply, 100).ours / (rows * width * width)
-    finally:
-        torch.set_num_threads(threads)
-
-
 def rows(seed: int, quick: bool) -> Iterator[Row]:
     """Measure, one row after the other."""
     rounds, rollouts = (1, 1) if quick else (9, 2)
@@ -107,21 +73,17 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     ours, one_by_one = (training(setup, native, rollouts) for native in (True, False))
     peer = by_hand(setup, rollouts)
     timing = side_by_side(ours, peer, rounds)
-    env, limit = gym.make("filters:BowThruster-EKF-v0"), network_limit(setup)
     yield Row(
         f"a step of PPO on an EKF, {COPIES} copies",
         "Stable-Baselines3, DummyVecEnv",
         timing,
         ratio_goal=GOAL,
-        limit=limit,
     )
     timing = side_by_side(ours, one_by_one, rounds)
-    yield Row("the same, all but the VecEnv equal", "DummyVecEnv", timing, limit=limit)
+    yield Row("the same, all but the VecEnv equal", "DummyVecEnv", timing)
     stepping = side_by_side(*(acting(seed, "ekf", native) for native in (True, False)), rounds)
-    limit = arithmetic_limit(step_of_filtered(env))
-    yield Row("of it env and EKF", "DummyVecEnv", stepping, ratio_goal=ACTING_GOAL, limit=limit)
-    limit = arithmetic_limit(step_of_env(env))
-    yield Row("of it env alone", None, alone(acting(seed, "raw", True), rounds), limit=limit)
+    yield Row("of it env and EKF", "DummyVecEnv", stepping, ratio_goal=ACTING_GOAL)
+    yield Row("of it env alone", None, alone(acting(seed, "raw", True), rounds))
 
 
 def acting(seed: int, observe: str, native: bool, steps: int = 200) -> Measure:

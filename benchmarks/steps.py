@@ -12,16 +12,15 @@ from time import perf_counter
 import gymnasium as gym
 import numpy as np
 
-import thruster_env  # noqa: F401 - registers BowThruster-v0  # noqa: F401 - registers BowThruster-v0
+import thruster_env  # noqa: F401 - registers BowThruster-v0
 from benchmarks.peers import EnsembleStep, KalmanStep, UnscentedStep, compiled_model, python_model
-from benchmarks.rates import arithmetic_limit, operations_of, step_of_env, step_of_filtered
 from benchmarks.timing import Measure, Row, alone, seconds_a_call, side_by_side
 from filters.wrappers.envs import EstimateState
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.memory import WIDTH
 from thruster_env.core.sources import written_out
 from thruster_env.core.streams import ACTION_SPACE, derived_seed
-from thruster_env.core.threads import cores, spread
+from thruster_env.core.threads import spread
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.dynamics import Constants, substep
 from thruster_env.thruster.model import thruster_model
@@ -32,7 +31,6 @@ HORIZON, HORIZON_GOAL = 10, 1 / 10
 PEER_STEPS = 100  # of FilterPy's slow filters in a round; their time a step does not depend on their number
 COPIES, STEPS = 8192, 200
 PROPAGATED = 65536
-LIMIT_GOAL = 1.8
 FILTERED_COPIES, FILTERED_STEPS = 1024, 100
 
 
@@ -44,8 +42,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
 
     ours, peer = episode(gym.make("BowThruster-v0"), seed), episode(gym.make("Pendulum-v1"), seed)
     timing = side_by_side(ours, peer, 20 if quick else 600)
-    limit = arithmetic_limit(step_of_env(gym.make("BowThruster-v0")))
-    yield Row("env step", "Pendulum-v1", timing, ratio_goal=0.29, limit=limit)
+    yield Row("env step", "Pendulum-v1", timing, ratio_goal=0.29)
 
     for model, peer_name, goal in (
         (python_model, "FilterPy", 1 / 40),
@@ -54,8 +51,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
         wrapped = EstimateState(gym.make("BowThruster-v0"), filter="enkf", ensemble_size=ENSEMBLE_SIZE)
         peer = peer_ensemble(plant, model, voltages, measurements, seed)
         timing = side_by_side(episode(wrapped, seed), peer, 4 if quick else 60)
-        limit = arithmetic_limit(step_of_filtered(wrapped))
-        yield Row(f"EnKF step, N = {ENSEMBLE_SIZE}", peer_name, timing, ratio_goal=goal, limit=limit)
+        yield Row(f"EnKF step, N = {ENSEMBLE_SIZE}", peer_name, timing, ratio_goal=goal)
 
     for name in ("kf", "ekf"):
         wrapped = EstimateState(gym.make("BowThruster-v0"), filter=name)
@@ -63,8 +59,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
         inputs = np.column_stack([voltages, np.ones_like(voltages)])
         peer = seconds_a_call(step, zip(inputs, measurements, strict=True), step.reset)
         timing = side_by_side(episode(wrapped, seed), peer, 10 if quick else 200)
-        limit = arithmetic_limit(step_of_filtered(wrapped))
-        yield Row(f"{name.upper()} step", "FilterPy's KF", timing, ratio_goal=0.31, limit=limit)
+        yield Row(f"{name.upper()} step", "FilterPy's KF", timing, ratio_goal=0.31)
 
     wrapped = EstimateState(gym.make("BowThruster-v0"), filter="ukf")
     points = wrapped.filter.alpha, wrapped.filter.beta, wrapped.filter.kappa
@@ -72,8 +67,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     recorded = zip(voltages[:PEER_STEPS].tolist(), measurements[:PEER_STEPS], strict=True)
     peer = seconds_a_call(step, recorded, step.reset)
     timing = side_by_side(episode(wrapped, seed), peer, 10 if quick else 100)
-    limit = arithmetic_limit(step_of_filtered(wrapped))
-    yield Row("UKF step", "FilterPy's UKF", timing, ratio_goal=1 / 10, limit=limit)
+    yield Row("UKF step", "FilterPy's UKF", timing, ratio_goal=1 / 10)
 
 
 def recorded_episode(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -170,12 +164,10 @@ def vector_rows(seed: int, quick: bool) -> Iterator[Row]:
     rounds = 5 if quick else 40
     ours, peer = vector_steps("BowThruster-v0", seed), vector_steps("CartPole-v1", seed)
     timing = side_by_side(ours, peer, rounds)
-    limit = arithmetic_limit(step_of_env(gym.make("BowThruster-v0")), cores=cores())
-    yield Row(f"vector env, {COPIES} copies", "CartPole-v1", timing, ratio_goal=0.4, limit=limit)
+    yield Row(f"vector env, {COPIES} copies", "CartPole-v1", timing, ratio_goal=0.4)
 
-    count = operations_of(substep, np.zeros(2), (12.0, 0.0), make_plant().constants)
-    limit, timing = arithmetic_limit(count, cores=cores()), alone(propagation(), rounds)
-    yield Row(f"Runge-Kutta step, {PROPAGATED} copies", None, timing, limit=limit, limit_goal=LIMIT_GOAL)
+    timing = alone(propagation(), rounds)
+    yield Row(f"Runge-Kutta step, {PROPAGATED} copies", None, timing)
 
 
 def memory_line() -> str:
@@ -242,11 +234,10 @@ def _propagate() -> Callable:
 def vector_filter_rows(seed: int, quick: bool) -> Iterator[Row]:
     """Measure, one row after the other."""
     sized = {"filter_arguments": {"ensemble_size": ENSEMBLE_SIZE}}
-    for what, name, arguments, goal in (
-        ("EKF", "filters:BowThruster-EKF-v0", {}, 16),
-        (f"EnKF, N = {ENSEMBLE_SIZE},", "filters:BowThruster-EnKF-v0", sized, 2.9),
+    for what, name, arguments in (
+        ("EKF", "filters:BowThruster-EKF-v0", {}),
+        (f"EnKF, N = {ENSEMBLE_SIZE},", "filters:BowThruster-EnKF-v0", sized),
     ):
         measure = vector_steps(name, seed, FILTERED_COPIES, FILTERED_STEPS, **arguments)
         timing = alone(measure, 5 if quick else 40)
-        limit = arithmetic_limit(step_of_filtered(gym.make(name, **arguments)), cores=cores())
-        yield Row(f"{what} on {FILTERED_COPIES} copies", None, timing, limit=limit, limit_goal=goal)
+        yield Row(f"{what} on {FILTERED_COPIES} copies", None, timing)

@@ -15,11 +15,8 @@ from unittest import mock
 import numpy as np
 
 from benchmarks.peers import EnsembleStep, python_model
-from benchmarks.rates import arithmetic_limit, step_by_size, times
 from benchmarks.timing import Row, Timing
 from filters.engine.batch import run
-from filters.filter import Filter
-from thruster_env.core.threads import cores
 from tuning.evaluation import sizes
 from tuning.experiments.lorenz96 import STEPS, problem
 from tuning.likelihood import family
@@ -27,7 +24,6 @@ from tuning.problems import data as in_parts
 from tuning.search import parameters, trials
 from tuning.search import plan as plans
 from tuning.search.plan import TRAINING_SEEDS, Plan
-from tuning.search.space import oracle_choice
 from tuning.search.storage import quiet_optuna
 from tuning.search.study import StudyResult, open_study, run_study
 from tuning.thruster.scenario import Scenario, find_scenario
@@ -55,7 +51,6 @@ print(status["VmHWM"].split()[0])
 """
 INTERPRETER = "DAPPER_PYTHON"
 LORENZ_TRIALS, SEEDS, LARGEST = 100, 8, 60
-FEW = 2, 4  # members that are counted: each has forty states, and takes a second
 PEER_SIZES = (10, 35, 60)  # its time a run is a line over N
 LORENZ_GOAL = 1 / 20
 
@@ -67,17 +62,17 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     _study(plan, min(WARM_UP, count))  # compiles
     total, in_filters, result = _timed(plan, count)
     what = f"study, {count} trials of an EnKF"
-    peer, limit = filterpy_seconds(plan.scenarios[0], result), filters_limit(plan.scenarios[0], result)
+    peer = filterpy_seconds(plan.scenarios[0], result)
     timing = Timing(total, peer, total / peer)
-    yield Row(what, "FilterPy's runs, extrapolated", timing, ratio_goal=RUNS_GOAL, limit=limit)
+    yield Row(what, "FilterPy's runs, extrapolated", timing, ratio_goal=RUNS_GOAL)
     rest = total - in_filters
     timing = Timing(rest, total, rest / total)
     yield Row("of it outside filters and scores", "the whole", timing, ratio_goal=OUTSIDE_GOAL)
     total, _, result = _timed(plan._replace(prune=False), count)
-    peer, limit = filterpy_seconds(plan.scenarios[0], result), filters_limit(plan.scenarios[0], result)
+    peer = filterpy_seconds(plan.scenarios[0], result)
     timing = Timing(total, peer, total / peer)
     what = "all seeds in every trial"
-    yield Row(what, "FilterPy's runs, extrapolated", timing, ratio_goal=STUDY_GOAL, limit=limit)
+    yield Row(what, "FilterPy's runs, extrapolated", timing, ratio_goal=STUDY_GOAL)
 
 
 def _trials(quick: bool) -> int:
@@ -148,14 +143,6 @@ def filterpy_seconds(scenario: Scenario, result: StudyResult) -> float:
     return sum(seeds * scenario.steps * (fixed + slope * size) for seeds, size in _runs(result))
 
 
-def filters_limit(scenario: Scenario, result: StudyResult) -> float:
-    """Seconds of the same runs on the arithmetic limit of all cores."""
-    fixed, a_member = step_by_size(oracle_choice("enkf", scenario).filter(scenario))
-    runs = [(seeds * scenario.steps, size) for seeds, size in _runs(result)]
-    members = times(a_member, sum(steps * size for steps, size in runs))
-    return arithmetic_limit(times(fixed, sum(steps for steps, _ in runs)) + members, cores=cores())
-
-
 def _runs(result: StudyResult) -> list[tuple[int, int]]:
     """Seeds and members of each trial, then of each size among which the study chose: training and fresh seeds."""
     tried = [(len(trial.intermediate_values) or TRAINING_SEEDS, trial.params["N"]) for trial in result.trials]
@@ -191,29 +178,24 @@ print(json.dumps(seconds[1:]))
 def assimilation_rows(seed: int, quick: bool) -> Iterator[Row]:
     """The study, and what DAPPER would take for its runs."""
     count, seeds = (3, 2) if quick else (LORENZ_TRIALS, SEEDS)
-    ours, sizes, filter_ = study_seconds(seed, count, seeds)
-    limit = lorenz_limit(filter_, sizes)
+    ours, sizes = study_seconds(seed, count, seeds)
     what = f"study on Lorenz-96, {count} trials of an EnKF"
     if os.environ.get(INTERPRETER):
         peer = float(np.polyval(peer_line(100 if quick else STEPS), sizes).sum())
-        yield Row(
-            what, "DAPPER, extrapolated", Timing(ours, peer, ours / peer), ratio_goal=LORENZ_GOAL, limit=limit
-        )
+        yield Row(what, "DAPPER, extrapolated", Timing(ours, peer, ours / peer), ratio_goal=LORENZ_GOAL)
     else:
-        yield Row(what, f"no DAPPER, {INTERPRETER} not set", Timing(ours, None, None), limit=limit)
+        yield Row(what, f"no DAPPER, {INTERPRETER} not set", Timing(ours, None, None))
 
 
-def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int], Filter]:
-    """Seconds of a study of so many trials on so many seeds, without pruning; the N of its runs; one filter."""
+def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int]]:
+    """Seconds of a study of so many trials on so many seeds, without pruning, and the N of its runs."""
     quiet_optuna()
     few = mock.patch.multiple(plans, TRAINING_SEEDS=seeds, SIZE_SEEDS=seeds)
     limits = mock.patch.object(parameters, "KALMAN_SIZES", parameters.Sizes(30, 5, LARGEST))
     sizes: list[int] = []
-    filters: list[Filter] = []
 
     def counting(filter_, keys, *data, **noise):
         sizes.extend([filter_.size] * len(keys))
-        filters.append(filter_)
         return run(filter_, keys, *data, **noise)
 
     with few, limits, mock.patch.object(in_parts, "run", counting):
@@ -222,14 +204,7 @@ def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int], 
         plan.training_data()  # drawing the truth is no part of the study, nor of the peer's runs
         begin = perf_counter()
         run_study(study, plan, count)
-        return perf_counter() - begin, sizes, filters[0]
-
-
-def lorenz_limit(filter_: Filter, sizes: list[int]) -> float:
-    """Seconds of runs of a filter with so many members on the arithmetic limit of all cores."""
-    fixed, a_member = step_by_size(filter_, FEW)
-    a_step = times(fixed, len(sizes)) + times(a_member, sum(sizes))
-    return STEPS * arithmetic_limit(a_step, cores=cores())
+        return perf_counter() - begin, sizes
 
 
 def peer_line(steps: int) -> np.ndarray:

@@ -15,16 +15,15 @@ from statistics import median
 from time import perf_counter
 from typing import NamedTuple
 
-from benchmarks.rates import vector_bits
 from thruster_env.core.checks import short_repr
 from thruster_env.core.files import write_whole
 from thruster_env.core.text_tables import markdown_table, with_tables
 
 Measure = Callable[[], float]
 """Does one round of work and returns the seconds that a unit of it (a step, say) took."""
-COLUMNS = ["what; peer", "ours", "peer", "ratio", "limit", "x limit", "goal", "met?"]
+COLUMNS = ["what; peer", "ours", "peer", "ratio", "goal", "met?"]
 PACKAGES = ("numba", "gymnasium", "numpy", "filterpy", "jax", "casadi", "do_mpc", "stable_baselines3", "torch")
-HEADER = ("what", "beside", "ours", "theirs", "ratio", "limit", "x limit", "goal", "met")
+HEADER = ("what", "beside", "ours", "theirs", "ratio", "goal", "met")
 NO_BREAK = "\N{NO-BREAK SPACE}"  # between a number and its unit
 MARK, END = "<!-- table speed: ", "<!-- end -->"
 
@@ -91,39 +90,18 @@ def seconds_a_call(function: Callable, arguments: Iterable[tuple], prepare: Call
 
 
 class Row(NamedTuple):
-    """A timing, what it would be on the machine's arithmetic limit, and the most that it may be of something.
-
-    A goal is one of the ratio to the peer, of the multiple of the limit, or of the time, where that was asked for.
-    """
+    """A timing and the most that its ratio to the peer, or its time, may be."""
 
     what: str
     peer_name: str | None
     timing: Timing
     ratio_goal: float | None = None
-    limit: float | None = None  # [s]
-    limit_goal: float | None = None  # of `of_limit`
     time_goal: float | None = None  # [s]
-
-    @property
-    def of_limit(self) -> float | None:
-        """Our time as a multiple of the limit."""
-        return None if self.limit is None else self.timing.ours / self.limit
-
-    @property
-    def limits(self) -> str:
-        """The multiple of the limit as text; a time below the limit is flagged, as the limit is then wrong."""
-        if self.of_limit is None:
-            return "-"
-        return rounded(self.of_limit, 2) + (" passed" if self.of_limit < 1 else "")
 
     @property
     def met(self) -> bool | None:
         """Whether the goal is met; None without a goal."""
-        for value, goal in (
-            (self.timing.ratio, self.ratio_goal),
-            (self.of_limit, self.limit_goal),
-            (self.timing.ours, self.time_goal),
-        ):
+        for value, goal in ((self.timing.ratio, self.ratio_goal), (self.timing.ours, self.time_goal)):
             if goal is not None:
                 return value <= goal
         return None
@@ -133,8 +111,6 @@ class Row(NamedTuple):
         """The goal as text."""
         if self.ratio_goal is not None:
             return f"{self.ratio_goal:.2g}"
-        if self.limit_goal is not None:
-            return f"{self.limit_goal:g} x"
         return "-" if self.time_goal is None else readable(self.time_goal)
 
     def cells(self) -> list[str]:
@@ -144,8 +120,6 @@ class Row(NamedTuple):
             readable(self.timing.ours),
             "-" if self.timing.peer is None else readable(self.timing.peer),
             "-" if self.timing.ratio is None else rounded(self.timing.ratio),
-            "-" if self.limit is None else readable(self.limit),
-            self.limits,
             self.goal,
             {True: "yes", False: "no", None: "-"}[self.met],
         ]
@@ -158,10 +132,7 @@ class Row(NamedTuple):
             "ours_seconds": self.timing.ours,
             "peer_seconds": self.timing.peer,
             "ratio": self.timing.ratio,
-            "limit_seconds": self.limit,
-            "of_limit": self.of_limit,
             "ratio_goal": self.ratio_goal,
-            "limit_goal": self.limit_goal,
             "time_goal_seconds": self.time_goal,
             "met": self.met,
         }
@@ -190,7 +161,6 @@ def machine() -> dict[str, str | int | bool]:
         "system": f"{platform.system()} {platform.machine()}",
         "architecture": binding.get_host_cpu_name(),
         "avx512": binding.get_host_cpu_features().get("avx512f", False),
-        "vector_bits": vector_bits(),
         "python": platform.python_version(),
         **{package: version(package) for package in PACKAGES if find_spec(package)},
     }
@@ -214,9 +184,8 @@ def machine_lines(facts: dict) -> list[str]:
     """The machine in two lines of text."""
     packages = ", ".join(f"{name} {facts[name]}" for name in PACKAGES if name in facts)
     avx512 = " with AVX-512" if facts["avx512"] else ""
-    vectors = f"{facts['architecture']}{avx512}, compiled to vectors of {facts['vector_bits']} bits"
     return [
-        f"Machine: {machine_name(facts)}, {facts['system']}; {vectors}.",
+        f"Machine: {machine_name(facts)}, {facts['system']}; {facts['architecture']}{avx512}.",
         f"Python {facts['python']}, {packages}.",
     ]
 

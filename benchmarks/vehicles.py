@@ -7,11 +7,9 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from time import perf_counter
 
-import gymnasium as gym
 import numpy as np
 
 from benchmarks.batches import shared
-from benchmarks.rates import arithmetic_limit, operations_of, step_of_filter, step_of_filtered, times
 from benchmarks.steps import vector_steps
 from benchmarks.timing import Measure, Row, alone, side_by_side
 from filters import make_filter, run
@@ -21,14 +19,12 @@ from thruster_env.auv.forces import Constants
 from thruster_env.auv.plant import make_plant
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import tuple_of, written_out
-from thruster_env.core.threads import cores
 from tuning.auv.scenario import Scenario, find_scenario
 from tuning.problems.data import training_seeds
 
 MEMBERS, STEPS = 256, 200
 COPIES, VECTOR_STEPS = 1024, 50
 PAPER_SIZE, PAPER_SECONDS = 300, 25.0
-EKF_GOAL, PAPER_GOAL = 34, 2.3  # of the limit
 CRUISE = (2.845, -0.01707, 0.0, 0.0)  # propeller's force [N] and torque [N m], both rudders [rad]
 N = 8  # states of the model "motion"
 PAIRS = 8  # of a sine and a cosine in a Runge-Kutta step: four rates of roll and pitch
@@ -47,24 +43,19 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     """Measure, one row after the other."""
     step, sines = member_steps(), library_sines()
     timing = side_by_side(step, sines, 20 if quick else 200)  # milliseconds each
-    limit = arithmetic_limit(operations_of(motion_substep, np.full(N, 0.1), CRUISE, make_plant().constants))
     what = f"vehicle, {N} states: member's step"
-    yield Row(what, "library sines alone", timing, ratio_goal=0.27, limit=limit)
+    yield Row(what, "library sines alone", timing, ratio_goal=0.27)
 
     sensors = {"sensors": "motion"}
     filtered = vector_steps("filters:SegorogeniAUV-EKF-v0", seed, COPIES, VECTOR_STEPS, **sensors)
     bare = vector_steps("SegorogeniAUV-v0", seed, COPIES, VECTOR_STEPS, **sensors)
     timing = side_by_side(filtered, bare, 3 if quick else 20)
-    env = gym.make("filters:SegorogeniAUV-EKF-v0", **sensors)
-    limit = arithmetic_limit(step_of_filtered(env), cores=cores())
     what = f"EKF of {N} states on {COPIES} vehicles"
-    yield Row(what, "vehicles alone", timing, limit=limit, limit_goal=EKF_GOAL)
+    yield Row(what, "vehicles alone", timing)
 
-    filter_, scenario = papers_filter()
     timing = alone(papers_ensemble(seed), 1 if quick else 5, warm_up=False)
-    limit = arithmetic_limit(times(step_of_filter(filter_), scenario.steps))
     what = f"EnKF, {N} states, N = {PAPER_SIZE}, 25 s at 1 kHz"
-    yield Row(what, None, timing, limit=limit, limit_goal=PAPER_GOAL)
+    yield Row(what, None, timing)
 
 
 def member_steps() -> Measure:

@@ -4,7 +4,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import benchmarks.rates as rates_module
 from benchmarks.__main__ import PARTS, command, rows_of
 from benchmarks.batches import NORMALS, array_filter
 from benchmarks.timing import HEADER, NO_BREAK, Row, Timing, check_page, write_page
@@ -21,21 +20,18 @@ def test_each_part_of_the_benchmark_can_be_measured_quickly():
     for part in PARTS:
         assert list(inspect.signature(rows_of(part)).parameters) == ["seed", "quick"]
     row = next(rows_of("steps")(0, True))
-    assert row.timing.ours > 0 and row.as_json()["limit_seconds"] > 0
+    assert row.timing.ours > 0
 
 
 @pytest.mark.slow
-def test_the_quick_benchmark_measures_the_rows_of_parts(monkeypatch):
+def test_the_quick_benchmark_measures_the_rows_of_parts():
     """Of those with other packages, machine code of C, and a study; all take three minutes."""
     pytest.importorskip("filterpy")
-    monkeypatch.setattr(rates_module, "ROUNDS", 1)
-    monkeypatch.setattr("benchmarks.__main__.measure_again", lambda: None)  # 8 s each time
     found = command(quick=True, part=["steps", "trajectories", "studies", "c_code"]).data
     rows = found["rows"]
+    assert not found["failed"]
     assert len(rows) >= 12
     assert all(row["ours_seconds"] > 0 for row in rows)
-    limits = [row["limit_seconds"] for row in rows if row["limit_seconds"] is not None]
-    assert len(limits) >= 10 and all(limit > 0 for limit in limits)
     assert {"FilterPy", "FilterPy's UKF", "FilterPy's KF"} < {row["peer"] for row in rows}
     assert found["study_resident_megabytes"] is None or 50 < found["study_resident_megabytes"] < 500
     (outside,) = [row["ratio"] for row in rows if "outside filters" in row["what"]]
@@ -74,53 +70,25 @@ def test_the_filter_written_for_jax_is_ours_given_our_random_numbers(process_noi
     ("row", "shown"),
     [
         (
-            Row("a", "b", Timing(1234.5, 4938.0, 0.25), ratio_goal=1 / 3, limit=10.0),
-            ["a; b", "1234 s", "4938 s", "0.25", "10 s", "123", "0.33", "yes"],
-        ),
-        (
-            Row("a", None, Timing(2.5e-9, None, None), limit=1e-9, limit_goal=2),
-            ["a", "2.5 ns", "-", "-", "1 ns", "2.5", "2 x", "no"],
-        ),
-        (
-            Row("a", None, Timing(6.3e-10, None, None), limit=1e-9, limit_goal=2),
-            ["a", "0.63 ns", "-", "-", "1 ns", "0.63 passed", "2 x", "yes"],
+            Row("a", "b", Timing(1234.5, 4938.0, 0.25), ratio_goal=1 / 3),
+            ["a; b", "1234 s", "4938 s", "0.25", "0.33", "yes"],
         ),
         (
             Row("a", "b", Timing(0.5, 0.1, 5.0), time_goal=0.6),
-            ["a; b", "500 ms", "100 ms", "5", "-", "-", "600 ms", "yes"],
+            ["a; b", "500 ms", "100 ms", "5", "600 ms", "yes"],
         ),
-        (Row("a", "b is not installed", Timing(0.5, None, None)), ["a; b is not installed", "500 ms", *"------"]),
+        (Row("a", "b is not installed", Timing(0.5, None, None)), ["a; b is not installed", "500 ms", *"----"]),
     ],
 )
 def test_a_row_says_whether_its_goal_is_met(row, shown):
     assert row.cells() == shown
 
 
-def test_the_best_of_several_measurements_of_the_machine_counts(monkeypatch):
-    """The second measurement is disturbed, the third is not: the limit only falls."""
-    seconds = iter([3.0, 5.0, 2.0])
-    monkeypatch.setattr(rates_module, "LOOPS", {"add": ["a loop"]})
-    monkeypatch.setattr(rates_module, "all_cores", lambda: 1)
-    monkeypatch.setattr(rates_module, "_seconds", lambda loop, cores: next(seconds))
-    rates_module.rates.cache_clear()
-    try:
-        found = [dict(rates_module.rates(1))]
-        for _ in range(2):
-            rates_module.measure_again()
-            found.append(dict(rates_module.rates(1)))
-    finally:
-        rates_module.rates.cache_clear()
-    assert found == [{"add": 3.0}, {"add": 3.0}, {"add": 2.0}]
-
-
 FACTS = {
     **{"cpu": "a processor", "cores": 2, "system": "Linux", "architecture": "znver9", "avx512": True},
-    **{"vector_bits": 256, "python": "3.11.7", "numba": "0.68.1"},
+    **{"python": "3.11.7", "numba": "0.68.1"},
 }
-MACHINE = (
-    "Machine: a processor, 2 cores, Linux; znver9 with AVX-512, compiled to vectors of 256 bits. "
-    "Python 3.11.7, numba 0.68.1."
-)
+MACHINE = "Machine: a processor, 2 cores, Linux; znver9 with AVX-512. Python 3.11.7, numba 0.68.1."
 
 
 def test_each_machine_has_its_table_on_the_page_on_speed(tmp_path):
@@ -130,7 +98,7 @@ def test_each_machine_has_its_table_on_the_page_on_speed(tmp_path):
     check_page(page)
     rows = [
         Row("a step", "b", Timing(1e-6, 4e-6, 0.25), ratio_goal=1 / 3),
-        Row("c", None, Timing(2e-9, None, None), limit=1e-9),
+        Row("c", None, Timing(2e-9, None, None)),
     ]
     write_page(page, rows, FACTS, ["Memory: 8 bytes."])
     first = page.read_text()
@@ -138,8 +106,8 @@ def test_each_machine_has_its_table_on_the_page_on_speed(tmp_path):
     second = page.read_text()
     a, b, c = (
         "## On a processor, 2 cores",
-        f"| a step | b | 1{NO_BREAK}us | 4{NO_BREAK}us | 0.25 | | | 0.33 | yes |",
-        f"| c | | 2{NO_BREAK}ns | | | 1{NO_BREAK}ns | 2 | | |",
+        f"| a step | b | 1{NO_BREAK}us | 4{NO_BREAK}us | 0.25 | 0.33 | yes |",
+        f"| c | | 2{NO_BREAK}ns | | | | |",
     )
     header = "| " + " | ".join(HEADER) + " |"
     assert header in before and {a, header, b, c, f"{MACHINE} Memory: 8 bytes."} <= {*first.splitlines()}
