@@ -28,7 +28,7 @@ extensions = [
     "docs._ext.equations",
     "docs._ext.generated",
 ]
-exclude_patterns = ["_static", "tutorials/*.ipynb", "tutorials/*.py", "tutorials/*.zip"]
+exclude_patterns = ["_static", "paper", "tutorials/*.ipynb", "tutorials/*.py", "tutorials/*.zip"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 4
 # Equations and terminal output stand in blocks without a language.

@@ -13,7 +13,7 @@ from filters.registry import FILTERS
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
-PAGES = [path for path in DOCS.rglob("*.md") if "tutorials" not in path.parts]
+PAGES = [path for path in DOCS.rglob("*.md") if not {"tutorials", "paper"} & {*path.parts}]
 REFERENCE = "\n".join(path.read_text() for path in sorted((DOCS / "reference").glob("*.md")))
 EQUATIONS = {
     "x_{k+1} = f(x_k, u_k) + w,  w ~ N(0, Q)": (r"x_{k+1} = f(x_{k}, u_{k}) + w,\quad w \sim  \mathcal{N}(0, Q)"),
