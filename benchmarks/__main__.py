@@ -78,7 +78,7 @@ def command(
     measures = {name: rows_of(name) for name in parts}
     from benchmarks import steps, studies
 
-    rows, failed = [], []
+    rows, failed, resident = [], [], None
     with progress_console.status("measuring ...") as status:
         for name, rows_of_part in measures.items():
             try:
@@ -87,11 +87,12 @@ def command(
                     status.update(f"measured: {row.what} ...")
             except Exception as error:  # the rows of other parts took minutes
                 failed.append(f"{name}: {error!r}")
-        status.update("memory of the study ...")
-        resident = studies.resident_memory(seed, quick)
+        if "studies" in parts:
+            status.update("memory of the study ...")
+            resident = studies.resident_memory(seed, quick)
     facts = machine()
     speeds = Table("Speed, side by side", COLUMNS, [row.cells() for row in rows], caption=CAPTION)
-    memory = [steps.memory_line(), studies.memory_line(resident)]
+    memory = [steps.memory_line(), *([studies.memory_line(resident)] if "studies" in parts else [])]
     if page is not None and not failed:
         write_page(page, rows, facts, memory)
     data = {

@@ -25,17 +25,14 @@ def test_each_part_of_the_benchmark_can_be_measured_quickly():
 
 @pytest.mark.slow
 def test_the_quick_benchmark_measures_the_rows_of_parts():
-    """Of those with other packages, machine code of C, and a study; all take three minutes."""
+    """Of those with other packages and machine code of C; a study takes minutes."""
     pytest.importorskip("filterpy")
-    found = command(quick=True, part=["steps", "trajectories", "studies", "c_code"]).data
+    found = command(quick=True, part=["steps", "trajectories", "c_code"]).data
     rows = found["rows"]
     assert not found["failed"]
-    assert len(rows) >= 12
+    assert len(rows) >= 9
     assert all(row["ours_seconds"] > 0 for row in rows)
     assert {"FilterPy", "FilterPy's UKF", "FilterPy's KF"} < {row["peer"] for row in rows}
-    assert found["study_resident_megabytes"] is None or 50 < found["study_resident_megabytes"] < 500
-    (outside,) = [row["ratio"] for row in rows if "outside filters" in row["what"]]
-    assert 0 < outside < 1
     assert any(row["peer"] in ("JAX", "JAX is not installed") for row in rows)
 
 
