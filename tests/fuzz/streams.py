@@ -7,11 +7,7 @@ from __future__ import annotations
 
 import itertools
 import random
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -22,7 +18,6 @@ from filters.estimators.estimator import Estimator
 from filters.registry import make_filter
 from tests.fuzz.python_interface import _until
 from thruster_env.core.streams import SPAWN_KEYS, derived_generator, derived_seed
-from tuning.problems.digest import digest_of
 from tuning.problems.env_problem import EnvProblem
 
 STEPS, RUNS = 50, 20
@@ -189,56 +184,17 @@ class _Spoiling(Estimator):
         return self.mean
 
 
-LINES = {
-    "A = {0}": "a module's constant",
-    "def helped(x): return x + {0} * A": "a helper",
-    "class Base:\n    def base(self, x): return helped(x) * {0}": "a base",
-    "class Kind(Base):\n    limit = {0}\n    def __init__(self, g={0}): self.g = g\n"
-    "    @property\n    def own(self): return self.g * {0}\n"
-    "    @staticmethod\n    def still(x): return x * {0}\n"
-    "    @classmethod\n    def made(cls): return cls({0})\n"
-    "    def __call__(self, x): return self.base(x) + self.own + self.still(x) + self.limit": "a class",
-    "def around(k):\n    def inner(x): return x + k * {0}\n    return inner": "a closure",
-    "VALUE = Kind({0}), Kind.made, functools.partial(Kind(), {0}), around({0}), lambda x: x * {0}": "values",
-}
-
-
 def digests(rng: np.random.Generator, seconds: float) -> str:
-    """Code of random numbers: one number changed is another digest; other orders, processes and names are none."""
-    tried, count = 0, sum(line.count("{0}") for line in LINES)
-    for k in _until(seconds):
-        numbers = rng.integers(1, 1000, count).tolist()
-        changed = [*numbers]
-        changed[int(rng.integers(count))] += 1000
-        with tempfile.TemporaryDirectory() as folder:
-            texts = [_text(numbers), "# a comment\n\n" + _text(numbers), _text(changed)]
-            found = [_digest(folder, f"m{k}_{i}_{rng.integers(2**30)}", text) for i, text in enumerate(texts)]
-            assert found[0] == found[1] != found[2], f"{numbers} and {changed}: {found}"
-            if k % 8 == 0:  # a process of its own takes a second
-                path = Path(folder) / "run_as_a_script.py"
-                path.write_text(
-                    texts[0] + "\nfrom tuning.problems.digest import digest_of\nprint(digest_of(VALUE))\n"
-                )
-                done = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, check=True)
-                assert done.stdout.strip() == found[0], f"{numbers}: run {done.stdout}, imported {found[0]}"
+    """Envs of random numbers: one number changed is another digest; the same numbers are none, nor is rounding."""
+    tried = 0
+    for _ in _until(seconds):
+        numbers = rng.uniform(0.1, 0.9, 2)
+        changed, rounded = numbers.copy(), numbers * (1.0 + 1e-14)
+        changed[int(rng.integers(2))] *= 1.0 + 10.0 ** rng.uniform(-4.0, -1.0)
+        found = [_digest(*pair.tolist()) for pair in (numbers, numbers, rounded, changed)]
+        assert found[0] == found[1] == found[2] != found[3], f"{numbers} and {changed}: {found}"
         tried += 1
-    return f"digests: {tried} files, each change seen, and nothing else"
-
-
-def _text(numbers: list[int]) -> str:
-    left = iter(numbers)
-    lines = "\n".join(LINES).split("{0}")
-    return "import functools\n" + lines[0] + "".join(f"{next(left)}.0{rest}" for rest in lines[1:])
-
-
-def _digest(folder: str, name: str, text: str) -> str:
-    (Path(folder) / f"{name}.py").write_text(text)
-    sys.path.insert(0, folder)
-    try:
-        return digest_of(__import__(name).VALUE)
-    finally:
-        sys.path.remove(folder)
-        sys.modules.pop(name, None)
+    return f"digests: {tried} envs, each change noticed, and nothing else"
 
 
 def _digest(a: float, b: float) -> str:

@@ -43,6 +43,7 @@ from tuning.evaluation.held_out import (
     versions,
 )
 from tuning.problems.assumed import augmented, name_and_unknown, suited
+from tuning.problems.digest import is_older
 from tuning.problems.find import built_in, find_given, find_problem, scenario_of
 from tuning.problems.problem import Problem
 from tuning.search.objectives import NIS_BAND
@@ -165,6 +166,13 @@ def problem_in(content: Mapping, name, path: str | Path, problems: Sequence[Prob
     if same is not None:
         return same
     for problem in problems:
+        if problem.name == name and is_older(digest, problem.digest):
+            warnings.warn(
+                f"whether {name} is the problem that {path} was tuned on cannot be told from its digest, which is "
+                f"that of an older version; {path} was made with {made_with(content)}",
+                stacklevel=3,
+            )
+            return problem
         if problem.name == name:
             raise ValueError(
                 f"the problem of a tuned file must be the one it was tuned on, {name} of digest {digest}, but "

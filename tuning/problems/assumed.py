@@ -30,7 +30,7 @@ from thruster_env.core.modules import error_line
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.check import check_data
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step
-from tuning.problems.digest import digest_of
+from tuning.problems.digest import RUNS, digest_of, numbers_of
 from tuning.problems.problem import GIVEN, SPREAD, Parameter, Problem
 
 RANGE_SEEDS = range(8)  # seeds whose runs determine each state's range, unless the model has it
@@ -198,11 +198,26 @@ class AssumedProblem(Problem):
         """Sample time [s]."""
         return self._dt
 
-    @property
-    def assumptions(self) -> tuple:
-        """All arguments but those that the data come from, for the digest."""
+    @cached_property  # computed at first use, for it takes some runs
+    def digest(self) -> str:
+        """A hash of the problem's numbers; see `tuning.problems.digest`."""
+        ends = ({p.name: end} for p in self._parameters or () for end in (p.low, p.high))
+        models = [self.model(), *map(self._model_or_none, ends)]
+        numbers = numbers_of(models, self.data(tuple(self.range_seeds)[:RUNS]))
         of_runs = self.steps, self.first_scored_step, self._scale, self._dt
-        return self._assumed, self._parameters, self._untuned, self._true, *of_runs
+        return digest_of(self.origin, numbers, self._parameters, self._untuned, self._true, *of_runs)
+
+    @property
+    def origin(self) -> tuple:
+        """What the data come from, where that is plain data, for the digest."""
+        return ()
+
+    def _model_or_none(self, changes: Mapping[str, float]) -> StateSpaceModel | None:
+        """The model for some parameters; None where the user's function has none."""
+        try:
+            return self.model(**changes)
+        except ValueError:
+            return None
 
     @cached_property
     def _thumb(self) -> dict:

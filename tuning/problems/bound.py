@@ -15,7 +15,6 @@ from filters.bounds import gathering_code, posterior_variances, sequences_taken
 from thruster_env.core.files import write_whole
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
-from tuning.problems.digest import digest_of
 
 if TYPE_CHECKING:
     from thruster_env.graphs.loops import Loops
@@ -36,7 +35,7 @@ def average_bound(model: StateSpaceModel, data: Data, truths: int = 100) -> np.n
     """
     inputs = np.ascontiguousarray(data.seen.inputs, dtype=np.float64)
     code, sources = gathering_code(model)
-    parts = sources, digest_of(model, *model.functions), data.first_scored, truths, inputs.shape
+    parts = sources, model.digest, data.first_scored, truths, inputs.shape
     counted = b"" if data.counted is None else np.ascontiguousarray(data.counted).tobytes()
     follows_from = repr(parts).encode() + model.numbers.tobytes() + inputs.tobytes() + counted
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -30,16 +30,12 @@ from thruster_env.core.streams import (
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data
-from tuning.problems.digest import digest_of, env_identity
 from tuning.problems.excitation import Excitation, excitation_of
 from tuning.problems.model_problem import NamedArguments
 from tuning.problems.problem import Parameter
 
 # `Episodes`: the env of an `EnvProblem`, which offers the problem's model and shows what its data hold.
 
-
-if TYPE_CHECKING:
-    pass
 
 Policy = str | Mapping | Excitation | Callable
 RANDOM = "random"
@@ -196,7 +192,7 @@ class EnvProblem(AssumedProblem):
     repeated to find it.
 
     Args:
-        env: an env, whose attributes are those of its digest as it is now; its id; or a function that makes it.
+        env: an env; its id; or a function that makes it.
         policy: "random" for actions that are uniform over the action space; a function of the observation, or an
             object with `predict(observation)` as Stable-Baselines3 has it, which is asked to be deterministic
             (both are reset if they have `reset`, or `reset(seed)`); or an excitation, or a mapping with its name.
@@ -250,7 +246,6 @@ class EnvProblem(AssumedProblem):
             own_dt = getattr(instance.unwrapped, "dt", None)
             if dt is None and isinstance(own_dt, float):
                 dt = own_dt
-            identity = env_identity(self.env, instance)
         finally:
             self._close(instance)
         super().__init__(
@@ -274,16 +269,6 @@ class EnvProblem(AssumedProblem):
         self.noise_cov = None
         if measurement_noise_cov is not None:
             self.noise_cov = covariance("measurement_noise_cov", measurement_noise_cov, assumed.m)
-        drawn = (RANDOM, RANDOM_ACTIONS) if isinstance(self.policy, str) else self.policy
-        shown_by = self.state_of, self.measure, self.has_truth
-        noise = None if self.noise_cov is None else (self.noise_cov, ADDED_NOISE)
-        # Now, for policies and envs that are objects change while they run.
-        self._digest = digest_of(identity, self.env_arguments, drawn, (*shown_by, noise), self.assumptions)
-
-    @property
-    def digest(self) -> str:
-        """A hash of the env and its class, the policy, the model and all else that determines the data."""
-        return self._digest
 
     @property
     def untuned(self) -> dict:

@@ -21,7 +21,6 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
 from tuning.problems.data import Data, mask_of, only, padded
-from tuning.problems.digest import digest_of
 from tuning.problems.log_parts import Parts, check_apart, checked_logs, parts_of
 from tuning.problems.problem import Parameter
 
@@ -163,19 +162,12 @@ class LogProblem(AssumedProblem):
         if start == MEASUREMENT:
             self._first = _first_measured(self.data(self.parts.training).seen.measurements)
             self.model()  # an error on a start that nothing sees
-        digests, parts = tuple(log.digest for log in self.logs), self.parts
-        of_blocks = (
-            parts.blocks,
-            len(parts.training),
-            self._states is None,
-            *([start] if start == MEASUREMENT else []),
-        )
-        self._digest = digest_of(digests, *of_blocks, self.assumptions)  # before anything remembers a run
 
     @property
-    def digest(self) -> str:
-        """A hash of the logs' samples, their blocks and everything else that determines the data and the score."""
-        return self._digest
+    def origin(self) -> tuple:
+        """The logs by their samples, and their blocks."""
+        parts = self.parts.blocks, len(self.parts.training), self._states is None, self._start == MEASUREMENT
+        return tuple(log.digest for log in self.logs), *parts
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -25,7 +25,6 @@ from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
 from tuning.problems.bound import average_bound
 from tuning.problems.check import check_quantities
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step, estimates_in_parts
-from tuning.problems.digest import digest_of
 from tuning.problems.excitation import Excitation, excitation_of
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import BOUND, OPEN_LOOP, Parameter
@@ -102,7 +101,6 @@ class ModelProblem(AssumedProblem):
         if self._true is None and self._shared == list(range(model.n)) and model.n == truth.n:
             r = as_argument(truth.measurement_noise_cov)
             self._true = {"process_noise_cov": rows_argument(truth.process_noise_cov), "measurement_noise_cov": r}
-        self._digest = digest_of(self.truth, self.inputs, self.assumptions)  # before anything remembers a run
 
     def _shared_states(self, model: StateSpaceModel) -> list[int]:
         """Indices in the truth of the assumed model's first states."""
@@ -118,11 +116,6 @@ class ModelProblem(AssumedProblem):
         pair = model.states[: len(shared)], tuple(self.truth.states[i] for i in shared)
         check_quantities("states", *pair, "the assumed model", "the truth")
         return shared
-
-    @property
-    def digest(self) -> str:
-        """A hash of both models, the inputs and everything else that determines the data and the score."""
-        return self._digest
 
     def make(self, seeds: tuple[int, ...]) -> Data:
         """Truth and measurements under the inputs of each seed."""

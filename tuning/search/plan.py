@@ -18,12 +18,12 @@ from thruster_env.core.checks import positive, short_repr
 from thruster_env.core.modules import is_code
 from tuning.problems.assumed import may_estimate_constants
 from tuning.problems.check import checked_problem, data_of
-from tuning.problems.data import Data
+from tuning.problems.data import Data, estimates_on
 from tuning.problems.digest import digest_of
 from tuning.problems.problem import Argument, Parameter, Problem
 from tuning.search.forgetting import TOLERANCE, forgetting, raised_noise, reachable
 from tuning.search.objectives import COVARIANCE, LOG_SCORE, Objective, check_objectives, find_objective
-from tuning.search.parameters import MeasurementVariance, ProcessVariance, index_pairs
+from tuning.search.parameters import MeasurementVariance, ProcessVariance, filter_parameters, index_pairs
 from tuning.search.space import (
     AUTO,
     AUTO_FILTER_TYPES,
@@ -41,6 +41,7 @@ HELD_OUT_SEEDS = 200
 VALIDATION_SEEDS = 100  # on which the best trials meet the baselines
 SIZE_SEEDS = 100  # enough to distinguish an ensemble that is 1 % worse than the best, as N = 30 from N = 50
 MOST_OPTIONS = 3  # in a sentence
+FEW = 50  # steps, along which a user's estimator is identified
 WIDER = 1e4  # factor by which a range is widened, on the advice of a report
 NEAR_END = 0.01  # of a range, on its scale: what ends so near to an end has ended there
 
@@ -66,8 +67,8 @@ class Plan(NamedTuple):
 
     @property
     def identity(self) -> dict:
-        """What must be the same for a study to be continued, including the code of a user's own estimator."""
-        digests = {name: digest_of(filter_type(name).estimator) for name in self.filter_types if is_code(name)}
+        """What must be the same for a study to be continued, including the estimates of a user's own estimator."""
+        digests = {name: self._digest_of_code(name) for name in self.filter_types if is_code(name)}
         return {
             **({"estimators": digests} if digests else {}),
             **({"worst": True} if self.worst else {}),
@@ -88,6 +89,23 @@ class Plan(NamedTuple):
             "hold_r": self.hold_r,
             "optuna": optuna.__version__.split(".")[0],
         }
+
+    def _digest_of_code(self, name: str) -> str:
+        """A hash of an estimator's estimates as a run begins, at the defaults and ends of its parameters."""
+        problem = self.scenarios[0]
+        estimates: list[Any] = []
+        run = problem.data(tuple(problem.training_seeds(self.seed, 2))[:1]).seen
+        first = Data(run.seeds, run.inputs[:, :FEW], run.measurements[:, : FEW + 1], run.filter_keys)
+        free = filter_parameters(filter_type(name), process_noise=False)
+        choices = [untuned_choice(name, problem)] * 3
+        for parameter in free:
+            choices[1:] = parameter.set(choices[1], parameter.low), parameter.set(choices[2], parameter.high)
+        for choice in choices:
+            try:
+                estimates += estimates_on(choice.filter(problem), first)[:2]  # means and covariances
+            except ValueError as error:  # which a trial would raise, too
+                estimates.append(str(error))
+        return digest_of(*estimates)
 
     @property
     def filter_types(self) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from optuna.trial import FrozenTrial, TrialState
 from thruster_env.core.checks import tell
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.data import Data
+from tuning.problems.digest import is_older
 from tuning.search.among_types import (
     choose_type_by_race,
     enqueue_after,
@@ -184,6 +185,11 @@ def _check_identity(name: str, wanted: dict, stored: dict) -> None:
     if stored != wanted:
         differing = [key for key in {**wanted, **stored} if wanted.get(key) != stored.get(key)]
         wanted, stored = ({key: part.get(key) for key in differing} for part in (wanted, stored))
+        if is_older(stored, wanted):
+            raise ValueError(
+                f"a study must have this version's digests of problems, but {name!r} has those of an older one, "
+                "which tell nothing here: give it another name (--study NAME), or go on with that version"
+            )
         if differing == ["scenario_digests"]:  # its numbers would tell nobody anything
             raise ValueError(
                 f"a study must be for one model and its data, but {name!r} exists here for another model or other "

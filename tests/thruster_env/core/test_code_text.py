@@ -9,7 +9,6 @@ import pytest
 
 from thruster_env.core.compiled import function_fingerprint
 from thruster_env.core.user_functions import code_text
-from tuning.problems.digest import digest_of
 
 USERS = """
 import params
@@ -57,12 +56,6 @@ def test_another_number_in_another_file_is_another_code(monkeypatch, name):
     one, same, other = (getattr(users(monkeypatch, k), name) for k in (2.0, 2.0, 3.0))
     prints = [function_fingerprint(part, within="thruster_env.core") for part in (one, same, other)]
     assert prints[0] == prints[1] != prints[2]
-
-
-@pytest.mark.parametrize("name", ["direct", "attribute", "nested", "listed", "closed", "outer"])
-def test_so_is_the_digest_by_which_studies_tell_problems_apart(monkeypatch, name):
-    one, same, other = (digest_of(getattr(users(monkeypatch, k), name)) for k in (2.0, 2.0, 3.0))
-    assert one == same != other
 
 
 def test_objects_tell_nothing_for_their_addresses_differ(monkeypatch):
