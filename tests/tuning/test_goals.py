@@ -110,14 +110,14 @@ def test_a_goal_is_the_objective_of_the_filter_that_runs_and_its_gradient_that_o
     point = goal.coordinates.of(goal.untuned) + np.linspace(0.1, 0.3, len(goal.untuned))
     found = goal(point)
     value = level(goal, goal.choice_at(point), problems, data)
-    assert goal.level(found.values.sum()) == pytest.approx(value, rel=1e-9)
-    unit = found.values.sum() / value
+    assert goal.level(found.value) == pytest.approx(value, rel=1e-9)
+    unit = found.value / value
     slopes = []
     for step in 1e-4 * np.eye(len(point)):
         above, below = (level(goal, goal.choice_at(point + sign * step), problems, data) for sign in (1, -1))
         slopes.append(unit * (above - below) / 2e-4)
     tolerance = 1e-6 * np.abs(slopes).max()
-    np.testing.assert_allclose(found.gradients.sum(axis=0), slopes, rtol=1e-5, atol=tolerance)
+    np.testing.assert_allclose(found.gradient, slopes, rtol=1e-5, atol=tolerance)
 
 
 def test_the_numbers_of_a_model_are_found_together_whatever_they_move():
@@ -168,7 +168,7 @@ def test_problems_of_a_list_have_one_optimum():
     assert found.best.value < sum(one.best.value for one in alone) - 1.0
     goal = goal_of("ekf", both, data)
     best = goal.coordinates.of(found.best.parameters)
-    assert abs(goal(best).gradients.sum(axis=0)).max() < 1e-3 * abs(goal(best + 0.1).gradients.sum(axis=0)).max()
+    assert abs(goal(best).gradient).max() < 1e-3 * abs(goal(best + 0.1).gradient).max()
 
 
 def of_two_sensors(**assumed):

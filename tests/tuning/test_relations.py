@@ -45,9 +45,9 @@ def test_a_number_that_others_follow_has_the_sum_of_their_slopes(objective):
     free = goal_of("kf", problem, data, objective)
     assert tied.coordinates.names == ("Q11", "R11") and free.coordinates.names == ("Q11", "Q22", "R11", "R22")
     some, others = tied(np.log([0.07, 0.5])), free(np.log([0.07, 0.28, 0.5, 0.1]))
-    np.testing.assert_allclose(some.values, others.values, rtol=1e-12)
-    by_q1, by_q2, by_r1, _ = others.gradients.T
-    np.testing.assert_allclose(some.gradients.T, [by_q1 + by_q2, by_r1], rtol=1e-9)
+    np.testing.assert_allclose(some.part_values, others.part_values, rtol=1e-12)
+    by_q1, by_q2, by_r1, _ = others.scores.T
+    np.testing.assert_allclose(some.scores.T, [by_q1 + by_q2, by_r1], rtol=1e-9)
 
 
 def test_correlations_follow_too():
@@ -58,10 +58,8 @@ def test_correlations_follow_too():
     model = goal.choice_at(point).model
     assert model["measurement_noise_cov"][0][1] == pytest.approx(-0.15 * np.sqrt(0.4 * 0.1))
     step = 1e-5 * np.eye(5)
-    sides = [[goal(point + sign * one).values.sum() for one in step] for sign in (1, -1)]
-    np.testing.assert_allclose(
-        goal(point).gradients.sum(axis=0), (np.array(sides[0]) - sides[1]) / 2e-5, rtol=1e-6, atol=1e-5
-    )
+    sides = [[goal(point + sign * one).value for one in step] for sign in (1, -1)]
+    np.testing.assert_allclose(goal(point).gradient, (np.array(sides[0]) - sides[1]) / 2e-5, rtol=1e-6, atol=1e-5)
 
 
 def test_gradients_end_where_the_relation_is_true_of_the_plant():

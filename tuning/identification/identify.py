@@ -18,7 +18,7 @@ from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.streams import START_POINTS, derived_generator
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.objective import Ascent, Objective, climb
+from tuning.identification.objective import Objective
 from tuning.identification.result import (
     Identification,
     NullTest,
@@ -31,6 +31,7 @@ from tuning.identification.result import (
     null_tests,
 )
 from tuning.identification.starts import estimates_of, runs_of, starts_of
+from tuning.likelihood.ascent import Ascent, climb
 from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates, Parameter
 from tuning.search.study import stop_on_interrupt

@@ -1,7 +1,6 @@
 """The log-likelihood of logs as a function of a model's free parameters, with its derivatives and its maximum.
 
-In order: the effect of a gate for outliers on variances and standard errors; the objective; Fisher scoring with
-Marquardt's damping.
+In order: the effect of a gate for outliers on variances and standard errors; the objective.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.family import CapturedConstants
 from tuning.identification.starts import runs_of
+from tuning.likelihood.ascent import Ascent, Evaluation, climb  # noqa: F401 - `tuning.series` takes them from here
 from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates
 
@@ -32,10 +32,6 @@ STEP = 1e-4  # of differences of the model, in coordinates
 LARGE_STEP = 1e-2  # of differences of the likelihood itself
 COVARIANCES = "process_noise_cov", "measurement_noise_cov", "prior_cov"
 BLOCKS = 20  # least number of blocks of all runs, whose scores give the scatter
-ITERATIONS = 60  # at most
-ENOUGH = 1e-4  # predicted rise in log-likelihood below which the search ends
-LONGEST = 1.5  # longest step, in coordinates
-LEAST_CURVATURE = 1e-6  # of the largest one; fixes directions on which the data have no information
 
 
 def kept_variance(gate: float) -> float:
@@ -66,16 +62,6 @@ def _edge(gate: float) -> float:
     if gate > 38.0:  # phi is no number of floating point any more
         return 0.0
     return 2.0 * gate * math.exp(-0.5 * gate**2) / math.sqrt(2.0 * math.pi) / math.erf(gate / math.sqrt(2.0))
-
-
-class Evaluation(NamedTuple):
-    """Log-likelihood and its derivatives in coordinates at one point."""
-
-    value: float  # of all runs
-    gradient: np.ndarray  # (p,)
-    information: np.ndarray  # (p, p), Fisher; differences of the gradient for parameters without sensitivities
-    scores: np.ndarray  # (runs or blocks of them, p), gradients of parts that are nearly independent
-    part_values: np.ndarray  # (runs or blocks of them,), log-likelihoods of the same parts
 
 
 class Objective:
@@ -333,94 +319,3 @@ def _checked_channels(predicted: Sequence[str], model: StateSpaceModel) -> list[
     if all(unseen):
         raise ValueError(f"a filter must see some channel, but {', '.join(symbols)} are only predicted")
     return unseen
-
-
-class Ascent(NamedTuple):
-    """The end of a search."""
-
-    at: np.ndarray  # (p,), coordinates
-    found: Evaluation
-    iterations: int
-    converged: bool
-
-
-def climb(
-    evaluate: Callable[[np.ndarray], Evaluation],
-    start: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    *,
-    fixed: np.ndarray | None = None,
-    iterations: int = ITERATIONS,
-    enough: float = ENOUGH,
-    stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[np.ndarray, Evaluation], None] = lambda at, evaluation: None,
-) -> Ascent:
-    """Maximise a log-likelihood by steps d of (J + lambda diag J) d = g, Fisher information J and gradient g.
-
-    lambda falls where the log-likelihood rises as predicted, and grows where it does not. Parameters at an end of
-    their range whose gradient points outwards stay there.
-
-    Args:
-        evaluate: value, gradient and information at coordinates (p,).
-        start: coordinates (p,) where the search begins.
-        low: the smallest coordinates.
-        high: the largest ones.
-        fixed: which parameters are held, (p,) bool.
-        iterations: largest number of iterations.
-        enough: predicted rise in log-likelihood below which the search ends.
-        stop: called before each iteration; True ends the search.
-        progress: called with coordinates and evaluation after each rise.
-
-    Source: Osborne (1992), "Fisher's method of scoring", International Statistical Review 60(1); Marquardt (1963).
-    """
-    at, damping = np.clip(start, low, high), 1e-3
-    here = evaluate(at)
-    fixed = np.zeros(len(at), dtype=bool) if fixed is None else fixed
-    quiet = 0
-    for number in range(iterations):
-        if stop() or not _usable(here):
-            return Ascent(at, here, number, False)
-        progress(at, here)
-        outward = ((at <= low) & (here.gradient < 0)) | ((at >= high) & (here.gradient > 0))
-        moving = ~(fixed | outward)
-        if not moving.any():
-            return Ascent(at, here, number, True)
-        g, j = here.gradient[moving], here.information[np.ix_(moving, moving)]
-        curvature = np.maximum(np.diag(j), LEAST_CURVATURE * max(np.diag(j).max(), 1e-300))
-        while True:
-            step = np.zeros(len(at))
-            matrix = _positive(j) + np.diag(damping * curvature + LEAST_CURVATURE * curvature.max())
-            step[moving] = np.linalg.solve(matrix, g)
-            step *= min(1.0, LONGEST / max(np.abs(step).max(), 1e-300))
-            trial = np.clip(at + step, low, high)
-            promised = here.gradient @ (trial - at) * 0.5
-            if promised < enough or damping > 1e10:
-                return Ascent(at, here, number, True)
-            next_one = evaluate(trial)
-            rise = next_one.value - here.value if _usable(next_one) else -np.inf
-            if rise > 0.05 * promised:
-                break
-            damping = max(10.0 * damping, 1e-3)
-            if stop():
-                return Ascent(at, here, number, False)
-        damping = damping / 5.0 if rise > 0.5 * promised else damping
-        quiet = quiet + 1 if rise < 20 * enough else 0
-        at, here = trial, next_one
-        if quiet > 3:
-            return Ascent(at, here, number + 1, True)
-    return Ascent(at, here, iterations, False)
-
-
-def _usable(evaluation: Evaluation) -> bool:
-    return bool(
-        np.isfinite(evaluation.value)
-        and np.isfinite(evaluation.gradient).all()
-        and np.isfinite(evaluation.information).all()
-    )
-
-
-def _positive(information: np.ndarray) -> np.ndarray:
-    """An information matrix with positive eigenvalues: differences of gradients may make some negative."""
-    values, axes = np.linalg.eigh(information)
-    return axes * np.abs(values) @ axes.T

@@ -20,9 +20,9 @@ from thruster_env.core.text_tables import verbatim
 from thruster_env.logs.log import Log
 from thruster_env.model.simulate import inputs_until
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.objective import climb
 from tuning.identification.result import Identification
 from tuning.identification.starts import estimates_of, starts_of
+from tuning.likelihood.ascent import climb
 from tuning.likelihood.identifiability import SIGNIFICANT
 from tuning.problems.data import Data
 from tuning.search.study import stop_on_interrupt

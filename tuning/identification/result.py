@@ -24,7 +24,8 @@ from thruster_env.logs.write import check_not_among
 from thruster_env.model.continuous import noise_for_dt, same_dt
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.family import ModelFamily
-from tuning.identification.objective import Ascent, Objective, climb, lost_information
+from tuning.identification.objective import Objective, lost_information
+from tuning.likelihood.ascent import Ascent, climb
 from tuning.likelihood.identifiability import COMPANION, KNOWN_WITHIN, TWO_SIDED
 from tuning.problems.problem import Coordinates
 

@@ -11,15 +11,15 @@ import numpy as np
 from filters.consistency.intervals import pooled_mean
 from filters.differentiated import recursion
 from filters.differentiated.runs import ModelSlopes, Truth
-from filters.sensitivity import Likelihood
 from thruster_env.core.checks import one_of
 from thruster_env.core.sources import is_array
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.runs import metrics_of_all
+from tuning.likelihood.ascent import Evaluation, lbfgs
 from tuning.likelihood.family import Family, check_gradient
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
 from tuning.problems.data import Data
-from tuning.problems.problem import Coordinates, Parameter, Problem
+from tuning.problems.problem import Parameter, Problem
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
 from tuning.search.space import Choice, neutral, untuned_choice
@@ -32,16 +32,14 @@ OF_STATES = {  # objectives on the true states: what of them is summed over step
 BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from the optimum
 STEP = 1e-3  # in coordinates, of the differences of gradients that give the Hessian
 FLAT = 1e-12  # curvature relative to the largest one, below which a direction counts as flat
-DIVERGED = 1e12  # in place of -log L where the filter diverges
 EQUAL = 0.02  # optima this close in every coordinate are the same
 SAME_LEVEL = 1e-4  # relative difference of their levels, up to which they may be
-PRECISE = 1e-13  # relative decrease of -log L below which the search ends
 FEW_RUNS = 4  # with which the search for a model of many states begins
-COARSE = 1e-9  # the same for models of many states, whose log L is of the order of a million
+COARSE = 1e-9  # relative decrease of -log L that ends a search for a model of many states: log L is some million
 LINEAR_WITHIN = 2.5  # a quarter of the range, in coordinates of parameters on linear scales
 
 
-class Goal:
+class RunsObjective:
     """A function of coordinates that is to be maximised, and its gradient, for each run of some problems.
 
     It is the log-likelihood of a run; or minus the sum of an objective's terms over the scored steps of a run. Of
@@ -69,7 +67,7 @@ class Goal:
         data: Sequence[Data],
         parameters: Sequence[Parameter],
         objective: str = LIKELIHOOD,
-        watch: Callable[[Goal, np.ndarray, Likelihood], None] = lambda goal, point, likelihood: None,
+        watch: Callable[[RunsObjective, np.ndarray, Evaluation], None] = lambda goal, point, evaluation: None,
     ):
         """Find the truth that counts."""
         self._watch = watch
@@ -80,22 +78,25 @@ class Goal:
         self.coordinates = self._families[0].coordinates
         self.steps = sum(int(runs.scored_counts.sum()) for runs in data)
 
-    def __call__(self, point: np.ndarray) -> Likelihood:
-        """Values of all runs, (B,), and their gradients, (B, p), at coordinates."""
-        blocks = []
+    def __call__(self, point: np.ndarray, information: bool = False) -> Evaluation:
+        """The sum over all runs at coordinates, with Fisher's information in the innovations if that is wanted."""
+        blocks, matrices = [], []
         parts = zip(self._problems, self._data, self._families, self._truths, strict=True)
         for problem, data, family, truth in parts:
             score = OF_STATES.get(self.objective, recursion.LIKELIHOOD)
             if truth is not None and self.objective == SCORE:
                 truth = truth._replace(weights=self._of_score(point, problem, data, family))
-            out, _ = family.derivatives(point, data, score=score, truth=truth)
+            out, of_runs = family.derivatives(point, data, score=score, truth=truth, information=information)
             blocks.append(out * self._weight(data))
+            matrices.append(of_runs)
         runs = np.concatenate(blocks)
         if self.objective == SCORE:
             runs[:, 1:] *= 0.5
-        likelihood = Likelihood(runs[:, 0], runs[:, 1:])
-        self._watch(self, point, likelihood)
-        return likelihood
+        values, scores = runs[:, 0], runs[:, 1:]
+        total = np.concatenate(matrices).sum(axis=0)
+        evaluation = Evaluation(float(values.sum()), scores.sum(axis=0), total, scores, values)
+        self._watch(self, point, evaluation)
+        return evaluation
 
     def by_noise(self, choice: Choice) -> tuple[float, np.ndarray, np.ndarray]:
         """The sum over all runs at a choice, and its derivatives by the matrices Q (n, n) and R (m, m).
@@ -111,24 +112,20 @@ class Goal:
         value, by_q, by_r = (np.sum(np.array(of_all), axis=0) for of_all in zip(*parts, strict=True))
         return float(value), by_q, by_r
 
-    def information(self, point: np.ndarray) -> np.ndarray:
-        """Fisher's information on the coordinates in the innovations of all runs, (p, p)."""
-        pairs = zip(self._families, self._data, strict=True)
-        matrices = [family.derivatives(point, data, information=True)[1] for family, data in pairs]
-        return np.concatenate(matrices).sum(axis=0)
-
     def model_at(self, point: np.ndarray) -> tuple[StateSpaceModel, ModelSlopes]:
         """The model of the first problem at coordinates, and its derivatives by them."""
         return self._families[0].at(point)
 
-    def of_few(self, runs: int) -> Goal:
+    def of_few(self, runs: int) -> RunsObjective:
         """The same of the first runs of each problem."""
         few = [data.slice(0, runs) for data in self._data]
-        return Goal(self._choice, self._problems, few, self.coordinates.free, self.objective, self._watch)
+        return RunsObjective(self._choice, self._problems, few, self.coordinates.free, self.objective, self._watch)
 
-    def of(self, objective: str) -> Goal:
+    def of(self, objective: str) -> RunsObjective:
         """Another objective of the same runs."""
-        return Goal(self._choice, self._problems, self._data, self.coordinates.free, objective, self._watch)
+        return RunsObjective(
+            self._choice, self._problems, self._data, self.coordinates.free, objective, self._watch
+        )
 
     @property
     def is_of_squares(self) -> bool:
@@ -293,21 +290,21 @@ def goal_of(
     data: Data | Sequence[Data],
     objective: str = LIKELIHOOD,
     options: Mapping[str, Any] | None = None,
-) -> Goal:
+) -> RunsObjective:
     """What `tune_by_gradient` maximises, with the parameters of the first problem; arguments are its."""
     listed = [problems] if isinstance(problems, Problem) else list(problems)
     runs = [data] if isinstance(data, Data) else list(data)
     parameters = model_parameters(listed[0], **(options or {}))
-    return Goal(untuned_choice(filter_name, listed[0]), listed, runs, parameters, objective)
+    return RunsObjective(untuned_choice(filter_name, listed[0]), listed, runs, parameters, objective)
 
 
-def start_at(goal: Goal, factors: Sequence[float]) -> np.ndarray:
+def start_at(goal: RunsObjective, factors: Sequence[float]) -> np.ndarray:
     """Coordinates of a start, given factors on the untuned parameters; those on linear scales stay untuned."""
     log = goal.coordinates.log
     return goal.coordinates.of(np.where(log, goal.untuned * np.asarray(factors), goal.untuned))
 
 
-def optimum(goal: Goal, start: np.ndarray) -> Optimum:
+def optimum(goal: RunsObjective, start: np.ndarray) -> Optimum:
     """The maximum to which one start leads, without the standard errors of `tune_by_gradient`.
 
     Squared errors hardly know the scale of Q and R, nor what of them no estimate depends on: where these are
@@ -325,12 +322,12 @@ def optimum(goal: Goal, start: np.ndarray) -> Optimum:
     if goal.is_of_squares:
         first = goal.of(LIKELIHOOD)
         start = first.coordinates.of(optimum(first, start).parameters)
-        prior = goal.unit(goal(start).values.sum()) / KNOWN_WITHIN**2
+        prior = goal.unit(goal(start).value) / KNOWN_WITHIN**2
     point, large, evaluations = start, goal.is_large, 0
     for part in (goal.of_few(FEW_RUNS), goal) if large and goal.runs > FEW_RUNS else (goal,):
         minimum = _minimum(part, point, large, prior * (part.steps / goal.steps), start)
         point, evaluations = minimum.x, evaluations + minimum.nfev
-    value = float(goal(point).values.sum()) if prior else -float(minimum.fun)
+    value = goal(point).value if prior else -float(minimum.fun)
     return Optimum(goal.coordinates.values(point), value, goal.level(value), evaluations, bool(minimum.success))
 
 
@@ -357,45 +354,19 @@ def _bad(parameter: Parameter) -> float:
     return BAD_START[parameter.place.index % 2] if isinstance(parameter.place, ProcessVariance) else BAD_START[1]
 
 
-def _minimum(goal: Goal, first: np.ndarray, large: bool, prior: float, centre: np.ndarray):
-    """The minimum of minus the sum over all runs and of a prior about a centre, from a start."""
+def _minimum(goal: RunsObjective, first: np.ndarray, large: bool, prior: float, centre: np.ndarray):
+    """L-BFGS-B on the sum over all runs and a prior about a centre, from a start."""
 
-    def negative(point: np.ndarray) -> tuple[float, np.ndarray]:
-        away, likelihood = point - centre, goal(point)
-        return 0.5 * prior * (away @ away) - likelihood.values.sum(), prior * away - likelihood.gradients.sum(
-            axis=0
-        )
+    def with_prior(point: np.ndarray) -> Evaluation:
+        away, here = point - centre, goal(point)
+        value, gradient = here.value - 0.5 * prior * (away @ away), here.gradient - prior * away
+        return here._replace(value=value, gradient=gradient)
 
     options = {"ftol": COARSE, "maxcor": 2 * len(first)} if large else {}
-    return minimum_within(goal.coordinates, negative, first, **options)
+    return lbfgs(with_prior, first, goal.coordinates.low, goal.coordinates.high, **options)
 
 
-def minimum_within(
-    coordinates: Coordinates,
-    function: Callable[[np.ndarray], tuple[float, np.ndarray]],
-    first: np.ndarray,
-    **options,
-):
-    """The result of L-BFGS-B on a function of coordinates that returns its value and gradient, within the ranges.
-
-    Where a filter diverges, or a covariance is singular by rounding, the line search takes a shorter step.
-    """
-    from scipy.optimize import minimize
-
-    def finite(point: np.ndarray) -> tuple[float, np.ndarray]:
-        try:
-            value, gradient = function(point)
-        except ValueError:
-            return DIVERGED, np.zeros_like(point)
-        if np.isfinite(value) and np.isfinite(gradient).all():
-            return value, gradient
-        return DIVERGED, np.zeros_like(point)
-
-    bounds = list(zip(coordinates.low, coordinates.high, strict=True))
-    return minimize(finite, first, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": PRECISE} | options)
-
-
-def _standard_errors(goal: Goal, point: np.ndarray, unit: float = 1.0) -> np.ndarray:
+def _standard_errors(goal: RunsObjective, point: np.ndarray, unit: float = 1.0) -> np.ndarray:
     """Standard errors of coordinates, (p,): from the scatter between runs, or from the Hessian if larger.
 
     The Hessian is counted in a unit of what is maximised, which is 1 where that is a log density. In a direction
@@ -405,13 +376,13 @@ def _standard_errors(goal: Goal, point: np.ndarray, unit: float = 1.0) -> np.nda
     point = np.clip(point, goal.coordinates.low + STEP, goal.coordinates.high - STEP)
     hessian = np.empty((count, count))
     for i, step in enumerate(STEP * np.eye(count)):
-        above, below = (goal(point + sign * step).gradients.sum(axis=0) for sign in (1, -1))
+        above, below = (goal(point + sign * step).gradient for sign in (1, -1))
         hessian[i] = (below - above) / (2 * STEP)
     if not np.isfinite(hessian).all():  # the filter diverges
         return np.full(count, np.inf)
     values, axes = np.linalg.eigh((hessian + hessian.T) / 2)
     values = np.maximum(values, FLAT * abs(values).max())
-    scores = goal(point).gradients @ axes / values
+    scores = goal(point).scores @ axes / values
     scores -= scores.mean(axis=0)
     scatter = axes @ (scores.T @ scores) @ axes.T * len(scores) / (len(scores) - 1)
     return np.sqrt(np.maximum(np.diag(scatter), unit * np.diag(axes / values @ axes.T)))

@@ -12,7 +12,7 @@ import warnings
 import numpy as np
 
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.likelihood.gradient import DIVERGED, minimum_within
+from tuning.likelihood.ascent import DIVERGED, Evaluation, lbfgs
 from tuning.methods.task import Spent, Task
 from tuning.problems.problem import Coordinates
 from tuning.search.objectives import LIKELIHOOD
@@ -88,10 +88,10 @@ def maximum_a_posteriori(task: Task) -> None:
     matrices = ("process_noise_cov", "full_q"), ("measurement_noise_cov", "full_r")
     best = -np.inf
 
-    def negative(point: np.ndarray) -> tuple[float, np.ndarray]:
+    def with_prior(point: np.ndarray) -> Evaluation:
         nonlocal best
-        likelihood = goal(point)
-        value, gradient = likelihood.values.sum(), likelihood.gradients.sum(axis=0)
+        here = goal(point)
+        value, gradient = here.value, here.gradient
         model, slopes = goal.model_at(point)
         for name, option in matrices:
             prior, by = _log_prior(first, model, getattr(slopes, name), name, bool(task.options.get(option)))
@@ -99,10 +99,10 @@ def maximum_a_posteriori(task: Task) -> None:
         if value > best:
             best = value
             task.keep(goal.choice_at(point))
-        return -value, -gradient
+        return here._replace(value=value, gradient=gradient)
 
     start = np.clip(coordinates.of(goal.untuned), coordinates.low, coordinates.high)
-    task.keep(goal.choice_at(minimum_within(coordinates, negative, start).x))
+    task.keep(goal.choice_at(lbfgs(with_prior, start, coordinates.low, coordinates.high).x))
 
 
 def _log_prior(
@@ -156,18 +156,14 @@ def nuts(task: Task) -> None:
         point, s = point_at(y)
         try:
             task.check()
-            likelihood, away = goal(point), (point - centre) / DEVIATION**2
+            here, away = goal(point), (point - centre) / DEVIATION**2
             evaluated.add(y.tobytes())
         except Spent:  # an exception would end the process: the other draws are of something cheap, and not kept
             return -0.5 * float(y @ y), -y
         except ValueError:  # the filter diverges
             return -DIVERGED, np.zeros(p)
-        value = (
-            likelihood.values.sum()
-            - 0.5 * (point - centre) @ away
-            + np.log(np.maximum(s * (1.0 - s), LEAST_SHARE)).sum()
-        )
-        by_point = likelihood.gradients.sum(axis=0) - away
+        value = here.value - 0.5 * (point - centre) @ away + np.log(np.maximum(s * (1.0 - s), LEAST_SHARE)).sum()
+        by_point = here.gradient - away
         slope = by_point * (high - low) * s * (1.0 - s) + 1.0 - 2.0 * s
         if not (np.isfinite(value) and np.isfinite(slope).all()):
             return -DIVERGED, np.zeros(p)

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.registry import filter_type
-from filters.sensitivity import Likelihood
 from thruster_env.core.streams import METHOD_OF_TUNING, derived_generator
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.evaluate import compute_metrics
 from tuning.evaluation.runs import metrics_of_all
-from tuning.likelihood.gradient import Goal
+from tuning.likelihood.ascent import Evaluation
+from tuning.likelihood.gradient import RunsObjective
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.problem import Parameter, Problem
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORES, NEES, SCORE, VARIANCES, find_objective, penalised
@@ -231,31 +231,41 @@ class Task:
             values.append(penalised(objective.value(evaluation, math.nan), evaluation))
         return float(np.mean(values))
 
-    def goal(self, objective: str, keeps: bool = True) -> Goal:
-        """What gradients of an objective lead to: each evaluation counts; by default the best point is kept."""
+    def goal(self, objective: str, keeps: bool = True, information: bool = False) -> RunsObjective:
+        """What gradients of an objective lead to: each evaluation counts; by default the best point is kept.
+
+        Args:
+            objective: by its name.
+            keeps: whether the best point is kept.
+            information: whether evaluations are with Fisher's information, which is priced.
+        """
         best: dict[tuple, float] = {}
         last = objective, self.passes
 
-        def watch(goal: Goal, point: np.ndarray, likelihood: Likelihood) -> None:
-            self.charge(prices[goal.objective] * len(likelihood.values))
+        def watch(goal: RunsObjective, point: np.ndarray, here: Evaluation) -> None:
+            self.charge(prices[goal.objective] * len(here.part_values))
             if not keeps:
                 return
-            value, key = float(likelihood.values.sum()), (goal.objective, len(likelihood.values))
-            if np.isfinite(value) and value > best.get(key, -math.inf) and (key == last or last not in best):
-                best[key] = value
+            key = goal.objective, len(here.part_values)
+            if (
+                np.isfinite(here.value)
+                and here.value > best.get(key, -math.inf)
+                and (key == last or last not in best)
+            ):
+                best[key] = here.value
                 self.keep(goal.choice_at(point))
 
         with self.uncounted():
-            goal = Goal(self.start, self.problems, self.data, self.free, objective, watch)
+            goal = RunsObjective(self.start, self.problems, self.data, self.free, objective, watch)
             needed = {objective, LIKELIHOOD} if goal.is_of_squares else {objective}
-            prices = {objective_: self._price_of_gradients(objective_) for objective_ in needed}
+            prices = {objective_: self._price_of_gradients(objective_, information) for objective_ in needed}
         return goal
 
-    def _price_of_gradients(self, objective: str) -> float:
-        plain = Goal(self.start, self.problems, self.data, self.free, objective)
+    def _price_of_gradients(self, objective: str, information: bool) -> float:
+        plain = RunsObjective(self.start, self.problems, self.data, self.free, objective)
         few, coordinates = plain.of_few(FEW), plain.coordinates
         point = np.clip(coordinates.of(plain.untuned), coordinates.low, coordinates.high)
-        return self.price(objective, lambda: few(point))
+        return self.price("information" if information else objective, lambda: few(point, information))
 
     def price(self, name: str, call: Callable[[], object]) -> float:
         """What a call over the first 32 runs takes, in passes of the filter, at least 1: measured once a name."""

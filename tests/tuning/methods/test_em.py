@@ -61,7 +61,7 @@ def test_a_step_of_diagonals_is_a_smoothers(missing):
     goal = task.goal(LIKELIHOOD, keeps=False)
     found = goal(goal.coordinates.of(goal.untuned))
     transitions, measured = counts_of(task)
-    slopes = found.gradients.sum(axis=0)
+    slopes = found.gradient
     q = FIRST_Q * (1 + 2 / transitions * slopes[:2])
     r = FIRST_R * (1 + 2 / measured * slopes[2:])
     expected = textbook_step(task.data[0].measurements, np.diag(FIRST_Q), np.diag(FIRST_R))

@@ -45,7 +45,7 @@ def test_slopes_by_matrices_of_diagonals_are_those_of_coordinates():
     point = goal.coordinates.of(goal.untuned)
     _, by_q, by_r = goal.by_noise(goal.choice_at(point))
     slopes = np.concatenate([np.diag(by_q), np.diag(by_r)]) * goal.untuned
-    np.testing.assert_allclose(goal(point).gradients.sum(axis=0), slopes, rtol=1e-9)
+    np.testing.assert_allclose(goal(point).gradient, slopes, rtol=1e-9)
     with pytest.raises(ValueError, match="must not be 'score'"):
         goal.of(SCORE).by_noise(task.start)
 
