@@ -131,9 +131,10 @@ def identify(
 ) -> Identification:
     """Find the values of free parameters under which a filter's innovations are most likely.
 
-    The search is Fisher scoring (`ascent.climb`) in logarithms of positive parameters and parts of the range of
-    others, with gradients by the filter's sensitivities to constants, Q, R and prior, in any combination.
-    For parameters that move the data, or change the model's functions, differences of the likelihood are used.
+    The search is Fisher scoring (`tuning.likelihood.ascent.climb`) in logarithms of positive parameters and parts
+    of the range of others, with gradients by the filter's sensitivities to constants, Q, R and prior, in any
+    combination. For parameters that move the data, or change the model's functions, differences of the likelihood
+    are used.
 
     The first start is `start`; the others are drawn uniformly (in coordinates) within a quarter of each range to
     either side of it; one at which the filter does not stay finite is moved halfway to the first, repeatedly. With

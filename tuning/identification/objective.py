@@ -14,21 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from filters.differentiated.runs import ModelSlopes, same_functions
 from filters.registry import make_filter
 from filters.sensitivity import sensitivity
 from filters.starts import Starts
 from thruster_env.core.checks import one_of, short_repr
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.family import CapturedConstants
 from tuning.identification.starts import runs_of
 from tuning.likelihood.ascent import Ascent, Evaluation, climb  # noqa: F401 - `tuning.series` takes them from here
+from tuning.likelihood.parametric import STEP, ParametricModel  # noqa: F401
 from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates
 
 FILTERS = "kf", "ekf"
-STEP = 1e-4  # of differences of the model, in coordinates
 LARGE_STEP = 1e-2  # of differences of the likelihood itself
 COVARIANCES = "process_noise_cov", "measurement_noise_cov", "prior_cov"
 BLOCKS = 20  # least number of blocks of all runs, whose scores give the scatter
@@ -102,21 +100,14 @@ class Objective:
         self.filter = one_of("filter", filter, FILTERS)
         self.coordinates, self._model, self.degrees, self.simulation = coordinates, model, degrees, simulation
         self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
-        self.first_model = self._given_model(coordinates.start())
+        self.first_model = self._given_model(**coordinates.named(coordinates.start()))
         self.data: Data | Callable[..., Any] = data if callable(data) else runs_of(data, self.first_model)
         self.evaluations, self.starts, self.gate = 0, starts, gate
         self.predicted = tuple(predicted)
-        self._captured: CapturedConstants | None = None
-        self.rough: tuple[int, ...] = ()  # indices of parameters without sensitivities
         at = coordinates.start()
-        self._check_factory(at)
-        pairs = [self._pair(at, j) for j in range(len(at))]
-        same = [same_functions(*pair) for pair in pairs]
-        if not all(same):
-            self._captured = CapturedConstants.of(self._models_about(at))
-            pairs = [self._pair(at, j) for j in range(len(at))]
-            same = [same_functions(*pair) for pair in pairs]
-        self.rough = tuple(j for j, name in enumerate(coordinates.names) if name in self._of_data or not same[j])
+        self._models = ParametricModel(self._given_model, coordinates, self._as_filtered)
+        moving = [j for j, name in enumerate(coordinates.names) if name in self._of_data]
+        self.rough = tuple(sorted({*moving, *self._models.rough}))  # parameters without sensitivities, by index
         self._smooth = [j for j in range(len(at)) if j not in self.rough]
         runs = self.data_at(at)
         _check_runs(runs, self.model_at(at))
@@ -133,8 +124,10 @@ class Objective:
 
     def model_at(self, at: np.ndarray) -> StateSpaceModel:
         """The model at coordinates, as the filter runs on it."""
-        plain = self._given_model(at)
-        model = plain if self._captured is None else self._captured.with_constants(plain)
+        return self._models.at(at)
+
+    def _as_filtered(self, model: StateSpaceModel, at: np.ndarray) -> StateSpaceModel:
+        """A model as the filter runs on it."""
         model = make_filter(self.filter, model).kernel_model
         if self._noise_factors_of is not None:
             roots = np.sqrt(self._noise_factors(at, model))
@@ -143,35 +136,8 @@ class Objective:
             model = model.replace(process_noise_cov=np.zeros((model.n, model.n)))
         return model
 
-    def _given_model(self, at: np.ndarray) -> StateSpaceModel:
-        values = {n: v for n, v in self.coordinates.named(at).items() if n not in self._of_data}
-        return self._model(**values)
-
-    def _check_factory(self, at: np.ndarray) -> None:
-        """Raise ValueError if a model's functions read what the factory changes for the next model."""
-        for j, name in enumerate(self.coordinates.names):
-            first, second = self.coordinates.neighbours(at, j, STEP)
-            model = self._given_model(first)
-            functions = model.functions
-            self._given_model(second)
-            if model.functions != functions:
-                raise ValueError(
-                    f"functions of a model must not read values that its factory sets, but {name!r} changes those "
-                    "of a model that was made before: pass it to them in `constants`, or write them in the factory"
-                )
-
-    def _models_about(self, at: np.ndarray) -> list[StateSpaceModel]:
-        """Models in which all parameters differ: near a point, and elsewhere within the ranges."""
-        low, high = self.coordinates.low, self.coordinates.high
-        points = [point for j in range(len(at)) for point in self.coordinates.neighbours(at, j, STEP)]
-        shares = np.mod(np.arange(1, 4)[:, None] * (np.sqrt(2.0) + np.arange(len(at))) / np.sqrt(5.0), 1.0)
-        models = list(map(self._given_model, points))
-        for share in shares:
-            try:
-                models.append(self._given_model(low + share * (high - low)))
-            except Exception:  # a user's function need not have a model there
-                continue
-        return models
+    def _given_model(self, **values: float) -> StateSpaceModel:
+        return self._model(**{name: value for name, value in values.items() if name not in self._of_data})
 
     def data_at(self, at: np.ndarray) -> Data:
         """The runs at coordinates."""
@@ -222,7 +188,7 @@ class Objective:
 
     def _smooth_part(self, at: np.ndarray, indices: Sequence[int]) -> Evaluation:
         self.evaluations += 1
-        model, slopes = self.model_at(at), self._slopes(at, indices)
+        model, slopes = self.model_at(at), self._models.slopes(at, indices)
         runs, starts, variance = self.data_at(at), self.starts, kept_variance(self.gate)
         if variance < 1.0:  # a common factor on Q, R and P moves no estimate
             model = model.replace(**{name: variance * getattr(model, name) for name in COVARIANCES})
@@ -254,8 +220,8 @@ class Objective:
 
     def moves_prior(self, at: np.ndarray) -> bool:
         """Whether some free parameter moves the prior of the first state, which is then what it says."""
-        slopes = self._slopes(at, self._smooth)
-        rough = [self._pair(at, j) for j in self.rough]
+        slopes = self._models.slopes(at, self._smooth)
+        rough = [self._models.pair(at, j) for j in self.rough]
         apart = [
             np.abs(a.prior_mean - b.prior_mean).sum() + np.abs(a.prior_cov - b.prior_cov).sum() for a, b in rough
         ]
@@ -271,17 +237,6 @@ class Objective:
         for block, rows_of in enumerate(np.arange(rows) * self.blocks // rows == np.arange(self.blocks)[:, None]):
             counts[:, block] = counted[:, rows_of].sum(axis=1)
         return counts
-
-    def _slopes(self, at: np.ndarray, indices: Sequence[int]) -> ModelSlopes:
-        pairs = [self._pair(at, j) for j in indices]
-        if not pairs:
-            return ModelSlopes.of(self.model_at(at), 0)
-        return ModelSlopes.between(pairs, 2 * STEP)
-
-    def _pair(self, at: np.ndarray, index: int) -> tuple[StateSpaceModel, StateSpaceModel]:
-        """Models one step above and below."""
-        above, below = self.coordinates.neighbours(at, index, STEP)
-        return self.model_at(above), self.model_at(below)
 
 
 def _arguments_among(function: Callable, names: Sequence[str]) -> tuple[str, ...]:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from filters.differentiated.recursion import LIKELIHOOD, Wanted
-from filters.differentiated.runs import KINDS, ModelSlopes, Truth, derivatives, has_derivatives, same_functions
+from filters.differentiated.runs import KINDS, ModelSlopes, Truth, derivatives, has_derivatives
 from filters.estimators.find import is_foreign
 from filters.pages.page_filter import PageFilter
 from filters.registry import filter_type, make_filter
 from thruster_env.core.checks import one_of
 from thruster_env.model.state_space import StateSpaceModel
+from tuning.likelihood.parametric import ParametricModel
 from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates, Parameter, Problem
 from tuning.search.parameters import (
@@ -29,7 +30,6 @@ from tuning.search.relations import correlation_slopes, correlations_of, full_co
 from tuning.search.space import Choice
 
 LEAST_NUMBERS = 8  # number of parameters from which the information is faster than differences
-STEP = 1e-4  # in coordinates, of the differences of a model's numbers
 
 # Q or R as a function of tuned parameters, with exact derivatives.
 
@@ -137,8 +137,14 @@ class Family:
         if all(isinstance(position, kinds) for positions in settings for position, _ in positions):
             q = TunedCovariance(self._base.process_noise_cov, Q, ProcessVariance, settings)
             self._noise = q, TunedCovariance(self._base.measurement_noise_cov, R, MeasurementVariance, settings)
-        else:
-            self._check_functions()
+            return
+        self._models = ParametricModel(self._made, self.coordinates, lifts=False)
+        if self._models.rough:
+            name = self.coordinates.names[self._models.rough[0]]
+            raise ValueError(
+                "parameters of a gradient must change numbers of the model alone, "
+                f"but {name} changes its functions"
+            )
 
     @property
     def states(self) -> int:
@@ -152,7 +158,7 @@ class Family:
             (q, by_q), (r, by_r) = (noise.at(values, units) for noise in self._noise)
             model = self._base.replace(process_noise_cov=q, measurement_noise_cov=r)
             return model, ModelSlopes.of(model, len(point), process_noise_cov=by_q, measurement_noise_cov=by_r)
-        return self._model_at(point), ModelSlopes.between(self._pairs(point), 2 * STEP)
+        return self._models.at(point), self._models.slopes(point, range(len(point)))
 
     def derivatives(
         self,
@@ -208,31 +214,16 @@ class Family:
 
     def choice_at(self, point: np.ndarray) -> Choice:
         """The choice at coordinates."""
-        changed = self._choice
-        for parameter, value in zip(self.coordinates.free, self.coordinates.values(point).tolist(), strict=True):
-            changed = parameter.set(changed, value)
-        return changed
+        return self._with(self.coordinates.values(point).tolist())
 
-    def _check_functions(self) -> None:
-        """Raise ValueError if a parameter changes functions of the model."""
-        start = self.coordinates.start()
-        for index, name in enumerate(self.coordinates.names):
-            above, below = self.coordinates.neighbours(start, index, STEP)
-            model = self._model_at(above)
-            functions = model.functions
-            if not same_functions(model, self._model_at(below)) or model.functions != functions:
-                raise ValueError(
-                    f"parameters of a gradient must change numbers of the model alone, but {name} changes its "
-                    "functions"
-                )
+    def _made(self, **values: float) -> StateSpaceModel:
+        return self._model(self._with(values.values()))
 
-    def _pairs(self, point: np.ndarray) -> list[tuple[StateSpaceModel, StateSpaceModel]]:
-        """Models a step above and below along each parameter."""
-        sides = (self.coordinates.neighbours(point, index, STEP) for index in range(len(point)))
-        return [(self._model_at(above), self._model_at(below)) for above, below in sides]
-
-    def _model_at(self, point: np.ndarray) -> StateSpaceModel:
-        return self._model(self.choice_at(point))
+    def _with(self, values: Iterable[float]) -> Choice:
+        choice = self._choice
+        for parameter, value in zip(self.coordinates.free, values, strict=True):
+            choice = parameter.set(choice, value)
+        return choice
 
     def _model(self, choice: Choice) -> StateSpaceModel:
         model = self._problem.started_for(choice.name, self._problem.model(**choice.model))
