@@ -22,11 +22,11 @@ from thruster_env.thruster.plant import make_plant
 from tuning.api.identify import DEFAULT_OUT
 from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, Argument, Option, PresetOption
 from tuning.api.result import Printed
-from tuning.experiments.bollard import FITTED, Identified, identify, read_table, relative_errors
 from tuning.identification.identify import identify as identify_logs
 from tuning.identification.result import Identification
 from tuning.logs.read import read_named
 from tuning.problems.problem import Parameter
+from tuning.thruster.bollard import FITTED, Identified, identify, read_table, relative_errors
 from tuning.thruster.logs import ThrusterFamily
 
 INFERRED = "t200"  # whose other parameters are taken where no preset is given

@@ -266,8 +266,8 @@ def policies(
     from tuning.policies.algorithms import check_installed
 
     check_installed()
-    from tuning.policies.comparison import QUICK, Comparison, run_comparison
-    from tuning.policies.comparison_report import (
+    from tuning.experiments.policies import QUICK, Comparison, run_comparison
+    from tuning.experiments.policies_report import (
         HEADER,
         PAGE,
         answers,

@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
-from tuning.policies import comparison as runs
-from tuning.policies.comparison import (
+from tuning.experiments import policies as runs
+from tuning.experiments.policies import (
     BEST,
     CLASSICAL,
     QUICK,
@@ -26,7 +26,7 @@ from tuning.policies.comparison import (
     typical_error,
     typical_return,
 )
-from tuning.policies.comparison_report import HEADER, answers, rows_of, summary_rows
+from tuning.experiments.policies_report import HEADER, answers, rows_of, summary_rows
 from tuning.policies.environments import make_environments
 from tuning.policies.plants import FIRST_SCORED_STEP, THRUSTER, Part
 from tuning.policies.saved import Scores, classical_policy, run_episodes, score
@@ -268,7 +268,7 @@ def test_what_is_done_is_kept_after_an_interruption_and_done_once(tmp_path, monk
 
 @pytest.mark.slow
 def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path, monkeypatch):
-    monkeypatch.setattr("tuning.policies.comparison.QUICK", QUICK._replace(episodes=4))
+    monkeypatch.setattr("tuning.experiments.policies.QUICK", QUICK._replace(episodes=4))
     page = tmp_path / "page.md"
     page.write_text("Before.\n<!-- table policies_medium -->\nold\n<!-- end -->\nAfter.\n")
     command = "study", "policies", "--quick", "--seeds", 1, "--steps", 2048, "--out", "found", "--page", page

@@ -11,7 +11,7 @@ It fixes neither K_h and K3, on which all time constants depend, nor blade angle
 
 Current is measured at the supply. The motor's current is assumed to be that divided by the throttle.
 
-    python -m tuning.experiments.bollard TABLE.csv
+    python -m tuning.thruster.bollard TABLE.csv
 
 The table's licence is unstated, so it is not in this repository; the numbers derived from it are. Its columns are
 pwm_us, rpm, current_A, voltage_V and force_kgf, its rows 201 pulse widths from 1100 to 1900 us at each of six
@@ -387,7 +387,7 @@ def _volts(voltages: Sequence[float]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return 0, or 2 after a user's mistake, which is one line."""
     parser = argparse.ArgumentParser(
-        prog="python -m tuning.experiments.bollard",
+        prog="python -m tuning.thruster.bollard",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description=(
             "Identify the preset t200 from the T200's bollard table.\n\n"
@@ -396,7 +396,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "whether the preset in the package has these numbers. All else in the preset is\n"
             "inferred, which a static table cannot check: see its docstring."
         ),
-        epilog="Example: python -m tuning.experiments.bollard t200.csv --held-out 12 16 --json -",
+        epilog="Example: python -m tuning.thruster.bollard t200.csv --held-out 12 16 --json -",
     )
     parser.add_argument(
         "table", type=Path, help="CSV with columns pwm_us, rpm, current_A, voltage_V, force_kgf, of 10 to 20 V."

@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from tuning.cli.study import app
-from tuning.policies.comparison import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
-from tuning.policies.comparison_report import GOAL, HEADER, NOT_ON_PAGE, name_of
+from tuning.experiments.policies import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
+from tuning.experiments.policies_report import GOAL, HEADER, NOT_ON_PAGE, name_of
 from tuning.policies.observations import OBSERVATION_SETS
 from tuning.policies.plants import TASKS
 from tuning.policies.saved import classical_policy, score

@@ -17,7 +17,7 @@ from filters.consistency.intervals import Interval
 from filters.logs.findings import colour_of
 from thruster_env.core.files import DARK, check_target, new_figure, save_figure, tidy, write_whole
 from thruster_env.core.text_tables import markdown_table, with_tables
-from tuning.policies.comparison import (
+from tuning.experiments.policies import (
     BEST,
     VARIANT_NOISE,
     WRONG,

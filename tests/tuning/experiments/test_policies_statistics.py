@@ -8,7 +8,7 @@ pytest.importorskip("stable_baselines3")
 from scipy.stats import t as student
 from scipy.stats import ttest_ind
 
-from tuning.policies.comparison import EPISODES, Figure, as_interval, combined, mean_figure
+from tuning.experiments.policies import EPISODES, Figure, as_interval, combined, mean_figure
 
 SEEDS, EPISODE_COUNT = 5, 40
 TRIALS = 1200
