@@ -1,5 +1,4 @@
 import csv
-import json
 import math
 
 import numpy as np
@@ -16,11 +15,9 @@ from tuning.thruster.bollard import (
     coefficients,
     identified_numbers,
     identify,
-    main,
     predict,
     read_table,
     relative_errors,
-    study,
 )
 
 OTHER = Identified(
@@ -185,35 +182,15 @@ def test_pulse_widths_become_voltages():
     assert float(controller.source_voltage(1900, 20.0)) == pytest.approx(12.0)
 
 
-def test_the_report_says_what_was_found(table_path, capsys):
-    assert main([str(table_path)]) == 0
-    output = capsys.readouterr().out
-    for words in ("fitted: 10, 12, 16, 20 V; held out: 14, 18 V", "differ from the preset", "K_T", "0.0% (0.0%)"):
-        assert words in output
-    assert max(map(len, output.splitlines())) <= 100
-
-
-def test_the_report_knows_the_preset(tmp_path):
-    result = study(write_table(tmp_path / "own.csv", recorded_rows(PRESET)))
-    assert result["matches_preset"] and all(result["goals_met"].values())
-
-
-def test_json_goes_where_it_is_told(table_path, tmp_path, capsys):
-    assert main([str(table_path), "--json", "-", "--held-out", "12"]) == 0
-    data = json.loads(capsys.readouterr().out)
-    assert data["held_out_voltages"] == [12] and data["fitted_voltages"] == [10, 14, 16, 18, 20]
-    assert main([str(table_path), "--json", str(tmp_path / "out.json")]) == 0
-    assert "fitted:" in capsys.readouterr().out
-    written = json.loads((tmp_path / "out.json").read_text())
-    assert written["numbers"] == pytest.approx(identified_numbers(OTHER), rel=1e-5)
-
-
-def test_help_teaches(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["--help"])
-    assert stop.value.code == 0
-    output = capsys.readouterr().out
-    assert "bollard" in output and "force_kgf" in output and "Example:" in output
+def test_the_table_of_the_preset_gives_the_preset(tmp_path):
+    table = read_table(write_table(tmp_path / "own.csv", recorded_rows(PRESET)))
+    found = identify(table, (14.0, 18.0), T200)
+    assert identified_numbers(found) == pytest.approx(identified_numbers(PRESET), rel=1e-3)
+    medians = {
+        quantity: max(e["median"] for group in groups.values() for e in group.values())
+        for quantity, groups in relative_errors(found, table, (14.0, 18.0)).items()
+    }
+    assert medians["thrust from measured speed"] < 0.03 and medians["thrust from pulse width and supply"] < 0.05
 
 
 @pytest.mark.parametrize(
@@ -232,18 +209,15 @@ def test_help_teaches(capsys):
         ("\x00\xff", "must"),
     ],
 )
-def test_a_bad_file_is_one_clear_line(tmp_path, capsys, content, rule):
+def test_a_bad_file_is_refused(tmp_path, content, rule):
     path = tmp_path / "bad.csv"
     if content is not None:
         path.write_bytes(content.encode("latin-1"))
-    assert main([str(path)]) == 2
-    output = capsys.readouterr()
-    assert not output.out and len(output.err.splitlines()) == 1
     with pytest.raises(ValueError, match=rule):
-        study(path)
+        identify(read_table(path), (14.0, 18.0), T200)
 
 
 @pytest.mark.parametrize("held_out", [(13.0,), (10.0, 12.0, 14.0, 16.0, 18.0), ()])
 def test_held_out_voltages_are_checked(table_path, held_out):
     with pytest.raises(ValueError, match="held-out voltages must be some of 10, 12, 14, 16, 18, 20 V"):
-        study(table_path, held_out)
+        identify(read_table(table_path), held_out, T200)
