@@ -100,4 +100,4 @@ print(f"better on {np.mean(difference > 0):.0%} of {EPISODES} held-out episodes"
 # %%
 # One training seed says little about an algorithm. :doc:`/policies` has five for each case, all observations from
 # raw to true state, and MPC for comparison, computed by ``thruster train``, ``thruster score`` and ``thruster
-# study policies``.
+# reproduce policies``.

@@ -2,14 +2,14 @@
 
 A table stands on its page, or on that of the same name in docs/appendix, between `<!-- table NAME -->` and
 `<!-- end -->`. `TABLES` of a module has its function by name, which returns Markdown; `FIGURES` that of a picture
-by the file's name, which writes it to a path. The modules are the scripts in this folder, and experiments.
+by the file's name, which writes it to a path. The modules are scripts in this folder, and a page's experiments.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,28 +17,34 @@ import numpy as np
 from filters.consistency.intervals import Interval
 from thruster_env.core.files import new_figure, tidy, write_whole
 from thruster_env.core.text_tables import with_tables
+from tuning.experiments import EXPERIMENTS
 
 DOCS = Path(__file__).parents[1]
-PAGES: Mapping[str, tuple[str, ...]] = {  # and the modules that make their tables and pictures
-    "auv": ("docs.scripts.auv", "tuning.experiments.vehicle.tables"),
-    "benchmarks": (
-        *("tuning.experiments.lorenz63", "tuning.experiments.lorenz96", "tuning.experiments.range_bearing"),
-        "tuning.experiments.benchmark",
-    ),
-    "explore_scenes": ("docs.scripts.explore",),
-    "filters": ("docs.scripts.filters",),
-    "gallery": ("docs.scripts.gallery",),
-    "logs": ("tuning.experiments.hidden_truth",),
-    "machine_code": ("docs.scripts.machine_code",),
-    "methods": ("tuning.experiments.lidar",),
-    "monitoring": ("tuning.experiments.faults",),
-    "plant": ("docs.scripts.plant",),
-    "ranking": ("docs.scripts.ranking", "docs.scripts.estimators"),
-    "readme": ("docs.scripts.pictures",),
-    "real_data": ("tuning.experiments.recordings.identification",),
-    "tuning": ("docs.scripts.tuning", "docs.scripts.tuning_choice", "tuning.experiments.users"),
-    "workers": ("docs.scripts.workers",),
+SCRIPTS = {  # of this folder, by page; experiments name theirs
+    "auv": ("auv",),
+    "explore_scenes": ("explore",),
+    "filters": ("filters",),
+    "gallery": ("gallery",),
+    "machine_code": ("machine_code",),
+    "plant": ("plant",),
+    "ranking": ("ranking", "estimators"),
+    "readme": ("pictures",),
+    "tuning": ("tuning", "tuning_choice"),
+    "workers": ("workers",),
 }
+
+
+def modules_by_page() -> dict[str, list[str]]:
+    """The modules that make tables and pictures, by page."""
+    pages = {page: [f"docs.scripts.{name}" for name in names] for page, names in SCRIPTS.items()}
+    for experiment in EXPERIMENTS.values():
+        module = f"tuning.experiments.{experiment.module}"
+        if experiment.page and module not in pages.setdefault(experiment.page, []):
+            pages[experiment.page].append(module)
+    return dict(sorted(pages.items()))
+
+
+PAGES = modules_by_page()
 
 
 def made_by(page: str, kind: str) -> dict[str, Callable]:

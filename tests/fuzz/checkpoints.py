@@ -31,7 +31,7 @@ def trainings_killed(rng: np.random.Generator, seconds: float) -> str:
 
 
 def comparisons_killed(rng: np.random.Generator, seconds: float) -> str:
-    """`thruster study policies`, killed with its processes left to themselves."""
+    """`thruster reproduce policies`, killed with its processes left to themselves."""
     return kill_comparison(rng, KILLS, seconds)
 
 
@@ -69,7 +69,7 @@ def kill_training(rng: np.random.Generator, kills: int, seconds: float) -> str:
 
 
 def kill_comparison(rng: np.random.Generator, kills: int, seconds: float) -> str:
-    """Kill `thruster study policies` so often or so long, then let it end; no finished run is done again.
+    """Kill `thruster reproduce policies` so often or so long, then let it end; no finished run is done again.
 
     Raises:
         AssertionError: if a result or a checkpoint gets lost, a process outlives its parent, or the end is not

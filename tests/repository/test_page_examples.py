@@ -21,7 +21,7 @@ ELSEWHERE = {  # pages whose programs another test runs
     "plant.md": "test_docs.py",
     "filters.md": "test_docs.py",
     "machine_code.md": "test_machine_code_page.py",
-    "policies.md": "../tuning/policies/test_policies_page.py",
+    "policies.md": "../tuning/experiments/test_policies_page.py",
     "boat.md": "test_boat_page.py",
     **{page: "test_examples.py" for page in PAGES if page.startswith("howto/")},
 }

@@ -126,7 +126,7 @@ class Table(NamedTuple):
         columns: heads; empty for a list of names and what they are.
         rows: cells; the first one names the row, and is left-aligned.
         caption: below it.
-        words: whether the other columns hold words, and are left-aligned, too.
+        words: whether the other columns hold words, and are left-aligned, too; or the heads of those that do.
         best: numbers of rows that win, which stand out on a terminal; None is no row's number.
     """
 
@@ -134,7 +134,7 @@ class Table(NamedTuple):
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
     caption: str = ""
-    words: bool = False
+    words: bool | Sequence[str] = False
     best: Container[int | None] = ()
 
     def __rich__(self) -> RichTable:
@@ -142,8 +142,11 @@ class Table(NamedTuple):
         title, caption = (showable(part, console.encoding) for part in (self.title, self.caption))
         out = WholeTable(title=title, caption=caption, box=SIMPLE_HEAD)
         out.padding, out.pad_edge = (0, 1, 0, 0), False  # five figures with their intervals fit into 80 columns
+        out.leading = int(any("\n" in str(cell) for row in self.rows for cell in row))
+        words = () if isinstance(self.words, bool) else self.words
         for index, column in enumerate(self.columns):
-            justify: JustifyMethod = "left" if index == 0 or self.words else "right"
+            is_left = index == 0 or self.words is True or column in words
+            justify: JustifyMethod = "left" if is_left else "right"
             head = Text(showable(column, console.encoding), overflow="fold")
             out.add_column(head, justify=justify, overflow="fold")
         for number, row in enumerate(self.rows):  # Text: units in brackets are no markup
@@ -222,8 +225,8 @@ def markdown_text(text: str) -> str:
 def _keep_words_whole(out: RichTable) -> None:
     """Let cells fold between words only, if there is room for the longest one of each column.
 
-    The rest of the line goes to the columns in proportion to what they lack: rich itself would make a table with
-    minimal widths wider than the terminal, and cut it.
+    The rest of the line goes to the columns that lack least: numbers stay whole, sentences fold. rich itself would
+    make a table with minimal widths wider than the terminal, and cut it.
     """
     columns = [[column.header, *column.cells] for column in out.columns]
     longest = [max((_longest_word(str(cell)) for cell in cells), default=1) for cells in columns]
@@ -234,13 +237,16 @@ def _keep_words_whole(out: RichTable) -> None:
     spare = console.width - sum(longest) - margins
     if spare < 0:
         return
-    lacking = [line - word for line, word in zip(lines, longest, strict=True)]
-    if sum(lacking) > spare:
-        for column, word, lack in zip(out.columns, longest, lacking, strict=True):
-            column.width = word + spare * lack // sum(lacking)
+    if sum(lines) <= sum(longest) + spare:
+        for column, width in zip(out.columns, longest, strict=True):
+            column.min_width = width
         return
-    for column, width in zip(out.columns, longest, strict=True):
-        column.min_width = width
+    columns = [[str(head).replace(" ", "\n"), *cells] for head, *cells in columns]  # heads fold before cells
+    lines = [max(len(line) for cell in cells for line in str(cell).split("\n")) for cells in columns]
+    lacking = sorted((line - word, index) for index, (line, word) in enumerate(zip(lines, longest, strict=True)))
+    for later, (lack, index) in enumerate(lacking):
+        extra = min(lack, spare // (len(lacking) - later))
+        out.columns[index].width, spare = longest[index] + extra, spare - extra
 
 
 def _longest_word(cell: str) -> int:

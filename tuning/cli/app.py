@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import sys
-from collections.abc import Iterable, MutableMapping
+from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -32,7 +32,7 @@ PANELS = {
     ),
     "Recorded logs": ("log", "identify", "bollard", "estimate"),
     "Policies and learned estimators": ("train", "score", "play", "train-estimator"),
-    "Published results and long studies": ("reproduce", "study"),
+    "Published results and long studies": ("reproduce",),
 }
 COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
 VERBS = {
@@ -40,7 +40,7 @@ VERBS = {
 }  # made from the function of that name
 MARKUP: Final = "markdown"
 LOADING = "loading ..."
-RENAMED = {"--way": "--method", "--sampler": "--method", "ways": "methods"}
+RENAMED = {"--way": "--method", "--sampler": "--method", "ways": "methods", "study": "reproduce"}
 
 
 def with_todays_name(error: Exception, known: Iterable[str]) -> Exception:
@@ -86,19 +86,31 @@ class Group(TyperGroup):
             super().format_help(ctx, formatter)
 
 
-class Commands(Group):
-    """The group of commands, each of the module of its name: a `command`, or an `app` of further ones."""
+class LazyGroup(Group):
+    """A group whose commands are imported when they are called; `names`, `listed` and `loaded` say which."""
 
     _listing = False
 
+    def names(self) -> Mapping[str, Any]:
+        """Names of the commands, in the order of the help."""
+        raise NotImplementedError
+
+    def listed(self, name: str) -> TyperCommand:
+        """A command with its name, panel and help alone."""
+        raise NotImplementedError
+
+    def loaded(self, name: str) -> typer.Typer:
+        """The app of a command."""
+        raise NotImplementedError
+
     def list_commands(self, ctx) -> list[str]:
         """Names in the order of the help."""
-        return list(COMMANDS)
+        return list(self.names())
 
     @property
     def commands(self) -> MutableMapping[str, Any]:
         """All commands by name, as they are listed."""
-        return {name: listed(name) for name in COMMANDS}
+        return {name: self.listed(name) for name in self.names()}
 
     @commands.setter
     def commands(self, commands: MutableMapping[str, Any]) -> None:
@@ -114,22 +126,43 @@ class Commands(Group):
 
     def get_command(self, ctx, name: str):
         """The command of a name, None if there is none."""
-        if name not in COMMANDS:
+        if name not in self.names():
             return None
         if self._listing:
-            return listed(name)
+            return self.listed(name)
         if name not in self._made:
-            alone = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
-            is_verb = name in VERBS
-            module = imported(tuning.home_of(file_of(name)) if is_verb else f"tuning.cli.{file_of(name)}")
-            if hasattr(module, "app"):
-                alone = module.app
-            else:
-                function = getattr(module, file_of(name) if is_verb else "command")
-                alone.command(name, cls=Command)(imported("tuning.cli.verbs").command_of(function))
-            self._made[name] = get_command(alone)
+            self._made[name] = get_command(self.loaded(name))
             self._made[name].name = name
         return self._made[name]
+
+
+class Commands(LazyGroup):
+    """The group of commands, each of the module of its name: a `command`, or an `app` of further ones."""
+
+    def names(self) -> Mapping[str, str]:
+        """Names of the commands."""
+        return COMMANDS
+
+    def listed(self, name: str) -> TyperCommand:
+        """A command with its name, panel and help alone, read from its file."""
+        return listed(name)
+
+    def loaded(self, name: str) -> typer.Typer:
+        """The app of a command's module, or of its function."""
+        is_verb = name in VERBS
+        module = imported(tuning.home_of(file_of(name)) if is_verb else f"tuning.cli.{file_of(name)}")
+        return (
+            module.app
+            if hasattr(module, "app")
+            else app_of(getattr(module, file_of(name) if is_verb else "command"))
+        )
+
+
+def app_of(function: Callable, **chosen: Any) -> typer.Typer:
+    """The app of a verb's command; arguments that are chosen have no option."""
+    alone = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
+    alone.command(cls=Command)(imported("tuning.cli.verbs").command_of(function, **chosen))
+    return alone
 
 
 def file_of(name: str) -> str:

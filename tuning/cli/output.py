@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -75,6 +76,37 @@ def warn_beyond(preset: str, voltage: float) -> None:
     if abs(voltage) > known:
         message = f"{preset} is valid up to {known:g} V, but is driven by {abs(voltage):g} V: this is extrapolated"
         progress_console.print(f"thruster: warning: {message}")
+
+
+@contextmanager
+def progress_of(title: str, out: Path | None = None) -> Iterator[Callable[[str, int, int], None]]:
+    """A bar of long work: the callback takes what is running, how much is done, and how much there is.
+
+    Args:
+        title: until the callback is called.
+        out: a folder or file that keeps what is done, if there is one.
+    """
+    from rich.progress import (  # which takes 20 ms
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    text = TextColumn("{task.description}", markup=False)
+    columns = text, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    try:
+        with Progress(*columns, console=progress_console) as progress:
+            bar = progress.add_task(title, total=None)
+            yield lambda text, done, count: progress.update(
+                bar, description=text or title, completed=done, total=count
+            )
+    except KeyboardInterrupt:
+        if out is not None:
+            progress_console.print(f"Interrupted: finished work is in {out}, and the same command continues.")
+        raise
 
 
 @cache

@@ -91,9 +91,10 @@ class Part(NamedTuple):
         return value is not None and value != [] and value != self.default
 
 
-def command_of(verb: Callable) -> Callable:
-    """The function that Typer calls for a verb, with the verb's options as its signature."""
+def command_of(verb: Callable, **chosen: Any) -> Callable:
+    """The function that Typer calls for a verb, with the verb's options as its signature, and arguments chosen."""
     parts, fixed = parts_of(verb)
+    fixed |= chosen
     help_text = "Also write the result as JSON; - for standard output."
     json = typer.Option("--json", metavar="FILE", help=help_text, rich_help_panel=OUTPUT)
     of_result, returned = [], hints_of(verb)["return"][0]

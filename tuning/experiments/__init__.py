@@ -1,20 +1,51 @@
-"""Published experiments and standard problems, with the published numbers beside ours.
+"""Published experiments, standard problems and long studies, by name: `thruster reproduce NAME`.
 
-Papers on the thruster are in `thruster_papers`, those on the underwater vehicle in `vehicle`. Standard problems
-are modules with a `BENCHMARK`, and a `problem` for `thruster tune --problem tuning.experiments.NAME:problem`.
-`TABLES` and `FIGURES` of a module are those of the docs, by name: `python -m docs.scripts` makes them.
+A module has `reproduce`, of which `tuning.cli.verbs` makes the command, and `TABLES` and `FIGURES` of a page of
+the docs, by name, which `python -m docs.scripts PAGE` computes. Standard problems also have a `problem` for
+`thruster tune --problem tuning.experiments.NAME:problem`. The package is not in the wheel.
 """
 
-from tuning.experiments.thruster_papers import KIKI2020 as KIKI_2020
-from tuning.experiments.thruster_papers import NURHADI2022 as NURHADI_2022
+from __future__ import annotations
 
-STUDIES = {table.name: table for table in (NURHADI_2022, KIKI_2020)}
-BENCHMARKS = {
-    "lorenz63": "tuning.experiments.lorenz63:BENCHMARK",
-    "lorenz63-sparse": "tuning.experiments.lorenz63:SPARSE",
-    "lorenz96": "tuning.experiments.lorenz96:BENCHMARK",
-    "range-bearing": "tuning.experiments.range_bearing:BENCHMARK",
-}  # objects of modules by name
-VEHICLE_STUDIES = ("ngatini2017", "ngatini2019")  # see `tuning.experiments.vehicle`
+from typing import NamedTuple
 
-__all__ = ["BENCHMARKS", "KIKI_2020", "NURHADI_2022", "STUDIES", "VEHICLE_STUDIES"]
+SOLVED = "benchmark:reproduce"
+
+
+class Experiment(NamedTuple):
+    """What an experiment is, and where it is.
+
+    Attributes:
+        about: one line.
+        module: of this package, with TABLES and FIGURES of the page.
+        page: of the docs; empty if none has them.
+        command: "module:function" if it is not `reproduce` of the module; "tables" if it prints TABLES, as that of
+            a module without `reproduce` does.
+    """
+
+    about: str
+    module: str
+    page: str = ""
+    command: str = ""
+
+
+EXPERIMENTS = {
+    "nurhadi2022": Experiment("KF and EnKF of two linear bow thrusters, Nurhadi et al. 2022", "thruster_tables"),
+    "kiki2020": Experiment("KF and EnKF of two linear bow thrusters, Kiki 2020", "thruster_tables"),
+    "thruster-papers": Experiment("Both papers on the bow thruster on the same runs", "thruster_tables"),
+    "ngatini2017": Experiment("Ensemble and fuzzy filters of a vehicle, Ngatini 2017", "vehicle.tables", "auv"),
+    "ngatini2019": Experiment("Ensemble filters of a vehicle, Ngatini 2019", "vehicle.tables", "auv"),
+    "lorenz63": Experiment("Lorenz-63, beside published scores", "lorenz63", "benchmarks", SOLVED),
+    "lorenz63-sparse": Experiment("Lorenz-63, measured seldom", "lorenz63", "benchmarks", SOLVED),
+    "lorenz96": Experiment("Lorenz-96, beside published scores", "lorenz96", "benchmarks", SOLVED),
+    "range-bearing": Experiment("Range and bearing, beside Stone Soup", "range_bearing", "benchmarks", SOLVED),
+    "pendulum": Experiment("A pendulum of Gymnasium, tuned", "benchmark", "benchmarks", "tables"),
+    "lidar": Experiment("Learned Q and R of a lidar's tracks, beside OKF", "lidar", "methods"),
+    "identification": Experiment("Are the standard errors of identification right?", "identification", "identify"),
+    "faults": Experiment("How soon a monitor notices faults", "faults", "monitoring"),
+    "hidden-truth": Experiment("Tuning from logs beside tuning with true states", "hidden_truth", "logs"),
+    "recordings": Experiment("A recorded thruster beside its load cell", "recordings.identification", "real_data"),
+    "users": Experiment("Filters tuned on users' problems, beside users' baselines", "users", "tuning"),
+    "methods": Experiment("Every method of tuning on the same data and budget", "methods.tables"),
+    "policies": Experiment("Policies on raw, filtered and true state, beside MPC, PI and LQG", "policies_report"),
+}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 
@@ -18,10 +18,13 @@ from filters.consistency.intervals import Interval, mean_interval
 from filters.engine.batch import run
 from filters.filter import Filter
 from thruster_env.core.checks import at_least, one_of
-from thruster_env.core.text_tables import markdown_table
+from thruster_env.core.text_tables import Table, markdown_table
+from tuning.api.markers import RUNS as RUNS_PANEL
+from tuning.api.markers import Option, PythonOnly, Seed
+from tuning.api.result import Printed
+from tuning.cli.output import progress_of
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.runs import state_errors
-from tuning.experiments import BENCHMARKS
 from tuning.problems.data import Data, held_out_seeds
 from tuning.problems.model_problem import ModelProblem
 from tuning.search.plan import Plan
@@ -30,6 +33,12 @@ from tuning.search.space import Choice
 if TYPE_CHECKING:
     from tuning.search.study import StudyResult
 
+BENCHMARKS = {
+    "lorenz63": "tuning.experiments.lorenz63:BENCHMARK",
+    "lorenz63-sparse": "tuning.experiments.lorenz63:SPARSE",
+    "lorenz96": "tuning.experiments.lorenz96:BENCHMARK",
+    "range-bearing": "tuning.experiments.range_bearing:BENCHMARK",
+}  # objects of modules by name
 RUNS, TRIALS = 16, 20  # of 1000 analyses each; published scores seem to be of one such run
 MOST_RUNS = 10_000
 CLOSE = 0.05  # relative difference up to which two scores are called the same
@@ -135,6 +144,39 @@ def find_benchmark(name: str) -> Benchmark:
     """A benchmark by name; ValueError for an unknown one."""
     module, _, benchmark = BENCHMARKS[one_of("benchmark", name, tuple(BENCHMARKS))].partition(":")
     return getattr(importlib.import_module(module), benchmark)
+
+
+def reproduce(
+    name: Annotated[str, PythonOnly()], runs: Annotated[int, Option(RUNS_PANEL)] = RUNS, seed: Seed = 0
+) -> Printed:
+    """Solve a standard problem with our filters, and compare them with published results or another package.
+
+    The table compares a score of each filter, with its 95 % interval. Median run: median score of single runs.
+    Pooled: the RMSE of our tables.
+
+    Example: thruster reproduce lorenz63
+
+    Args:
+        name: of the problem.
+        runs: independent runs, at least 2; few make wide intervals.
+        seed: seed of all randomness; the same seed gives the same results.
+    """
+    benchmark = find_benchmark(name)
+    with progress_of("...") as progress:
+        rows = benchmark.reproduce(runs, seed, lambda row: progress(f"done: {row.label}", 0, 0))
+    columns = benchmark.header
+    columns[2] = f"ours ({runs} runs)"
+    table = Table(benchmark.about, columns, [row.cells() for row in rows], words=[WHY])
+    data = {
+        "settings": {"runs": runs, "seed": seed},
+        "source": benchmark.source,
+        "score": benchmark.score,
+        "theirs": benchmark.theirs,
+        "rows": [row._asdict() | {"ratio": row.ratio, "why": row.why} for row in rows],
+        "statements": list(benchmark.remarks),
+    }
+    remarks = [f"- {remark}" for remark in benchmark.remarks]
+    return Printed([table, f"Score: {benchmark.score}. Source: {benchmark.source}", *remarks], data)
 
 
 def run_in_memory(plan: Plan, trials: int, start: Choice | None = None) -> StudyResult:

@@ -1,6 +1,6 @@
 """Are the standard errors of `thruster identify` right? Logs of a known thruster, identified many times.
 
-    python -m tuning.experiments.identification --repetitions 20
+    thruster reproduce identification
 
 A thruster with a dead band, asymmetric thrust and ambient flow is recorded by a thrust sensor with a bias and a
 tachometer with a lag. Each repetition draws other inputs, process noise and measurement noise, starts from a
@@ -9,10 +9,8 @@ preset of another thruster, and checks whether each value is within two standard
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +21,9 @@ from thruster_env.logs.log import Log
 from thruster_env.model.simulate import simulate
 from thruster_env.thruster.model import Recorder, logged_model
 from thruster_env.thruster.plant import make_plant
+from tuning.api.markers import RUNS, Option
+from tuning.api.result import Printed
+from tuning.cli.output import progress_of
 from tuning.identification.identify import identify
 from tuning.identification.result import Identification
 from tuning.problems.excitation import held_levels
@@ -112,35 +113,29 @@ def report(rows: Sequence[Coverage], repetitions: int) -> str:
     total = sum(row.within for row in rows)
     part = total / (repetitions * len(rows))
     return (
-        markdown_table(columns, cells) + f"\n\n{total} of {repetitions * len(rows)} ({part:.1%}) hold the truth.\n"
+        markdown_table(columns, cells) + f"\n\n{total} of {repetitions * len(rows)} ({part:.1%}) hold the truth."
     )
 
 
 def study(repetitions: int, tell: Callable[[int], None] = lambda done: None, **options) -> list[Identification]:
     """All repetitions."""
     results = []
-    for seed in range(repetitions):
+    for seed in range(at_least("repetitions", repetitions, 2)):
         results.append(repetition(seed, **options))
         tell(seed + 1)
     return results
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return 0, or 2 after a user's mistake, which is one line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tuning.experiments.identification", description=__doc__.split("\n")[0]
-    )
-    parser.add_argument("--repetitions", default=20, help="How many [20].")
-    options = parser.parse_args(arguments)
-    try:
-        count = at_least("repetitions", options.repetitions, 2)
-    except ValueError as error:
-        print(f"identification: {error}", file=sys.stderr)
-        return 2
-    results = study(count, lambda done: print(f"{done} of {count}", file=sys.stderr))
-    print(report(coverage(results), count))
-    return 0
+def reproduce(repetitions: Annotated[int, Option(RUNS)] = 20) -> Printed:
+    """Record and identify a known thruster many times, and count how often stated errors hold the truth.
+
+    Args:
+        repetitions: how many, at least 2.
+    """
+    with progress_of("identifying") as progress:
+        results = study(repetitions, lambda done: progress("", done, repetitions))
+    rows = coverage(results)
+    return Printed([report(rows, repetitions)], {"coverage": [row._asdict() for row in rows]})
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+TABLES = {"coverage": lambda: report(coverage(study(20)), 20)}

@@ -10,15 +10,20 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
 from filters.consistency.intervals import Interval
 from filters.logs.findings import colour_of
 from thruster_env.core.files import DARK, check_target, new_figure, save_figure, tidy, write_whole
-from thruster_env.core.text_tables import markdown_table, with_tables
+from thruster_env.core.text_tables import Table, markdown_table, with_tables
+from tuning.api.markers import OUTPUT, RUNS, Option
+from tuning.api.result import Printed
+from tuning.cli.output import progress_of
 from tuning.experiments.policies import (
     BEST,
+    QUICK,
     VARIANT_NOISE,
     WRONG,
     Comparison,
@@ -26,6 +31,7 @@ from tuning.experiments.policies import (
     Result,
     as_interval,
     combined,
+    run_comparison,
     typical_error,
     typical_return,
 )
@@ -78,7 +84,7 @@ COST = "cost of an episode: minus the return [-]"
 
 # Of the page.
 NOT_ON_PAGE = "lowpass", "kf", "ukf"
-PAGE = "policies.md"
+PAGE, FOLDER = "policies.md", Path("out") / "comparison"
 CURVES, ERRORS = "policies_curves.png", "policies_errors.png"
 ROUGH = "**Rough**, by `--quick`: it shows that everything runs, not which policy is better."
 
@@ -406,3 +412,51 @@ def _new_page(comparison: Comparison, names: Sequence[str]) -> str:
     parts += [f"<!-- table {name} -->\n<!-- end -->" for name in names]
     parts += [f"![Learning curves]({CURVES})", f"![Cost against the error of what is observed]({ERRORS})"]
     return "\n\n".join(parts) + "\n"
+
+
+def reproduce(
+    quick: Annotated[bool, Option(RUNS)] = False,
+    seeds: Annotated[int | None, Option(RUNS, least=1, most=1000)] = None,
+    steps: Annotated[int | None, Option(RUNS, least=1, most=10**12)] = None,
+    recurrent: Annotated[bool, Option(RUNS)] = False,
+    jobs: Annotated[int | None, Option(RUNS, least=1, most=1000)] = None,
+    out: Annotated[Path, Option(OUTPUT)] = FOLDER,
+    page: Annotated[Path | None, Option(OUTPUT, metavar="FILE.md")] = None,
+) -> Printed:
+    """Train policies on raw, filtered and true state, and compare them with model-predictive control, PI and LQG.
+
+    It trains PPO at three noise levels of the thrust sensor, SAC, and policies that correct the controller, scores
+    all on the same held-out episodes, and writes a page with tables and two pictures. Ctrl-C keeps finished work,
+    and the same command continues. On two cores it takes an hour or more.
+
+    Example: thruster reproduce policies --quick
+
+    Args:
+        quick: one noise, two seeds, few steps: a test run without meaningful results.
+        seeds: training seeds of each learned policy; 5 by default.
+        steps: training steps of each policy; by default those of `thruster train`.
+        recurrent: also PPO with an LSTM on raw measurements: many hours.
+        jobs: number of processes; as many as cores.
+        out: folder of results; existing ones are not recomputed.
+        page: page whose tables are rewritten, with the pictures beside it.
+    """
+    comparison = QUICK if quick else Comparison()
+    changes: dict[str, Any] = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}
+    comparison = comparison._replace(**{name: value for name, value in changes.items() if value is not None})
+    target = page or out / PAGE
+    check_page(target)
+    with progress_of("policies", out) as progress:
+        results = run_comparison(comparison, out, jobs, lambda run, *counts: progress(run.name, *counts))
+    written = write_report(results, comparison, target, rough=quick)
+    rows = {noise: rows_of(results, noise) for noise in comparison.noises}
+    conclusions, files = answers(results), [str(path) for path in written]
+    summary = summary_rows(results)
+    tables = [Table(f"{noise} noise; thrust errors in N", HEADER, rows[noise]) for noise in rows]
+    data = {
+        "policies": {noise: [dict(zip(HEADER, row, strict=True)) for row in rows[noise]] for noise in rows},
+        "summary": summary,
+        "answers": conclusions,
+        "files": files,
+    }
+    tables.append(Table("in short, with 95 % intervals", ["", *comparison.noises], summary))
+    return Printed([*tables, *conclusions, *[f"wrote {path}" for path in files]], data)

@@ -166,8 +166,10 @@ def test_recorders_of_two_rates_are_told_the_option(folder, thruster):  # noqa: 
 
 
 def test_a_command_without_its_command_says_so(thruster):  # noqa: F811
-    done = thruster("study")
-    assert done.returncode == 2 and done.stderr.startswith("thruster: a command must follow thruster study, but ")
+    done = thruster("reproduce")
+    assert done.returncode == 2 and done.stderr.startswith(
+        "thruster: a command must follow thruster reproduce, but "
+    )
 
 
 def test_estimate_tells_of_alarms(folder, thruster, as_json):  # noqa: F811

@@ -13,6 +13,7 @@ import pytest
 from optuna.trial import create_trial
 from rich.console import Console
 
+from docs.scripts import DOCS, PAGES, made_by
 from filters.consistency.intervals import Interval
 from filters.registry import FILTERS
 from tests.linear_problem import LinearProblem
@@ -23,8 +24,8 @@ from tuning.api.progress import trial_bar
 from tuning.api.tune import file_name
 from tuning.cli import output
 from tuning.cli.app import COMMANDS, PANELS, listed
-from tuning.cli.reproduce import fitted
 from tuning.evaluation.baselines import ORACLE, RULE, rule_of_thumb
+from tuning.experiments import EXPERIMENTS
 from tuning.problems.find import find_problem
 from tuning.reporting.search_figures import draw_history
 from tuning.reporting.tuning_report import way_out
@@ -47,7 +48,7 @@ def test_commands_are_listed_in_panels_without_being_imported(thruster, monkeypa
         assert f"\n│ {name} " in said and listed(name).help[0].isupper()
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("demo", "study")])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("demo", "reproduce")])
 def test_every_option_is_in_a_panel(thruster, name):  # noqa: F811
     said = thruster(name, "--help").stdout
     rest = said[said.index("─ Options ─") :]
@@ -57,12 +58,27 @@ def test_every_option_is_in_a_panel(thruster, name):  # noqa: F811
 
 
 def test_what_is_random_has_a_seed_and_all_write_json(thruster):  # noqa: F811
-    without = {name for name in COMMANDS if name != "study" and "--seed " not in thruster(name, "--help").stdout}
+    commands = set(COMMANDS) - {"reproduce"}
+    without = {name for name in commands if "--seed " not in thruster(name, "--help").stdout}
     rest = {"inspect", "filters", "fit", "new", "methods", "report", "verify", "export", "log", "bollard"}
     assert without == rest
-    writing, studies = set(COMMANDS) - {"study", *WITHOUT_JSON}, ("policies", "recordings", "users", "methods")
-    for name in (*writing, *(f"study {one}" for one in studies)):
+    for name in (*(commands - {*WITHOUT_JSON}), *(f"reproduce {experiment}" for experiment in EXPERIMENTS)):
         assert "--json " in thruster(*name.split(), "--help").stdout
+
+
+def test_experiments_are_not_in_the_wheel_and_the_command_says_where_they_are(thruster, monkeypatch):  # noqa: F811
+    monkeypatch.setattr("tuning.cli.reproduce.find_spec", lambda name: None)
+    done = thruster("reproduce", "lorenz63")
+    assert done.returncode == 2
+    assert done.stderr.startswith("thruster: experiments must be run in a checkout of the project, but ")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_tables_and_pictures_of_scripts_and_experiments_stand_on_their_page(page):
+    files = [file for file in (DOCS / f"{page}.md", DOCS / "appendix" / f"{page}.md") if file.exists()]
+    text = "\n".join(file.read_text() for file in files) or (DOCS.parent / "README.md").read_text()
+    missing = [name for name in made_by(page, "TABLES") if f"<!-- table {name} -->" not in text]
+    assert not missing + [name for name in made_by(page, "FIGURES") if f"{name})" not in text]
 
 
 def test_names_are_taken_in_any_case(as_json):  # noqa: F811
@@ -81,7 +97,7 @@ def test_names_are_taken_in_any_case(as_json):  # noqa: F811
         ),
         (("compare", "--scenario", "mismach"), "but got 'mismach'; did you mean 'mismatch'?"),
         (("inspect", "--preset", "tunel"), "but got 'tunel'; did you mean 'tunnel'?"),
-        (("reproduce", "lorenz36"), "but got 'lorenz36'; did you mean 'lorenz96'?"),
+        (("reproduce", "lorenz36"), "No such command 'lorenz36'. Did you mean 'lorenz96'"),
         (("train", "--scenario", "ambiant"), "but got 'ambiant'; did you mean 'ambient'?"),
         (("tunne",), "Did you mean 'tune'?"),
         (("tune", "--trails", "3"), "--trials"),
@@ -130,11 +146,10 @@ def drawn(made, width, terminal=False, **environment):
 
 
 @pytest.mark.parametrize("width", [40, 60, 80, 140])
-@pytest.mark.parametrize("framed", [False, True])
-def test_a_table_has_the_same_columns_at_any_width(monkeypatch, width, framed):
+def test_a_table_has_the_same_columns_at_any_width(monkeypatch, width):
     monkeypatch.setattr(output.console, "width", width)
     made = Table("a title that is longer than the table", HEADS, ROWS, caption="of nothing")
-    said = drawn(fitted(made) if framed else made, width)
+    said = drawn(made, width)
     assert max(map(len, said.splitlines())) <= width and "…" not in said
     lines = said.splitlines()
     below = lines[next(i for i, line in enumerate(lines) if "──" in line) + 1]

@@ -7,7 +7,6 @@ import pytest
 
 from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
-from tuning.experiments import identification
 from tuning.experiments.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study
 from tuning.identification.objective import Objective
 from tuning.problems.problem import Coordinates
@@ -28,9 +27,9 @@ def test_estimates_lie_within_their_standard_errors_of_the_truth():
     assert text.count("\n| ") == 1 + len(rows) and "hold the truth" in text
 
 
-def test_a_mistake_is_one_line(capsys):
-    assert identification.main(["--repetitions", "1"]) == 2
-    assert "repetitions must be a whole number of at least 2" in capsys.readouterr().err
+def test_one_repetition_is_refused():
+    with pytest.raises(ValueError, match="repetitions must be a whole number of at least 2, but got 1"):
+        study(1)
 
 
 def test_a_clock_that_is_ahead_is_found_where_it_is_and_not_where_interpolation_hides_noise():

@@ -157,6 +157,8 @@ def test_a_ring_is_tuned_by_its_inflation_alone():
 def test_the_command_writes_its_page(as_json, thruster, tmp_path):  # noqa: F811
     page = tmp_path / "methods.md"
     page.write_text("<!-- table groups A to D -->\n<!-- end -->\n![](methods_groups.png)\n", encoding="utf-8")
-    told = as_json("study", "methods", "--quick", "--method", "likelihood", "--method", "start", "--page", page)
+    told = as_json(
+        "reproduce", "methods", "--quick", "--method", "likelihood", "--method", "start", "--page", page
+    )
     assert "| likelihood |" in page.read_text(encoding="utf-8") and (tmp_path / "methods_groups.png").is_file()
     assert {one["method"] for one in told["results"]} == {"likelihood", "start", "reference"}

@@ -1,4 +1,4 @@
-"""`thruster study policies`: its statistics, its plan, its runs and what it writes."""
+"""`thruster reproduce policies`: its statistics, its plan, its runs and what it writes."""
 # ruff: noqa: F811 - fixtures come by import and go by name
 
 import json
@@ -268,10 +268,10 @@ def test_what_is_done_is_kept_after_an_interruption_and_done_once(tmp_path, monk
 
 @pytest.mark.slow
 def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path, monkeypatch):
-    monkeypatch.setattr("tuning.experiments.policies.QUICK", QUICK._replace(episodes=4))
+    monkeypatch.setattr("tuning.experiments.policies_report.QUICK", QUICK._replace(episodes=4))
     page = tmp_path / "page.md"
     page.write_text("Before.\n<!-- table policies_medium -->\nold\n<!-- end -->\nAfter.\n")
-    command = "study", "policies", "--quick", "--seeds", 1, "--steps", 2048, "--out", "found", "--page", page
+    command = "reproduce", "policies", "--quick", "--seeds", 1, "--steps", 2048, "--out", "found", "--page", page
     done = thruster(*command, "--json", "found.json")
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "found.json").read_text())
@@ -307,6 +307,6 @@ def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path,
 )
 def test_a_page_without_a_place_for_tables_is_refused_before_the_work(name, text, line, thruster, tmp_path):
     (tmp_path / name).write_text(text)
-    done = thruster("study", "policies", "--quick", "--page", name)
+    done = thruster("reproduce", "policies", "--quick", "--page", name)
     assert done.returncode == 2 and line in done.stderr and "Traceback" not in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == text

@@ -11,10 +11,10 @@ from thruster_env.core.text_tables import console
 from thruster_env.model.simulate import simulate
 from thruster_env.thruster.linear import PUBLISHED
 from tuning.cli.main import main
-from tuning.experiments import STUDIES
 from tuning.experiments.thruster_papers import (
     NOISE_LEVELS,
     STEPS,
+    STUDIES,
     SYSTEMS,
     H,
     compare,
@@ -22,10 +22,9 @@ from tuning.experiments.thruster_papers import (
     discrete_model,
     findings,
     optimum,
-    series,
-    study_statements,
     unupdated_ensemble_means,
 )
+from tuning.experiments.thruster_tables import series, study_statements
 
 # The Riccati values and the errors of the un-updated ensemble, computed independently of this package.
 OPTIMUM = {
@@ -220,7 +219,7 @@ def command_line(monkeypatch, *arguments):
 def test_json_on_standard_output_is_whole(monkeypatch, capsys, tmp_path):
     few = ("--runs", "4", "--members", "5", "--seed", "3")
     picture = tmp_path / "series.png"
-    assert command_line(monkeypatch, "all", *few, "--series", str(picture), "--json", "-") == 0
+    assert command_line(monkeypatch, "thruster-papers", *few, "--series", str(picture), "--json", "-") == 0
     data = json.loads(capsys.readouterr().out)
     assert picture.read_bytes().startswith(b"\x89PNG") and data["picture"] == str(picture)
     assert [(s["case"], s["q"]) for s in data["series"]] == [(c, q) for c in SYSTEMS for q in NOISE_LEVELS]
@@ -255,11 +254,10 @@ def test_tables_fit_the_terminal(monkeypatch, capsys, tmp_path, width):
     "arguments",
     [
         ("healey1995",),
-        ("all", "--runs", "1"),
-        ("all", "--members", "1"),
-        ("all", "--runs", "many"),
-        ("all", "--series", "series.txt"),
-        (),
+        ("thruster-papers", "--runs", "1"),
+        ("thruster-papers", "--members", "1"),
+        ("thruster-papers", "--runs", "many"),
+        ("thruster-papers", "--series", "series.txt"),
     ],
 )
 def test_a_users_mistake_ends_with_code_2(monkeypatch, capsys, arguments):

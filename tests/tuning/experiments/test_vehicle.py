@@ -7,7 +7,6 @@ from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, affine_model, ru
 from tests.slow import slow_but
 from tests.tuning.experiments.test_studies import command_line
 from tuning.cli import output
-from tuning.experiments import VEHICLE_STUDIES
 from tuning.experiments.vehicle import estimators
 from tuning.experiments.vehicle.estimators import (
     MeanPropagatingEnKF,
@@ -161,7 +160,6 @@ def test_corners_of_the_bounds_are_unstable():
 
 
 def test_printed_tables_are_whole():
-    assert set(PAPERS) == set(VEHICLE_STUDIES)
     assert set(PRINTED_PATHS) == set(PATHS) and list(TABLE_III) == [50, 100, 200, 300]
     assert [len(row.rmse) for row in TABLE_III.values()] == [4] * 4
     fourth = PRINTED_PATHS["IV"].enkf.rmse
@@ -208,7 +206,7 @@ def quick(monkeypatch, as_python):
     monkeypatch.setattr(estimators, "FuzzyKalmanFilter", lambda **given: fuzzy(premises=(0,), **given))
 
 
-@pytest.mark.parametrize("paper", slow_but(VEHICLE_STUDIES, [*VEHICLE_STUDIES][1:]))
+@pytest.mark.parametrize("paper", slow_but(PAPERS, [*PAPERS][1:]))
 def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, tmp_path, paper):
     monkeypatch.setattr(output.console, "width", 100)
     table, picture = tmp_path / "table.json", tmp_path / "paths.png"
@@ -223,7 +221,7 @@ def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, t
     assert found["settings"] == {"runs": 2, "seed": 0, "steps": 2} and picture.stat().st_size > 10_000
     by_path = {(one["path"], one["world"]): one["filters"] for one in found["results"]}
     if paper == "ngatini2019":
-        assert [one["path"] for one in found["series"]] == ["IV"] and "0.4674" in words
+        assert [one["path"] for one in found["series"]] == ["IV"] and "0.467" in words
         sizes = [by_path["IV", "vehicle"][f"EnKF8 N={count}"] for count in (50, 100, 200, 300)]
         assert [one["published"]["seconds"] for one in sizes] == [2.819, 5.692, 11.56, 18.15]
     else:
@@ -236,9 +234,8 @@ def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, t
 @pytest.mark.parametrize(
     ("arguments", "rule"),
     [
-        (("ngatini2019", "--members", "5"), "--members must come with a paper on the thruster"),
-        (("nurhadi2022", "--steps", "5"), "--steps must come with a paper on the vehicle"),
-        (("lorenz63", "--series", "a.png"), "--series must come with a paper, but got 'lorenz63'"),
+        (("ngatini2019", "--members", "5"), "No such option: --members"),
+        (("nurhadi2022", "--steps", "5"), "No such option: --steps"),
         (("ngatini2017", "--runs", "1"), "runs must be a whole number of at least 2"),
         (("ngatini2017", "--steps", "1"), "steps must be a whole number of at least 2"),
         (("ngatini2017", "--series", "a.tex"), "--series must end in .png, .svg or .pdf"),

@@ -5,15 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.core.files import new_figure, save_figure, tidy
-from thruster_env.core.text_tables import markdown_table
+from thruster_env.core.files import new_figure, save_figure, tidy, write_whole
+from thruster_env.core.text_tables import markdown_table, with_tables
+from tuning.api.markers import OUTPUT, Option
+from tuning.api.markers import RUNS as RUNS_PANEL
+from tuning.api.result import Printed
+from tuning.cli.output import progress_of
 from tuning.experiments.methods.problems import (
+    FAST,
     GROUPS,
     ORACLE,
+    PREDICTIONS,
     RUNS,
     SCALED,
     START,
@@ -23,7 +29,7 @@ from tuning.experiments.methods.problems import (
     Case,
     Protocol,
 )
-from tuning.experiments.methods.runs import Regret, Result, regrets, within
+from tuning.experiments.methods.runs import Regret, Result, regrets, run_protocol, within
 from tuning.methods.registry import ALONE, TRUTH
 from tuning.search.objectives import LIKELIHOOD
 
@@ -39,6 +45,7 @@ NO_METHODS = (START, ORACLE)  # nobody has these
 NOT_ON_PAGE = ", 3 runs", ", 10 runs"  # ends of names of cases
 LEAST, MOST = 1e-4, 3.0  # of log ratios, at which points are clipped
 MARKS = dict(zip(RUNS, (("o", "0.75"), ("o", "C0"), ("o", "C3")), strict=True))
+FOLDER = Path("out") / "methods"
 
 
 class Situation(NamedTuple):
@@ -244,3 +251,62 @@ def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> P
         "Score over that of the best constant numbers, held out; left of 0.01 % is drawn there", fontsize=11
     )
     return save_figure(drawn, path)
+
+
+def reproduce(
+    groups: Annotated[str, Option(RUNS_PANEL)] = "ABCDEFGH",
+    method: Annotated[Sequence[str], Option(RUNS_PANEL)] = (),
+    sets: Annotated[int | None, Option(RUNS_PANEL, least=2, most=20)] = None,
+    runs: Annotated[float | None, Option(RUNS_PANEL, least=100, most=1e7)] = None,
+    seconds: Annotated[float | None, Option(RUNS_PANEL, least=0.1, most=1e4)] = None,
+    many: Annotated[int | None, Option(RUNS_PANEL, least=10, most=10**5)] = None,
+    starts: Annotated[int | None, Option(RUNS_PANEL, least=1, most=100)] = None,
+    jobs: Annotated[int, Option(RUNS_PANEL, least=1, most=1000)] = 1,
+    quick: Annotated[bool, Option(RUNS_PANEL)] = False,
+    out: Annotated[Path, Option(OUTPUT)] = FOLDER,
+    page: Annotated[Path | None, Option(OUTPUT, metavar="FILE.md")] = None,
+) -> Printed:
+    """Run every method of tuning on the same data within the same budget, and score it on held-out truth.
+
+    The regret of a method is its score over that of the best constant parameters, found by gradients from many
+    starts on many runs. Ctrl-C keeps finished results, and the same command continues. The whole study takes days;
+    the options reduce it, and results of different budgets are stored separately.
+
+    Example: thruster reproduce methods --quick
+
+    Args:
+        groups: groups of problems.
+        method: a method, may be repeated; by default all.
+        sets: data sets; 20.
+        runs: passes that a method may take; 1e5.
+        seconds: seconds of one core; 100.
+        many: runs of the reference; 2000.
+        starts: starts of the reference; 20.
+        jobs: processes.
+        quick: a test run without meaningful results.
+        out: folder of results, which several hosts may share; existing ones are not recomputed.
+        page: page whose tables are rewritten, with the picture beside it.
+    """
+    protocol = FAST if quick else Protocol()
+    changes: dict[str, Any] = {"sets": sets, "runs": runs, "seconds": seconds, "many": many, "starts": starts}
+    changes["methods"] = tuple(method) if method else None
+    changes["cases"] = tuple(case for case in protocol.cases if case.group in groups) or None
+    protocol = protocol._replace(**{name: value for name, value in changes.items() if value is not None})
+    text = None if page is None else page.read_text(encoding="utf-8")
+    with progress_of("methods", out) as progress:
+        results = run_protocol(protocol, out, jobs, progress)
+    makers = tables(results, protocol)
+    picture, written = "methods_groups.png", []
+    if page is None or text is None or picture in text:
+        written.append(figure(results, protocol, (out if page is None else page.parent) / picture))
+    if page is not None and text is not None:
+        write_whole(page, with_tables(text, makers))
+        written.append(page)
+    texts = {name: make() for name, make in makers.items()}
+    data = {
+        "results": [result._asdict() for result in results],
+        "predictions": [prediction._asdict() for prediction in PREDICTIONS],
+        "files": [str(path) for path in written],
+    }
+    parts = [*(f"{name}\n\n{content}" for name, content in texts.items()), *[f"wrote {path}" for path in written]]
+    return Printed(parts, data)

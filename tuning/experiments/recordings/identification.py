@@ -1,7 +1,7 @@
 """Model structures identified from the recordings, and their errors of thrust against the load cell.
 
 In order: the structures; their identification; errors and ratios to the recorder's own estimate; other estimators;
-a larger process noise after reversals; and the tables of docs/real_data.md and of `thruster study recordings`.
+a larger process noise after reversals; and the tables of docs/real_data.md and of `thruster reproduce recordings`.
 """
 
 from __future__ import annotations
@@ -9,15 +9,18 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from filters.engine.batch import run as run_filter
 from filters.gaussian.extended import ExtendedKalmanFilter
-from thruster_env.core.files import as_toml, write_whole
-from thruster_env.core.text_tables import markdown_table
+from thruster_env.core.files import as_toml, check_target, write_whole
+from thruster_env.core.text_tables import Table, markdown_table
 from thruster_env.model.state_space import StateSpaceModel
+from tuning.api.markers import INPUT, OUTPUT, RUNS, Option
+from tuning.api.result import Printed
+from tuning.cli.output import progress_of
 from tuning.experiments.recordings.model import (
     DT,
     IDENTIFIED,
@@ -389,25 +392,18 @@ def _filtered(model: StateSpaceModel, run: Recording, factor: float) -> tuple[np
     return np.array(thrust), squares, float(estimates.log_likelihoods.sum())
 
 
-class Table(NamedTuple):
-    """A header and rows of cells."""
-
-    header: list[str]
-    rows: list[list[str]]
-
-
 def tables_of(
     runs: Sequence[Recording], estimates: Estimates, tasks: Mapping[str, Mapping] | None = None
 ) -> dict[str, Table]:
     """All tables by name, in their order; those of structures and parameters where these were identified again."""
     tables = {
-        "ratios": Table(RATIO_HEADER, ratio_rows(runs, estimates)),
-        "estimators": Table(["run", *estimates], baseline_rows(runs, estimates)),
-        "clocks": Table(CLOCK_HEADER, clock_rows(runs)),
+        "ratios": Table("", RATIO_HEADER, ratio_rows(runs, estimates)),
+        "estimators": Table("", ["run", *estimates], baseline_rows(runs, estimates)),
+        "clocks": Table("", CLOCK_HEADER, clock_rows(runs)),
     }
     if tasks is not None:
-        tables["structures"] = Table(LADDER_HEADER, ladder_rows(runs, tasks))
-        tables["numbers"] = Table(NUMBER_HEADER, number_rows(runs, tasks))
+        tables["structures"] = Table("", LADDER_HEADER, ladder_rows(runs, tasks))
+        tables["numbers"] = Table("", NUMBER_HEADER, number_rows(runs, tasks))
     return tables
 
 
@@ -473,6 +469,51 @@ def sentences(estimates: Estimates, runs: Sequence[Recording]) -> list[str]:
     ]
 
 
+def reproduce(
+    data: Annotated[Path, Option(INPUT)],
+    identify: Annotated[bool, Option(RUNS)] = False,
+    out: Annotated[Path, Option(OUTPUT)] = RESULTS,
+) -> Printed:
+    """Compare estimates of a recorded thruster's thrust with its load cell, and with the recorder's own estimate.
+
+    The filter sees command and tachometer. By default its parameters are the project's, identified from six runs;
+    with --identify, each run is estimated with parameters identified without that run. The recordings are those of
+    J. A. Boehm (University of Maryland, 2019), which are not part of this project: see docs/real_data.md.
+
+    Example: thruster reproduce recordings --data rov_thruster
+
+    Args:
+        data: folder with the recorded runs as .csv files, or with a folder closed_loop_25Hz.
+        identify: identify all parameters again, of nine structures, with and without each run: a quarter of an
+            hour.
+        out: with --identify: file of results; existing ones are not recomputed.
+    """
+    runs = read_recordings(data)
+    if identify:
+        check_target(out)
+    tasks = None
+    if identify:
+        with progress_of("identifying", out) as progress:
+            tasks = identify_all(runs, out, progress=progress)
+    estimates = estimates_of(runs, tasks)
+    which = "parameters identified without the run" if identify else "the project's parameters"
+    titles = {
+        "ratios": f"RMSE of thrust over 0.2 s; {which}",
+        "estimators": "RMSE over 0.2 s, N: all rows / settled",
+        "clocks": "how far the load cell's clock is ahead",
+        "structures": "the contribution of each effect",
+        "numbers": "numbers found",
+    }
+    tables = tables_of(runs, estimates, tasks)
+    output = [content._replace(title=titles[name]) for name, content in tables.items()]
+    named = {
+        name: [dict(zip(content.columns, row, strict=True)) for row in content.rows]
+        for name, content in tables.items()
+    }
+    answers = sentences(estimates, runs)
+    return Printed([*output, *answers], {**named, "answers": answers})
+
+
 def tables_from(recordings: Path, results: Path = RESULTS) -> dict[str, Callable[[], str]]:
     """The tables of docs/real_data.md by name, from a folder of recordings; the project's numbers are written.
 
@@ -491,7 +532,7 @@ def tables_from(recordings: Path, results: Path = RESULTS) -> dict[str, Callable
         return markdown_table(["Q times", "log-likelihood of the tachometer", "mean NIS", "ratio, mean"], rows)
 
     tables = {
-        name: (lambda table=table: markdown_table(*table))
+        name: (lambda table=table: markdown_table(table.columns, table.rows))
         for name, table in tables_of(runs, left_out, tasks).items()
     }
     ratios = tables["ratios"]

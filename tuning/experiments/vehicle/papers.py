@@ -153,17 +153,6 @@ NGATINI2017 = Paper(
 # Polbeng Seri Informatika 4(1), 12-21, ISSN 2527-9866.
 
 
-PARTICULARS = {
-    "mass": (15.0, "kg"),
-    "length": (0.98, "m"),
-    "beam": (0.188, "m"),
-    "propeller diameter": (0.040, "m"),
-    "battery": (11.8, "V"),
-    "motor": (12.0, "V"),
-    "speed": (1.94, "kn"),
-}
-"""Table I, as far as it has numbers."""
-
 TABLE_III = {
     50: PrintedRow({"x": 0.4702, "y": 0.4674, "z": 0.0823, "psi": 0.1003}, 2.819),
     100: PrintedRow({"x": 0.4636, "y": 0.4666, "z": 0.0819, "psi": 0.1003}, 5.692),

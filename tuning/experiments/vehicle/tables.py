@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
-from typing import NamedTuple
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from filters import FuzzyKalmanFilter
 from filters.consistency.intervals import Interval
 from thruster_env.auv.parameters import SEGOROGENI, mass_matrix
-from thruster_env.core.text_tables import markdown_table
+from thruster_env.core.text_tables import Table, markdown_table
+from thruster_env.logs.write import check_picture
+from tuning.api.markers import OUTPUT, WRITTEN, Option, PythonOnly, Seed
+from tuning.api.markers import RUNS as RUNS_PANEL
+from tuning.api.result import Printed
+from tuning.cli.output import progress_of
 from tuning.experiments.vehicle.estimators import MEASUREMENTS, level_model
 from tuning.experiments.vehicle.experiment import (
     MEASURED_PLACES,
+    PAPERS,
     PathResult,
     Scores,
     path_runs,
@@ -32,10 +39,12 @@ from tuning.experiments.vehicle.papers import (
     NOISE,
     POSE,
     PRINTED_PATHS,
+    RUNS,
     TABLE_III,
     PrintedRow,
 )
 
+WHY = "why they differ"
 FACTOR = 3.0  # up to which two errors are of the same size: path and duration are not printed
 FIELDS = {
     "full": "similar to ours by the full transformation",
@@ -318,18 +327,11 @@ def _rates(scores: Scores) -> str:
     return f"{digits(p)} and {digits(q)} mrad/s"
 
 
-# Tables and a picture of docs/appendix/auv.md, of what `thruster reproduce` runs: some minutes on two cores.
+# Tables, of the command and of docs/appendix/auv.md.
 
 
-@cache
-def results(paper: str) -> list[PathResult]:
-    """What `thruster reproduce` runs."""
-    return run_tasks(tasks_of(paper), runs=RUNS_OF[paper])
-
-
-def members() -> str:
+def members(iv: PathResult) -> Table:
     """Table III beside ours."""
-    (iv,) = results("ngatini2019")
     labels = [MEASUREMENTS, "EKF8", *(f"EnKF8 N={count}" for count in TABLE_III)]
     rows = []
     for label in labels:
@@ -338,24 +340,14 @@ def members() -> str:
         ours = _row(scores.rmse("planar")), _row(scores.rmse("full")), with_interval(scores.nees_interval)
         rows.append([label, theirs, *ours, f"{printed.seconds:g}" if printed else ""])
     rows.append(["bound", "", "", _row(iv.bound.pose), "", ""])
-    return markdown_table(["", "published", "by yaw alone", "full", "NEES", "s, published"], rows)
+    title = "Path IV: RMSE of x, y, z [m] and psi [rad]"
+    return Table(title, ["", "published", "by yaw alone", "full", "NEES", "s, published"], rows)
 
 
-def velocities() -> str:
-    """RMSE of velocities and attitude on path IV."""
-    return _velocities(results("ngatini2019")[0])
-
-
-def other_world() -> str:
-    """The same without restoring moments, with pose."""
-    (other,) = [result for result in results("ngatini2017") if result.world != "vehicle"]
-    return _velocities(other, "EKF6 level")
-
-
-def paths() -> str:
+def paths(results: Sequence[PathResult]) -> Table:
     """Every printed row of the five paths beside ours."""
-    entries, rows = findings("ngatini2017", results("ngatini2017")), []
-    for entry in entries:
+    rows = []
+    for entry in findings("ngatini2017", list(results)):
         if entry.label not in (ENKF, FKF):
             continue
         names = list(PRINTED_PATHS[entry.path].enkf.rmse)
@@ -365,14 +357,18 @@ def paths() -> str:
         theirs = _row(printed.rmse.values()) if printed else ""
         seconds = f"{printed.seconds:.3g}" if printed else ""
         rows.append([f"{entry.path} ({', '.join(names)})", entry.label, theirs, *errors, seconds, entry.why])
-    columns = ["path", "", "published", "by yaw alone", "both by yaw alone", "full", "s, published"]
-    return markdown_table([*columns, "why they differ"], rows)
+    columns = ["path", "", "published", "by yaw alone", "both by yaw alone", "full", "s, published", WHY]
+    caption = (
+        "By yaw alone: the papers' transformation, against the true path. Both: against the path that true "
+        f'velocities give by yaw alone. Full: with roll and pitch. "Similar" means within a factor of {FACTOR:g}.'
+    )
+    return Table("RMSE of the paths, m and rad", columns, rows, caption=caption, words=[WHY])
 
 
-def ends() -> str:
+def ends(results: Sequence[PathResult]) -> Table:
     """Errors at the end in percent."""
     rows = []
-    for result in _of_vehicle():
+    for result in _of_vehicle(results):
         for label, printed in zip((ENKF, FKF), PRINTED_PATHS[result.path][:2], strict=True):
             names = list(printed.final_percent)
             columns = [POSE.index(name) for name in names]
@@ -380,7 +376,125 @@ def ends() -> str:
             ours = [_row(100 * errors.mean(axis=0) / np.abs(result.end[columns])) for errors in fields]
             theirs = _row(printed.final_percent.values())
             rows.append([f"{result.path} ({', '.join(names)})", label, theirs, *ours])
-    return markdown_table(["path", "", "published", "by yaw alone", "full"], rows)
+    caption = "Near zero end values the percentage is meaningless."
+    heads = ["path", "", "published", "by yaw alone", "full"]
+    return Table("Mean distance at the end, in percent of the end value", heads, rows, caption=caption)
+
+
+def velocities(result: PathResult, base: str = "", omitted: tuple[str, ...] = ()) -> Table:
+    """RMSE of velocities and attitude on a path, and of position over that of the filter `base`."""
+    rows = []
+    for label, scores in result.scores.items():
+        if label.endswith(omitted):
+            continue
+        errors = np.concatenate([scores.rmse("velocities")[SHOWN], scores.rmse("attitude")])
+        last = [with_interval(scores.nees_interval)]
+        if base:
+            last.append(_ratio(scores, result.scores[base]))
+        rows.append([label, *(digits(1e3 * value) for value in errors), *last])
+    bound = np.concatenate([result.bound.velocities[SHOWN], result.bound.attitude])
+    rows.append(["bound", *(digits(1e3 * value) for value in bound), *([""] * (2 if base else 1))])
+    columns = ["", "u", "p", "q", "phi", "theta", "NEES"]
+    world = "" if result.world == "vehicle" else f", {result.world}"
+    title = f"Path {result.path}{world}: RMSE in mm/s, mrad/s and mrad from 2 s on"
+    return Table(title, [*columns, f"position over {base}"] if base else columns, rows)
+
+
+def _ratio(scores: Scores, base: Scores) -> str:
+    if scores is base or np.isnan(scores.full).any():
+        return ""
+    return with_interval(position_ratio(scores, base, "full"))
+
+
+def _of_vehicle(results: Iterable[PathResult]) -> list[PathResult]:
+    return [result for result in results if result.world == "vehicle"]
+
+
+def _row(values: Iterable[float]) -> str:
+    return ", ".join(digits(value) for value in values if not np.isnan(value))
+
+
+# The command.
+
+
+def reproduce(
+    name: Annotated[str, PythonOnly()],
+    runs: Annotated[int, Option(RUNS_PANEL)] = RUNS,
+    steps: Annotated[int | None, Option(RUNS_PANEL)] = None,
+    series: Annotated[Path | None, Option(OUTPUT, metavar="FILE", file=WRITTEN)] = None,
+    seed: Seed = 0,
+) -> Printed:
+    """Repeat a paper on the underwater vehicle many times and say why its tables differ from ours.
+
+    The papers compare ensemble and fuzzy Kalman filters at 1 kHz by the RMSE
+    of the vehicle's path. The tables add other filters and the bare measurements, on the same runs, with the
+    papers' transformation and with the right one.
+
+    Example: thruster reproduce ngatini2019 --series paths.png
+
+    Args:
+        name: the paper.
+        runs: independent runs of some 25000 steps, at least 2; few make wide intervals.
+        steps: first steps of 1 ms of each path, for a quick look; all by default.
+        series: also draw one run of each path: .png, .svg or .pdf; into --json, too.
+        seed: seed of all randomness; the same seed gives the same results.
+    """
+    if series is not None:
+        check_picture(series, "--series")
+    with progress_of(f"{runs} runs") as progress:
+        results = run_tasks(
+            tasks_of(name),
+            runs=runs,
+            seed=seed,
+            steps=steps,
+            on_part=lambda done, total, label: progress(label, done, total),
+        )
+    compared, conclusions = findings(name, results), statements(name, results)
+    first = [members(results[0])] if name == NGATINI2019.name else [paths(results), ends(results)]
+    output: list[Any] = [*first, *(velocities(result, "EKF8") for result in results)]
+    output += ["Conclusions from the runs", *conclusions, f"{name}: {PAPERS[name].source}", *PAPERS[name].remarks]
+    data = {
+        "settings": {"runs": runs, "seed": seed, "steps": steps},
+        "source": PAPERS[name].source,
+        "results": [plain_result(result, compared) for result in results],
+        "statements": conclusions,
+        "remarks": list(PAPERS[name].remarks),
+    }
+    if series is not None:
+        drawn = path_runs(name, seed=seed, steps=steps)
+        output.append(f"Picture: {paths_figure(series, drawn)}")
+        data |= {"series": [run._asdict() for run in drawn], "picture": str(series)}
+    return Printed(output, data)
+
+
+def plain_result(result: PathResult, findings: list[Finding]) -> dict:
+    """One path as plain data."""
+    here = {
+        finding.label: finding for finding in findings if finding.path == result.path and result.world == "vehicle"
+    }
+    fields = ("velocities", "attitude", "full", "planar", "planar_both")
+    filters = {}
+    for label, scores in result.scores.items():
+        printed = here[label].printed if label in here else None
+        filters[label] = {
+            "rmse": {field: [interval._asdict() for interval in scores.intervals(field)] for field in fields},
+            "nees": scores.nees_interval._asdict(),
+            "divergences": float(scores.divergences.sum()),
+            "seconds": float(scores.seconds.mean()),
+            "published": None if printed is None else printed._asdict(),
+            "why": here[label].why if label in here else "",
+        }
+    plain = result._asdict() | {"bound": result.bound._asdict(), "filters": filters}
+    return {key: value for key, value in plain.items() if key != "scores"}
+
+
+# Of the page: some minutes on two cores.
+
+
+@cache
+def results(paper: str) -> list[PathResult]:
+    """What `thruster reproduce` runs."""
+    return run_tasks(tasks_of(paper), runs=RUNS_OF[paper])
 
 
 def paper_sentences() -> str:
@@ -394,38 +508,20 @@ def paper_sentences() -> str:
     return "\n" + "\n\n".join(blocks)
 
 
-def _velocities(result: PathResult, base: str = "") -> str:
-    rows = []
-    for label, scores in result.scores.items():
-        if label.endswith(NOT_ON_PAGE):
-            continue
-        errors = np.concatenate([scores.rmse("velocities")[SHOWN], scores.rmse("attitude")])
-        last = [with_interval(scores.nees_interval)]
-        if base:
-            last.append(_ratio(scores, result.scores[base]))
-        rows.append([label, *(digits(1e3 * value) for value in errors), *last])
-    bound = np.concatenate([result.bound.velocities[SHOWN], result.bound.attitude])
-    rows.append(["bound", *(digits(1e3 * value) for value in bound), *([""] * (2 if base else 1))])
-    columns = ["", "u", "p", "q", "phi", "theta", "NEES"]
-    return markdown_table([*columns, f"position over {base}"] if base else columns, rows)
+def _of_page(table: Callable[[], Table]) -> Callable[[], str]:
+    def markdown() -> str:
+        _, columns, rows, *_ = table()
+        return markdown_table(columns, rows)
 
-
-def _ratio(scores: Scores, base: Scores) -> str:
-    if scores is base or np.isnan(scores.full).any():
-        return ""
-    return with_interval(position_ratio(scores, base, "full"))
-
-
-def _of_vehicle() -> list[PathResult]:
-    return [result for result in results("ngatini2017") if result.world == "vehicle"]
-
-
-def _row(values: Iterable[float]) -> str:
-    return ", ".join(digits(value) for value in values if not np.isnan(value))
+    return markdown
 
 
 FIGURES = {"auv_papers.png": lambda path: paths_figure(path, path_runs("ngatini2017"))}
 TABLES = {
-    **{"papers_members": members, "papers_velocities": velocities, "papers_paths": paths, "papers_ends": ends},
-    **{"papers_world": other_world, "papers_said": paper_sentences},
+    "papers_members": _of_page(lambda: members(results("ngatini2019")[0])),
+    "papers_velocities": _of_page(lambda: velocities(results("ngatini2019")[0], omitted=NOT_ON_PAGE)),
+    "papers_paths": _of_page(lambda: paths(results("ngatini2017"))),
+    "papers_ends": _of_page(lambda: ends(results("ngatini2017"))),
+    "papers_world": _of_page(lambda: velocities(results("ngatini2017")[-1], "EKF6 level", NOT_ON_PAGE)),
+    "papers_said": paper_sentences,
 }
