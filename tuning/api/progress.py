@@ -22,8 +22,6 @@ from rich.text import Text
 
 from filters.estimators.find import label_of
 from thruster_env.core.checks import listening, short_repr
-from tuning.evaluation.compare import TUNING
-from tuning.search.study import STOPPING
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
@@ -141,6 +139,8 @@ def trial_bar(
             if running := filter_types_running(trials):
                 show_kinds(running)
 
+        from tuning.search.study import STOPPING  # which imports Optuna; `tuning.fit` has a console alone
+
         def show_rest(far: str) -> None:
             if far == STOPPING:
                 progress.update(task, description=far, refresh=True)
@@ -180,6 +180,9 @@ def row_bar(total: int, console: Console) -> Iterator[Callable[[Problem, str], N
         def on_row(problem: Problem, label: str) -> None:
             progress.update(task, description=f"{label} on {problem.name}", completed=len(begun))
             begun.append(label)
+
+        from tuning.evaluation.compare import TUNING
+        from tuning.search.study import STOPPING
 
         def show(far: str) -> None:
             if far == STOPPING or far.startswith(TUNING):

@@ -60,10 +60,11 @@ def check_targets(targets: Iterable[str | Path | None], json_target: str | None,
     inputs = [path for path in read if path is not None]
     for target in named:
         check_not_read(target, inputs)
-    if named:
-        from thruster_env.logs.write import check_not_among
     for target in named:
-        check_not_among(target)
+        if Path(target).suffix == ".toml":
+            from thruster_env.logs.write import check_not_among
+
+            check_not_among(target)
         check_target(target)
     _check_json(json_target)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from filters.differentiated.runs import ModelSlopes
 from filters.engine.batch import Estimates, run
@@ -171,7 +171,7 @@ def _is_elsewhere(model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> 
     )
     along = scaled @ axes
     distance = (along**2 / np.maximum(values, 1e-10)).sum()
-    return bool(distance > chi2.isf(LEVEL, int(uncertain.sum())))
+    return bool(distance > chdtri(int(uncertain.sum()), LEVEL))
 
 
 # Recorded runs as one batch: runs of different lengths are padded with steps in which nothing is measured.

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from filters.bounds import steady_state
 from filters.consistency.nees import LAGS, Whiteness, whiteness
@@ -136,7 +136,7 @@ class SeriesFit(Result):
             begin = np.clip(likelihood.coordinates.of(values), low, high)
             alone = climb(likelihood, begin, low, high).found.value
             gain += alone - likelihood.value(begin)
-        return float(chi2.sf(2.0 * gain, (axes - 1) * len(values)))
+        return float(chdtrc((axes - 1) * len(values), 2.0 * gain))
 
     def sentences(self) -> list[str]:
         """What a reader has to know, most important first."""

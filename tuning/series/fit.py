@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from filters.engine.batch import Estimates, run
 from filters.gaussian.kalman import KalmanFilter
@@ -51,7 +51,7 @@ SHARES = 0.01, 0.2, 0.9  # R from which searches begin, in squares of the roughn
 SEARCHES = 3
 EXACT = 1e-8  # predicted rise of the log-likelihood at which the last search ends
 NOISE = "variance of the measurement noise"
-FALL = 0.5 * float(chi2.ppf(0.95, 1))  # of the log-likelihood at the ends of a 95 % interval
+FALL = 0.5 * float(chdtri(1, 0.05))  # of the log-likelihood at the ends of a 95 % interval
 FAR = 100.0  # root of a fall where the filter has no likelihood
 PRECISION = 0.01  # of an interval's end, in coordinates
 
