@@ -21,6 +21,7 @@ import numpy as np
 from filters.augmented import Unknown, augmented_model
 from filters.estimators.find import is_foreign
 from filters.filter import Filter
+from filters.named import model_for_step
 from filters.registry import filter_type, make_filter
 from filters.tuned_file import (
     AUGMENTED,
@@ -44,7 +45,7 @@ HOOK = "measured_inputs"  # method of an env; what it returns is a `Split`, or N
 
 
 def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | StateSpaceModel]:
-    """A model's name in messages, and its source: the env, the "module:factory" named, or itself.
+    """A model's name in messages, and its source: the env, a name or "module:factory", or itself.
 
     Raises ValueError if there is none.
     """
@@ -56,11 +57,14 @@ def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | 
         return f"the model of {env.unwrapped}", make
     if isinstance(model, StateSpaceModel):
         return "the model", model
+    named = model_for_step(model, sample_time(env))
+    if named is not None:
+        return f"model {model!r}", named
     module, _, name = str(model).partition(":")
     try:
         factory = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError):
-        rule = "model must be 'module:factory' that can be imported, or a StateSpaceModel"
+        rule = "model must be a name, 'module:factory' that can be imported, or a StateSpaceModel"
         raise ValueError(f"{rule}, but got {model!r}") from None
     return f"model {model!r}", factory
 
@@ -253,14 +257,16 @@ ModelInSpec.__name__ = "StateSpaceModel (give model='module:factory' instead)"
 def check_spaces(
     action_space: gym.Space, observation_space: gym.Space, model: StateSpaceModel, measured_inputs: int = 0
 ) -> gym.spaces.Box:
-    """Return the action space; raise ValueError unless both spaces are Box, and actions fit the model.
+    """Return the space of the actions that the filter uses; ValueError unless both are Box, and fit the model.
 
-    Actions are the model's inputs without the last `measured_inputs`.
+    These are the model's inputs without the last `measured_inputs`; none for a model without inputs.
     """
     actions, size = _box("action", action_space), model.inputs - measured_inputs
+    _box("observation", observation_space)
+    if not size:
+        return gym.spaces.Box(0.0, 0.0, (0,))
     if int(np.prod(actions.shape)) != size:
         raise ValueError(f"the action space must have the model's {size} entries, but got {actions}")
-    _box("observation", observation_space)
     return actions
 
 

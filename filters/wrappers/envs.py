@@ -75,8 +75,10 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
             an innovation NaN.
         observation: one of the three forms above.
         model: None for the model that the env, or a wrapper around it, offers by `state_space_model(**arguments)`,
-            as a bow thruster does; "module:factory" of a function that returns a `StateSpaceModel`; or a
-            `StateSpaceModel` (which the env's spec cannot hold as JSON).
+            as a bow thruster does; a model by name with its numbers, such as
+            "constant-velocity:acceleration=0.04,R=0.25" or "pendulum:length=0.4" (`filters.named`), of the env's
+            `dt`; "module:factory" of a function that returns a `StateSpaceModel`; or a `StateSpaceModel` (which
+            the env's spec cannot hold as JSON). Of a model without inputs the filter ignores the actions.
         tuned: path of a tuned file, which gives filter, parameters and model arguments; or the result of
             `tuning.tune`, whose `filter` is used with its model.
         monitor: tests on the innovations, as a `filters.monitoring.Monitor`, a mapping of its attributes, its
@@ -184,6 +186,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         return self._observe(observation, z, info), reward, terminated, truncated, info
 
     def _clipped(self, action) -> Sequence[float]:
+        if not self._bounds:
+            return ()
         if self._has_one_input and type(action) is np.ndarray and action.size == 1:
             value, (low, high) = action.item(), self._bounds[0]  # the frequent case has to be quick
             if type(value) is float and value == value:
@@ -318,7 +322,9 @@ class EstimateStates(gym.vector.VectorWrapper):
         Raises ValueError, before the envs are stepped, for actions that are not numeric or have the wrong size.
         """
         ignored = self._done if self.autoreset_mode == AutoresetMode.NEXT_STEP else False
-        u = np.clip(checked_actions(actions, self.num_envs, len(self._low), ignored), self._low, self._high)
+        u = np.zeros((self.num_envs, 0))
+        if len(self._low):
+            u = np.clip(checked_actions(actions, self.num_envs, len(self._low), ignored), self._low, self._high)
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         if "recorded_input" in info:
             u = np.where(info["_recorded_input"][:, None], info["recorded_input"], u)

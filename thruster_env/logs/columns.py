@@ -60,6 +60,7 @@ _BRACKETS = re.compile(r"^(?P<base>.*?\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 
 # Kinds of quantities, and names of times.
 INPUT, MEASUREMENT, STATE, OUTPUT = "input", "measurement", "state", "output"
+NO_COLUMN = "a log must have a column"  # with which the message on missing columns begins
 TIME = "time"
 TIME_NAMES = ("t", "time", "Time", "TIME", "timestamp", "stamp")
 DATE_NAMES = ("timestamp", "datetime", "date_time", "date time")
@@ -299,7 +300,7 @@ def _check_columns(
     if needs_time and TIME not in columns:
         texts.append("times (use --column time=HEADER, or --dt)")
     python = f"in Python columns={{{missing[0].quantity.symbol!r}: 'HEADER'}}"
-    rule = f"a log must have a column for {' and for '.join(texts)}"
+    rule = f"{NO_COLUMN} for {' and for '.join(texts)}"
     raise ValueError(f"{rule}, but {file} has {listed(headers)}; {python}")
 
 

@@ -333,7 +333,7 @@ def estimate(
                 "isolate (--isolate) must come with monitor (--monitor STEPS), whose alarms it counts"
             )
         runs = replace(runs, reading=as_tuned(runs.reading, file))
-        recorded, offer = runs.read()
+        recorded, offer = runs.read(is_tuned=file is not None)
         result = estimate_log(
             recorded, filter, offer, tuned=file, smoother=smoother, lag=lag, seed=seed, **numbers
         )

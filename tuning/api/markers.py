@@ -89,6 +89,6 @@ Augment = Annotated[Sequence[str] | Mapping[str, Any], Option(FILTER, metavar="N
 FilterOption = Option(FILTER, ("--filter",), type=str, choices="filters")
 TunedArgument = Argument(FILTER, ("--tuned",), "FILE", str, file=READ)
 PresetOption = Option(INPUT, type=str, choices="presets", file=READ)
-ModelOption = Option(INPUT, metavar="MODULE:OBJECT", type=str)
+ModelOption = Option(INPUT, metavar="MODEL", type=str)
 CodeProblem = Annotated[Any, Option(INPUT, ("--problem",), "MODULE:OBJECT", list[str])]
 TunedFile = Annotated[str | Path, Argument(FILTER, metavar="FILE", type=Path, file=READ)]

@@ -10,6 +10,9 @@ from filters.estimators.find import is_foreign, is_trained
 from filters.registry import FILTERS, filter_type
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import short_repr
+from thruster_env.logs.log import Log
+from thruster_env.logs.recorders.registry import ENDINGS
+from thruster_env.logs.table import SUFFIXES
 from tuning.api.read_logs import RecordedRuns, read_logs
 from tuning.logs.problem import problems_in
 from tuning.problems import find
@@ -17,10 +20,16 @@ from tuning.problems.assumed import augmented, unknowns_of
 from tuning.problems.check import checked_problem
 from tuning.problems.find import built_in, logs_package
 from tuning.problems.problem import Problem
+from tuning.series.column import is_numbers
 
 RULE = (
     "a problem must be a name, a file that ends in .toml, 'module:object', a Problem, what read_logs "
     "returns, or a pair (model, data) of a model and recorded runs"
+)
+
+OF_NUMBERS = (
+    "tuning.fit(z, dt=0.1) finds the model, Q and R of numbers, and tuning.tune(tuning.read_logs(z, model='auto', "
+    "dt=0.1)) tunes any filter of such a model"
 )
 
 
@@ -48,7 +57,7 @@ def problem_of(argument: Any, preset: str | Path | None = None) -> Problem:
 
     Args:
         argument: a name, such as "mismatch" or "auv:motion", a .toml file, or "module:object"; a `Problem`; what
-            `read_logs` returns, or a pair (model, data) for it.
+            `read_logs` returns, or a pair (model, data) for it; or a thruster's log.
         preset: the problem of another thruster, by name or file.
 
     Raises:
@@ -57,6 +66,10 @@ def problem_of(argument: Any, preset: str | Path | None = None) -> Problem:
     if isinstance(argument, tuple) and len(argument) == 2:
         model, logs = argument
         argument = read_logs(logs, model=model)
+    elif is_numbers(argument):
+        raise ValueError(f"numbers must come with a model, but got {short_repr(argument)} alone: {OF_NUMBERS}")
+    elif isinstance(argument, Log | Mapping) or hasattr(argument, "columns") or _is_log_file(argument):
+        argument = read_logs(argument)
     if isinstance(argument, RecordedRuns):
         if preset is not None:
             raise ValueError(f"preset must be given to read_logs, but got {short_repr(preset)} beside {argument}")
@@ -72,7 +85,7 @@ def problem_of(argument: Any, preset: str | Path | None = None) -> Problem:
 
 def problems_of(argument: Any, preset: str | Path | None = None) -> tuple[Problem, ...]:
     """One problem, or several in a list; arguments as in `problem_of`. A second "a" is named "a (2)"."""
-    arguments = argument if isinstance(argument, list) else [argument]
+    arguments = argument if isinstance(argument, list) and not is_numbers(argument) else [argument]
     if not arguments:
         raise ValueError(f"{RULE}, or a list of them, but got an empty list")
     problems = [problem_of(each, preset) for each in arguments]
@@ -120,6 +133,10 @@ def is_filter(argument: Any) -> bool:
     raise ValueError(
         f"a filter must be a name, a tuned file, a Study or an estimator, but got {short_repr(argument)}"
     )
+
+
+def _is_log_file(argument: Any) -> bool:
+    return isinstance(argument, str | Path) and Path(argument).suffix in (*SUFFIXES, *ENDINGS)
 
 
 def _is_tuned_file(text: str) -> bool:

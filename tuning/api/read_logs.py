@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from filters.named import NamedMaker
 from filters.starts import STARTS
 from thruster_env.core.checks import one_of, short_repr
 from thruster_env.logs.findings import OUTLIERS
@@ -15,6 +16,8 @@ from thruster_env.logs.read import INPUTS_ACT
 from thruster_env.logs.recorders.bags import STAMPS
 from tuning.api.markers import LOGS, READ, Augment, ModelOption, Option, PresetOption
 from tuning.logs.read import model_of_logs, name_of, read_named
+from tuning.series.column import as_columns, is_numbers
+from tuning.series.named import with_numbers
 
 if TYPE_CHECKING:
     from tuning.problems.problem import Problem
@@ -50,11 +53,11 @@ class RecordedRuns:
         problem = log_problem(self.files, **self.reading, **self.splits, **self.cuts)
         return augmented(problem, unknowns_of(self.augment))
 
-    def read(self, tuned: Mapping[str, Any] | None = None) -> tuple[Log, Any]:
+    def read(self, *, is_tuned: bool = False) -> tuple[Log, Any]:
         """The only run, and the source of its model at its sample time.
 
         Args:
-            tuned: preset and sensors of a tuned file, where none are set.
+            is_tuned: whether a tuned file has the numbers of a model by name.
 
         Raises:
             ValueError: if there are several runs, or options of such.
@@ -64,7 +67,11 @@ class RecordedRuns:
         if several and len(self.files) != 1:
             raise ValueError(f"logs must be a single one here, but got {len(self.files)}")
         file = self.files[0] if several else self.files
-        return read_named(file, **{**(tuned or {}), **self.reading}, name=name_of(file, 0))
+        log, offer = read_named(file, **self.reading, name=name_of(file, 0))
+        if not isinstance(offer, NamedMaker):
+            return log, offer
+        fitted = with_numbers(offer, log)
+        return log if is_tuned else fitted.log, fitted.maker
 
     def check_uncut(self, what: str, options: Sequence[str] = (*CUTS, AUGMENT)) -> None:
         """Raise ValueError if an option is set that only problems of logs have."""
@@ -111,14 +118,17 @@ def read_logs(
 
     Args:
         files: a .csv, .parquet or .npz file with a header, or a recorder's: .ulg, .bin, .bag, .db3, .mcap, .mat,
-            .h5. In Python also a pandas.DataFrame, a mapping from headers to arrays, a `Log`, or a list.
+            .h5. In Python also a pandas.DataFrame, a mapping from headers to arrays, a `Log`, a list of such; or
+            numbers (K,) or (K, axes), whose model has a name.
         preset: the thruster of the problem or of the runs.
         model: instead of a thruster, a StateSpaceModel, or a function that returns one (called with dt if it has
-            that argument), one of `filters.plants`, such as pendulum, or a FILE.toml with matrices F, H, Q, R, P0.
-            In Python also an object that offers one, or a thruster's preset.
+            that argument); a name, such as pendulum:length=0.4, constant-velocity:axes=2 or auto, whose numbers
+            are found in the log where they are not given; or a FILE.toml with matrices F, H, Q, R, P0. In Python
+            also an object that offers one, or a thruster's preset.
         sensors: a thruster's sensor that the filter sees, thrust by default.
-        columns: the column of an input, measurement, state or output; may be repeated. In Python headers by name,
-            such as {"speed": "motor_rpm", "thrust": "loadcell[kgf]"}.
+        columns: the column of an input, measurement, state or output; may be repeated; of a model of columns of
+            numbers HEADER or X,Y. In Python headers by name, such as
+            {"speed": "motor_rpm", "thrust": "loadcell[kgf]"}.
         clock_offset: offset of a channel's clock, positive if it is ahead. In Python seconds by name.
         dt: sample time [s] of a log without times, or of the grid for irregular ones; variances are per step.
         grid: whether to put irregular logs on a grid, or to use their own time stamps, for a model in continuous
@@ -145,6 +155,7 @@ def read_logs(
         ValueError: states the rule and the value.
     """
     files, model, preset = model_of_logs(files, model, preset)
+    files = as_columns(files) if is_numbers(files) else files
     for name, value, choices in (("outliers", outliers, OUTLIERS), ("start", start, STARTS)):
         if value is not None:
             one_of(name, value, choices)

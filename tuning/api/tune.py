@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,9 +37,9 @@ from tuning.api.markers import (
     Progress,
     Seed,
 )
-from tuning.api.problems import problems_of
+from tuning.api.problems import OF_NUMBERS, problems_of
 from tuning.api.progress import console_for, trial_bar, working
-from tuning.api.read_logs import RecordedRuns
+from tuning.api.read_logs import read_logs
 from tuning.api.study import STUDIES, MethodAnswer, Study
 from tuning.evaluation.baselines import noise_estimated, same_filter
 from tuning.evaluation.held_out import evaluate_held_out
@@ -81,7 +82,6 @@ from tuning.search.study import (
 )
 from tuning.search.trials import run_trial
 from tuning.search.workers import run_in_workers
-from tuning.series.column import column_alone
 
 
 @dataclass(frozen=True)
@@ -133,6 +133,7 @@ def tune(
     out: Annotated[str | Path | bool | None, Option(OUTPUT, type=Path, file=WRITTEN, unset=True)] = None,
     seed: Seed = 0,
     progress: Progress = None,
+    **reading: Any,
 ) -> Study:
     """Find the Q, R and ensemble size that give a filter's best estimate, and evaluate it on held-out seeds.
 
@@ -146,6 +147,7 @@ def tune(
         study.plot_errors()
 
         study = tuning.tune((model, ["run1.csv", "run2.csv"]), trials=100)
+        study = tuning.tune(("constant-velocity", "acc.csv"), filter="kf")
 
     Q's variances and R are searched from 1e-10 to 1e4 times the rule of thumb, on logarithmic scales, beginning
     from 1e-5 to 1e2 (R: 1e-2 to 1e3) and ten times beyond the best trial; given values lie inside, and the report
@@ -173,6 +175,8 @@ def tune(
 
     Example: thruster tune --filter ekf --log run1.csv --log run2.csv --trials 100
 
+    Example: thruster tune --filter kf --log acc.csv --model constant-velocity
+
     Example: thruster tune --filter ekf --method log-score --scenario mismatch
 
     Example: thruster tune --filter auto --budget 2 --scenario published_noise --trials 100
@@ -182,7 +186,7 @@ def tune(
     Args:
         problem: name of a problem; several for their mean, or the worst with `worst`; mismatch by default. In
             Python also a `Problem`, `tuning.find_problem(...)`, `tuning.read_logs(...)`, a pair (model, data) of a
-            model, or a thruster's preset, and recorded runs, or a list.
+            model, its name, or a thruster's preset, and recorded runs, or a list.
         filter: name of a filter, as `thruster filters` lists them, or auto: the best of all within `budget`. In
             Python also "module:object" for an estimator of your own, which can be used, but not saved.
         space: what is searched.
@@ -202,6 +206,7 @@ def tune(
         out: tuned file; out/STUDY.json by default. In Python none by default, and True for that one.
         seed: seed of all randomness; the same seed gives the same results.
         progress: whether to show progress; by default only in terminals and notebooks.
+        **reading: refused; options of logs belong to `tuning.read_logs`.
 
     Returns:
         `Study`: `filter`, `choice`, `held_out`, `save(path)`, `to_frame()`, `plot_history()`, `plot_errors()`.
@@ -210,10 +215,12 @@ def tune(
         ValueError: states the rule and the value.
         KeyboardInterrupt: after Ctrl-C before any trial is complete, or during the held-out evaluation.
     """
-    if isinstance(problem, RecordedRuns) and (column := column_alone(problem.files, problem.reading)) is not None:
-        rule = "a log to tune a filter on must have the columns of a model, a thruster's by default"
-        way_out = f"`thruster fit {column}` (tuning.fit) finds a model, Q and R"
-        raise ValueError(f"{rule}, but {column} has one column of numbers: {way_out}")
+    for name in reading:
+        if name not in signature(read_logs).parameters:
+            raise TypeError(f"tune() got an unexpected keyword argument {name!r}")
+        raise ValueError(
+            f"{name} must be given to tuning.read_logs, whose runs tune takes, not to tune: {OF_NUMBERS}"
+        )
     if not isinstance(filter, str):
         raise ValueError(
             f"filter must be a name or 'module:object', by which trials keep it, but got {short_repr(filter)}"

@@ -8,13 +8,17 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from filters.named import NamedMaker, is_model_name
 from filters.tuned_file import check_preset_file, made_with, read_tuned_file, tune_options
 from thruster_env.core.checks import short_repr
-from thruster_env.core.modules import object_named
 from thruster_env.env.record import read_for
 from thruster_env.logs.findings import has_outliers, remarks_on
 from thruster_env.logs.log import Log, cut_at_gaps, in_any_steps
@@ -22,12 +26,13 @@ from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification, write_values
-from tuning.logs.read import check_model, name_of, read_named, texts
+from tuning.logs.read import check_model, name_of, offer_of, read_named, texts
 from tuning.problems.assumed import name_and_unknown
 from tuning.problems.find import logs_package, named
-from tuning.problems.log_parts import check_apart, check_times
+from tuning.problems.log_parts import check_apart, check_times, parts_of
 from tuning.problems.log_problem import MISSING, LogProblem, without_outliers
 from tuning.problems.problem import Parameter, Problem
+from tuning.series.named import Fitted, is_auto, maker_of, with_numbers
 
 # Of `read_named`.
 OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid", "inputs_act", "stamps")
@@ -77,11 +82,33 @@ def log_problem(
     recorded = [log for log, _ in pairs]
     recorded = without_rescaled(recorded, held_names) if apart else recorded
     runs = {log.name: runs[log.name] for log in recorded}
-    model = read_for(recorded[0], pairs[0][1])[1]()
+    offer = pairs[0][1]
     cuts: dict[str, Any] = {"held_out": held_names, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps or None}
     cuts |= {"start": start, "outliers": outliers}
     cuts = {key: value for key, value in cuts.items() if value is not None and value != []}
-    return LogProblem(recorded, model, **cuts, apart=apart, content=_content(runs, options, cuts))
+    if not isinstance(offer, NamedMaker):
+        content = _content(runs, options, cuts)
+        return LogProblem(recorded, read_for(recorded[0], offer)[1](), **cuts, apart=apart, content=content)
+    run, fitted = _learnt(offer, recorded, cuts)
+    if is_auto(options["model"]):
+        axes = len(fitted.maker.quantities)
+        options["model"] = fitted.maker.name + f":axes={axes}" * (axes > 1)
+    content = _content(runs, options, cuts)
+    recorded[run] = replace(fitted.log, measurements=recorded[run].measurements)
+    assumed, parameters = partial(fitted.maker, dt=recorded[0].dt), fitted.parameters
+    return LogProblem(recorded, assumed, parameters=parameters, **cuts, apart=apart, content=content)
+
+
+def _learnt(maker: NamedMaker, logs: Sequence[Log], cuts: Mapping[str, Any]) -> tuple[int, Fitted]:
+    """The run that has most rows in training blocks, and a model by name with the numbers of these."""
+    logs = list(map(without_outliers, logs)) if cuts.get("outliers") == MISSING else logs
+    options = {"hold_gaps": cuts.get("hold_gaps", False), "sizes": True}
+    parts = parts_of(logs, cuts.get("lead"), cuts.get("blocks"), cuts.get("held_out"), **options)
+    rows = [np.zeros(log.steps + 1, dtype=bool) for log in logs]
+    for block in parts.blocks[: len(parts.training)]:
+        rows[block.run][block.first + parts.lead : block.first + block.rows] = True
+    run = max(range(len(logs)), key=lambda index: int(rows[index].sum()))
+    return run, with_numbers(maker, logs[run], rows[run])
 
 
 def runs_by_name(logs: Any, held_out: Any = None) -> tuple[dict[str, Any], list[str]]:
@@ -215,7 +242,8 @@ def model_named_in(problem: Problem) -> str | None:
     content = problem.as_mapping()
     if content is None or "logs" not in content:
         return None
-    return content["options"].get("model")
+    model = content["options"].get("model")
+    return None if is_model_name(model) else model
 
 
 def split_runs(
@@ -292,7 +320,7 @@ def family_of(
     Raises:
         ValueError: for an unknown name; the message has the known ones.
     """
-    stamped = logs[0].stamps is not None
+    stamped, maker = logs[0].stamps is not None, maker_of(model)
     if stamped and filter != "ekf":
         raise ValueError(f"logs on their own stamps must be identified with the ekf, but got filter {filter}")
     if model is None:
@@ -301,9 +329,13 @@ def family_of(
         whose = None if preset is None else str(preset)
         of_preset = logs_package().family_of_preset(logs, whose, sensors, list(free), noise=noise)
         return AnyStepFamily(of_preset, logs) if stamped else of_preset
+    if maker is not None:
+        longest = max(logs, key=lambda log: log.steps)
+        maker, parameters, _ = with_numbers(replace(maker, quantities=tuple(longest.measured)), longest)
+        return NamedFamily(logs, maker, parameters, list(free))
     if not free:
         raise ValueError("free (--free) must name at least one parameter of the model, but got none")
-    offered = object_named(model, "model") if isinstance(model, str) else model
+    offered = offer_of(model)
     family = LoggedFamily(logs, in_discrete_time(offered), list(free), noise=noise, dt=logs[0].dt)
     return AnyStepFamily(family, logs) if stamped else family
 
@@ -319,6 +351,16 @@ class LoggedFamily(ModelFamily):
     def shifted(self, logs: Sequence[Log]) -> tuple[Log, ...]:
         """Other logs for this family, unchanged."""
         return tuple(logs)
+
+
+class NamedFamily(LoggedFamily):
+    """A model by name with the logs that it is identified on; its numbers give Q and R."""
+
+    def __init__(self, logs: Sequence[Log], maker: NamedMaker, parameters: Sequence[Parameter], free: list[str]):
+        """All numbers are free if none is named, within the ranges that follow from the data."""
+        super().__init__(logs, maker, free or list(maker.names), noise=False, dt=logs[0].dt)
+        by_name = {parameter.name: parameter for parameter in parameters}
+        self.free = tuple(by_name.get(parameter.name, parameter) for parameter in self.free)
 
 
 class AnyStepFamily:

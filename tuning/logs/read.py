@@ -10,13 +10,15 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from filters.models import is_named
+from filters.models import NAMES
+from filters.named import is_model_name, model_named
 from filters.plants import PLANTS
 from filters.tuned_file import check_preset_file, read_tuned_file, tune_options
 from thruster_env.core.checks import finite, short_repr
 from thruster_env.core.files import read_toml
 from thruster_env.core.modules import is_code, object_named
 from thruster_env.env.record import ANY_DT, read_for
+from thruster_env.logs.columns import NO_COLUMN
 from thruster_env.logs.log import Log
 from thruster_env.logs.recorders.registry import ENDINGS
 from thruster_env.logs.table import SUFFIXES
@@ -24,6 +26,8 @@ from thruster_env.model.affine import LETTERS, AffineModel, affine_model
 from thruster_env.model.continuous import ContinuousModel, in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.find import logs_package
+from tuning.series.fit import AUTO
+from tuning.series.named import is_auto, maker_of, read_columns, with_values_of
 
 Named = Mapping[str, Any] | Sequence[str] | None  # a mapping, or texts NAME=VALUE as on a command line
 
@@ -47,9 +51,10 @@ def read_named(
         path: path of a file; a table, as a pandas.DataFrame or a mapping from headers to arrays; or a `Log`.
         preset: the recorded thruster, by name or file, whose clock offsets are corrected; for a model a FILE.toml
             with its values.
-        model: instead of a thruster: a `StateSpaceModel`, what makes or offers one, or "module:object".
+        model: instead of a thruster: a `StateSpaceModel`, what makes or offers one, "module:object", or a name
+            (`filters.named`), of one that is `NamedMaker` for columns of numbers.
         sensors: measured channels of a thruster.
-        columns: headers by quantity, a mapping or texts NAME=HEADER[UNIT].
+        columns: headers by quantity, a mapping or texts NAME=HEADER[UNIT]; of a model by name also HEADER or X,Y.
         clock_offset: seconds by quantity, a mapping or texts NAME=SECONDS.
         dt: sample time [s].
         name: name of a log that is not a file.
@@ -64,9 +69,9 @@ def read_named(
         raise ValueError(
             "a log must be of model (--model) or of a thruster (preset, sensors; --preset, --sensor), but got both"
         )
-    offsets = pairs("clock_offset (--clock-offset)", clock_offset)
+    offsets, maker = pairs("clock_offset (--clock-offset)", clock_offset), maker_of(model)
     options: dict[str, Any] = {
-        "columns": pairs("columns (--column)", columns),
+        "columns": pairs("columns (--column)", columns if maker is None else _named_by_headers(columns)),
         "clock_offset": {key: _seconds(key, value) for key, value in offsets.items()},
         "dt": dt,
         "grid": None if grid else False,
@@ -79,8 +84,14 @@ def read_named(
             raise ValueError(f"{option} must come with a file or a table, but {path.name} is a Log already")
     elif name is not None:
         options["name"] = name
+    if maker is not None:
+        if preset is not None:
+            from tuning.identification.result import read_values
+
+            maker = with_values_of(maker, read_values(preset), preset)
+        return read_columns(maker, path, **options)
     if model is not None:
-        offer = object_named(model, "model") if isinstance(model, str) else model
+        offer = offer_of(model)
         if preset is not None:
             from tuning.identification.result import with_values
 
@@ -92,12 +103,45 @@ def read_named(
     room = logs_package()
     whose = room.DEFAULT_PRESET if preset is None else str(preset)
     thruster = room.Preset(whose, sensors, ANY_DT)
-    log, _ = read_for(path, thruster.state_space_model(), **options)
+    try:
+        log, _ = read_for(path, thruster.state_space_model(), **options)
+    except ValueError as error:
+        lacks_all = all(part in str(error) for part in (NO_COLUMN, "the input ", "the measurement "))
+        if preset is not None or sensors or options["columns"] or not lacks_all:
+            raise
+        raise ValueError(_of_another_plant(path, str(error))) from None
     known = {key: value for key, value in thruster.clock_offset.items() if f"measurement:{key}" not in log.offsets}
     if known and not isinstance(path, Log):  # offsets of the user or of the log itself have priority
         options["clock_offset"] |= known
         log, _ = read_for(path, thruster.state_space_model(), **options)
     return log, room.Preset(whose, sensors, log.dt)
+
+
+def _of_another_plant(path: Any, error: str) -> str:
+    """What to do with a log without a model that is not a thruster's."""
+    rule = "a log must have the columns of its model, a thruster's by default"
+    names = ", ".join((*NAMES, *PLANTS))
+    fit = f"`thruster fit {path}` (tuning.fit)" if isinstance(path, str | PathLike) else "tuning.fit"
+    return (
+        f"{rule}, but {error.partition(', but ')[2].partition('; ')[0]}: {fit} finds a "
+        f"model with Q and R, --model auto (model='auto') uses it; other models are {names} and MODULE:OBJECT, "
+        "with --column HEADER where there are several columns of numbers"
+    )
+
+
+def offer_of(model: Any) -> Any:
+    """The source of a model: one of `filters.plants` by its name, the object of "module:object", or itself."""
+    if not isinstance(model, str):
+        return model
+    return model_named(model) if is_model_name(model) else object_named(model, "model")
+
+
+def _named_by_headers(columns: Named) -> Named:
+    """Headers of a named model's axes, also as texts HEADER or X,Y, by these."""
+    if not isinstance(columns, list | tuple):
+        return columns
+    headers = [part for text in columns for part in (text.split(",") if "=" not in str(text) else [text])]
+    return [text if "=" in text else f"{text}={text}" for text in headers]
 
 
 def pairs(option: str, named: Named) -> dict[str, Any]:
@@ -144,12 +188,15 @@ def as_tuned(named: Mapping[str, Any], tuned: str | Path | None) -> dict[str, An
     check_preset_file(options, named.get("preset"), tuned)
     if named.get("preset") is None:
         check_model(options.get("model"), None, tuned)
-    stored: dict[str, Any] = {name: value for name, value in options.items() if name in ("preset", "sensors")}
+    names = ("preset", "sensors", *(["model"] if is_model_name(options.get("model")) else []))
+    stored: dict[str, Any] = {name: value for name, value in options.items() if name in names}
     return {**stored, **{name: value for name, value in named.items() if value not in (None, [])}}
 
 
 def check_model(named, trusted: Any, file: str | Path) -> None:
     """Raise ValueError unless the caller gives the code that a file names, by this name or as an object."""
+    if trusted is None and (is_auto(named) or is_model_name(named)):
+        return  # it is data
     if named is None and trusted is not None:
         raise ValueError(
             f"model (--model) must be left out for logs of a thruster, as in {file}, but got {short_repr(trusted)}"
@@ -183,8 +230,8 @@ def model_of_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any
         if model is not None:
             raise ValueError(f"a pair (model, logs) must come without another model, but got {short_repr(model)}")
         model, logs = logs
-    if str(model) in PLANTS:
-        return logs, f"{PLANTS[str(model)].__module__}:{PLANTS[str(model)].__name__}", preset
+    if is_auto(model) or is_model_name(model):
+        return logs, model, preset
     if not isinstance(model, str | Path) or is_code(str(model)):
         return logs, model, preset
     if Path(model).suffix == ".toml" and Path(model).is_file():
@@ -196,9 +243,9 @@ def model_of_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any
             f"give either a model or a preset, but got both, {short_repr(model)} and {short_repr(preset)}"
         )
     if not logs_package().is_preset(model):
-        rule = f"a model must be an object, 'module:object', one of {', '.join(PLANTS)}, or a thruster's preset"
-        way_out = " (thruster fit takes models of one column of numbers by name)" if is_named(str(model)) else ""
-        raise ValueError(f"{rule}, but got {short_repr(model)}{way_out}")
+        names = ", ".join((AUTO, *NAMES, *PLANTS))
+        rule = f"a model must be an object, 'module:object', a thruster's preset, or a name of {names}"
+        raise ValueError(f"{rule}, but got {short_repr(model)}")
     return logs, None, model
 
 
@@ -220,7 +267,12 @@ def _is_model(candidate: Any) -> bool:
     if isinstance(candidate, str | Path):
         if Path(candidate).suffix in (*SUFFIXES, *ENDINGS):  # a log in a folder of Windows has a colon, too
             return False
-        return is_code(str(candidate)) or str(candidate) in PLANTS or logs_package().is_preset(candidate)
+        return (
+            is_code(str(candidate))
+            or is_model_name(candidate)
+            or is_auto(candidate)
+            or logs_package().is_preset(candidate)
+        )
     return (
         isinstance(candidate, StateSpaceModel | ContinuousModel)
         or hasattr(candidate, "state_space_model")

@@ -16,6 +16,7 @@ from filters.models import Scales, named_model
 from thruster_env.core.checks import as_floats, listed, one_of, short_repr
 from thruster_env.logs.columns import DATE_NAMES, TIME, TIME_NAMES, parted, simple
 from thruster_env.logs.findings import sentences
+from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 from thruster_env.logs.recorders.registry import format_of
 from thruster_env.logs.table import Table, read_table, table_of
@@ -107,10 +108,40 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
     if is_table and times is not None:
         rule = "the times of a table or a file must be one of its columns"
         raise ValueError(f"{rule}, but got {short_repr(times)} beside it")
-    source: Any = z if is_table else _as_columns(z, times)
+    named = column.split(",") if isinstance(column, str) else column
+    log = log_of_columns(z, named, dt=dt, times=times)
+    for quantity, values in zip(log.measured, log.measurements.T, strict=True):
+        _check_numbers(quantity.symbol, values)
+    values = log.measurements[:, 0] if len(log.measured) == 1 else log.measurements
+    return Column(values, log.dt, log.measured, tuple(sentences(log.findings)))
+
+
+def log_of_columns(
+    z: Any,
+    named: Sequence[str] | None,
+    axes: int = 1,
+    *,
+    dt: float | None = None,
+    times: Any = None,
+    **options: Any,
+) -> Log:
+    """Columns of numbers as a log without inputs, whose measurements are named by their headers.
+
+    Args:
+        z: as `column_of` takes it.
+        named: headers, one for each axis; None where there are as many columns as axes.
+        axes: number of columns without names.
+        dt: sample time [s], for numbers without times, or of the grid.
+        times: as `column_of` takes it.
+        **options: others of `thruster_env.logs.read.read_log`.
+
+    Raises:
+        ValueError: for another number of columns, an unknown header, or too few numbers.
+    """
+    is_table = isinstance(z, str | Path | Mapping) or hasattr(z, "columns")
+    source: Any = z if is_table else as_columns(z, times)
     is_file = isinstance(source, str | Path)
     recorded = is_file and format_of(source) is not None
-    named = column.split(",") if isinstance(column, str) else column
     if recorded:
         if named is None:
             rule = "the column of a recorder's file must be named (column=, --column TOPIC.FIELD)"
@@ -118,21 +149,19 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
         headers, time = list(named), None
     else:
         table = read_table(source) if is_file else table_of(source, "a table")
-        named = [column] if isinstance(column, str) and column in table.names else named
+        if named is not None and ",".join(named) in table.names:
+            named = [",".join(named)]
         if named is None and source is not z and isinstance(source, Mapping):
             named = [name for name in source if name != TIME]
-        headers, time = _headers(table, named)
+        headers, time = _headers(table, named, axes)
         for header in headers:
             _check_numbers(header, table.numbers(header))
     quantities = tuple(map(_quantity, headers))
     reader = named_model("constant").model({"drift": 1.0}, 1.0, 1.0, quantities=quantities)
     columns = {quantity.symbol: header for quantity, header in zip(quantities, headers, strict=True)}
     columns |= {} if time is None else {TIME: time}
-    log = read_log(source, reader, columns, dt=1.0 if dt is None and time is None and not recorded else dt)
-    for header, values in zip(headers, log.measurements.T, strict=True):
-        _check_numbers(header, values)
-    values = log.measurements[:, 0] if len(headers) == 1 else log.measurements
-    return Column(values, log.dt, quantities, tuple(sentences(log.findings)))
+    options["dt"] = 1.0 if dt is None and time is None and not recorded else dt
+    return read_log(source, reader, columns, **{key: value for key, value in options.items() if value is not None})
 
 
 def _quantity(header: str) -> Quantity:
@@ -153,25 +182,20 @@ def _check_numbers(header: str, values: np.ndarray) -> None:
         raise ValueError(f"{rule}, but varies by {width:.3g}: use another unit")
 
 
-def column_alone(files: Any, reading: Mapping[str, Any]) -> str | Path | None:
-    """The file of a log that has one column of numbers beside its times, if nothing but dt is said of it.
-
-    Args:
-        files: of recorded runs.
-        reading: options by which they are read.
-    """
-    several = isinstance(files, list | tuple)
-    file = files[0] if several and len(files) == 1 else files
-    if not isinstance(file, str | Path) or not set(reading) <= {"dt"} or format_of(file) is not None:
-        return None
-    try:
-        _headers(read_table(file), None)
-    except ValueError:  # several columns, or none: whoever reads the log says what is wrong
-        return None
-    return file
+def is_numbers(z: Any) -> bool:
+    """Whether something is an array, a list of numbers or a pandas Series, and no table."""
+    if isinstance(z, np.ndarray) or hasattr(z, "to_frame") and not hasattr(z, "columns"):
+        return True
+    first = z[0] if isinstance(z, list | tuple) and len(z) else ""
+    return (
+        first is None
+        or isinstance(first, int | float | np.number)
+        or isinstance(first, list)
+        and is_numbers(first)
+    )
 
 
-def _as_columns(z: Any, times: Any) -> Mapping[str, Any]:
+def as_columns(z: Any, times: Any = None) -> Mapping[str, Any]:
     """An array, a list or a pandas Series as a table or a mapping from headers to arrays."""
     if hasattr(z, "to_frame") and times is None:
         return z.to_frame(z.name or "z")
@@ -192,16 +216,19 @@ def _as_columns(z: Any, times: Any) -> Mapping[str, Any]:
     return columns if times is None else {TIME: np.asarray(times), **columns}
 
 
-def _headers(table: Table, named: Sequence[str] | None) -> tuple[list[str], str | None]:
-    """The headers of the numbers and that of the times; ValueError for several columns without names."""
+def _headers(table: Table, named: Sequence[str] | None, axes: int = 1) -> tuple[list[str], str | None]:
+    """The headers of the numbers and that of the times; ValueError for other columns than axes without names."""
     times = [name for name in table.names if parted(name)[0].strip().lower() in (*TIME_NAMES, *DATE_NAMES)]
     times += [name for name in table.names if name not in times and table.dates(name) is not None]
     time = next((name for name in times if name not in (named or ())), None)
     numbers = [name for name in table.names if name not in times]
     if named is not None:
-        return [one_of(f"a column of {table.file}", header.strip(), table.names) for header in named], time
-    if len(numbers) != 1:
-        rule = "a file must have one column of numbers beside its times, or columns must be named"
+        by_name = {parted(name)[0].strip().lower(): name for name in table.names}
+        of = {header: header if header in table.names else by_name.get(header.strip().lower()) for header in named}
+        return [of[each] or one_of(f"a column of {table.file}", each.strip(), table.names) for each in named], time
+    if len(numbers) != axes:
+        count = "one column" if axes == 1 else f"{axes} columns"
+        rule = f"a file must have {count} of numbers beside its times, or columns must be named"
         way = "column=, --column HEADER, or --column X,Y for the axes of a track"
         raise ValueError(f"{rule} ({way}), but {table.file} has {listed(numbers)}")
     return numbers, time

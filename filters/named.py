@@ -1,0 +1,183 @@
+"""Models by name as text: "constant-velocity:axes=2", "pendulum:length=0.4", for wrappers, logs and commands.
+
+A name is one of `filters.models`, or a sum of such, or one of `filters.plants`; behind a colon stand values of its
+numbers. What it gives is a function of numbers that makes a model, as other sources of models are.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+from filters.models import NAMED, is_named, named_model
+from filters.plants import PLANTS
+from thruster_env.core.checks import at_least, finite, one_of, positive, short_repr
+from thruster_env.model.affine import AffineModel
+from thruster_env.model.continuous import AtDt, ContinuousModel
+from thruster_env.model.quantities import Quantity
+from thruster_env.model.state_space import StateSpaceModel
+
+R, AXES, DT, MEAN = "R", "axes", "dt", "mean"  # settings of every model of `filters.models` beside its numbers
+NUMBERS = {number.name for model in NAMED.values() for number in model.free}
+MOST_AXES = 64
+
+
+@dataclass(frozen=True)
+class NamedMaker:
+    """A model of `filters.models` as a function of its numbers, R and dt.
+
+        model_named("constant-velocity:axes=2,acceleration=0.04,R=0.25")(dt=0.1)
+
+    Attributes:
+        name: of the model, or a sum.
+        quantities: name, symbol and unit of the measurement on each axis.
+        values: of its numbers and R by name; those that it lacks must be given when it is called.
+        mean: of the data on each axis, or one for all, about which a model without a level varies.
+        first: the first measurement of each axis, where a filter begins.
+        spread: of the data.
+        dt: sample time [s], if the text gives it.
+    """
+
+    name: str
+    quantities: tuple[Quantity, ...] = (Quantity("measurement", "z"),)
+    values: Mapping[str, float] = field(default_factory=dict)
+    mean: tuple[float, ...] | None = None
+    first: tuple[float, ...] = (0.0,)
+    spread: float = 1.0
+    dt: float | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the numbers, R last."""
+        return (*(number.name for number in named_model(self.name).free), R)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all numbers have a value."""
+        return set(self.names) <= set(self.values)
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        """Dt and the numbers, with their values as defaults."""
+        nothing, kind = inspect.Parameter.empty, inspect.Parameter.KEYWORD_ONLY
+        defaults = {name: self.values.get(name, nothing) for name in self.names}
+        defaults[DT] = nothing if self.dt is None else self.dt
+        return inspect.Signature([inspect.Parameter(name, kind, default=defaults[name]) for name in defaults])
+
+    def __call__(self, *, dt: float | None = None, **numbers: float) -> AffineModel:
+        """The model; ValueError if a number has no value."""
+        dt, values = self.dt if dt is None else dt, {**self.values, **numbers}
+        missing = [name for name in self.names if name not in values] + [DT] * (dt is None)
+        if dt is None or missing:
+            settings = ",".join(f"{name}=..." for name in missing)
+            raise ValueError(
+                f"{self.name} must come with {', '.join(missing)}, as {self.name}:{settings}, but got none: "
+                "thruster fit (tuning.fit) finds these numbers in data"
+            )
+        return named_model(self.name).model(
+            {name: value for name, value in values.items() if name != R},
+            positive(R, values[R]),
+            dt,
+            first=self.first,
+            spread=self.spread,
+            offset=0.0 if self.mean is None else self.mean,
+            quantities=self.quantities,
+        )
+
+
+def model_named(text: Any) -> NamedMaker | Callable[..., ContinuousModel] | None:
+    """What makes the model of NAME[:KEY=VALUE,...]; None for a text that is no such name.
+
+    Args:
+        text: a model of `filters.models`, or a sum of such, with values of its numbers, R, axes, dt, mean; or one
+            of `filters.plants` with values of its arguments.
+
+    Raises:
+        ValueError: for an unknown setting, or a value that is no number.
+    """
+    if not is_model_name(text):
+        return None
+    name, _, settings = text.partition(":")
+    return _plant(name.strip(), settings) if name.strip() in PLANTS else _maker(text)
+
+
+def is_model_name(text: Any) -> bool:
+    """Whether something is the name of a model, perhaps with settings, and no "module:object"."""
+    if not isinstance(text, str) or re.fullmatch(r"[\w.]+:[A-Za-z_][\w.]*", text):
+        return False
+    return text.partition(":")[0].strip() in PLANTS or is_named(re.sub(r"\d[eE]\+\d", "", text))
+
+
+def model_for_step(text: Any, dt: float | None) -> Callable[..., StateSpaceModel] | None:
+    """The function of numbers that makes the model of a name for a sample time [s]; None for another text.
+
+    Raises:
+        ValueError: for a wrong setting, or a model without a sample time.
+    """
+    maker = model_named(text)
+    if maker is None:
+        return None
+    dt = maker.dt if isinstance(maker, NamedMaker) and maker.dt is not None else dt
+    if dt is None:
+        way_out = f"{maker.name}:dt=..." if isinstance(maker, NamedMaker) else "give it by a function"
+        raise ValueError(f"a model by name must have a sample time, but {text} has no dt here: {way_out}")
+    return partial(maker if isinstance(maker, NamedMaker) else AtDt(maker), dt=dt)
+
+
+def _plant(name: str, settings: str) -> Callable[..., ContinuousModel]:
+    """A function of `filters.plants`, with some of its arguments."""
+    make = PLANTS[name]
+    known = {
+        key: parameter.default
+        for key, parameter in inspect.signature(make).parameters.items()
+        if isinstance(parameter.default, float | str)
+    }
+    values: dict[str, Any] = {}
+    for key, value in _pairs(name, settings).items():
+        default = known[one_of(f"a setting of {name}", key, known)]
+        values[key] = value if isinstance(default, str) else finite(f"{key} of {name}", value)
+    return partial(make, **values) if values else make
+
+
+def _maker(text: str) -> NamedMaker:
+    parts, values = [], {}
+    for part in re.split(r"\+(?!\d)", text):
+        name, _, settings = (piece.strip() for piece in part.partition(":"))
+        retained = []
+        for setting in settings.split(",") if settings else []:
+            key, equals, value = (piece.strip() for piece in setting.partition("="))
+            if equals and (key in (R, AXES, DT, MEAN) or any(key.endswith(number) for number in NUMBERS)):
+                values[name.replace("-", "_"), key] = value
+            else:
+                retained.append(setting)
+        parts.append(name + ":" * bool(retained) + ",".join(retained))
+    maker = NamedMaker(named_model(" + ".join(parts)).name)
+    known, numbers = (*maker.names, AXES, DT, MEAN), {}
+    for (part, key), value in values.items():
+        key = f"{part}_{key}" if f"{part}_{key}" in known else key
+        check = finite if key == MEAN else positive
+        numbers[one_of(f"a setting of {maker.name}", key, known)] = check(f"{key} of {maker.name}", value)
+    count, dt, mean = numbers.pop(AXES, 1.0), numbers.pop(DT, None), numbers.pop(MEAN, None)
+    axes = at_least(AXES, int(count) if count == int(count) else count, 1, MOST_AXES)
+    maker = replace(maker, values=numbers, dt=dt, mean=None if mean is None else (mean,))
+    return replace(maker, quantities=axes_named("z", axes))
+
+
+def axes_named(symbol: str, axes: int) -> tuple[Quantity, ...]:
+    """The measurements of so many axes: z, or z_1, z_2, ..."""
+    symbols = [symbol] if axes == 1 else [f"{symbol}_{i + 1}" for i in range(axes)]
+    return tuple(Quantity("measurement", each) for each in symbols)
+
+
+def _pairs(name: str, settings: str) -> dict[str, str]:
+    pairs: dict[str, str] = {}
+    for setting in settings.split(",") if settings else []:
+        key, equals, value = (piece.strip() for piece in setting.partition("="))
+        if not equals or key in pairs:
+            raise ValueError(f"settings of {name} must be KEY=VALUE, each once, but got {short_repr(setting)}")
+        pairs[key] = value
+    return pairs

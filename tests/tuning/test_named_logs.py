@@ -1,0 +1,98 @@
+"""Models by name on recorded runs: any columns, numbers of the training rows alone."""
+
+import numpy as np
+import pytest
+
+import tuning
+from filters.models import kalman_filter
+from tuning.api.problems import problem_of
+
+rng = np.random.default_rng(4)
+VELOCITY = np.cumsum(0.2 * rng.normal(size=300))
+Z = np.cumsum(0.1 * VELOCITY) + 0.5 * rng.normal(size=300)
+TRACK = {"time": 0.1 * np.arange(300), "x [m]": Z, "y [m]": Z[::-1].copy()}
+NAME = "constant-velocity"
+
+
+@pytest.fixture
+def log(tmp_path):
+    file = tmp_path / "acc.csv"
+    np.savetxt(
+        file, np.column_stack([TRACK["time"], Z]), delimiter=",", header="t,pos [m]", comments="", fmt="%.17g"
+    )
+    return file
+
+
+def test_numbers_of_a_study_are_those_of_its_training_blocks(log):
+    problem = problem_of((NAME, log))
+    assert [parameter.name for parameter in problem.parameters] == ["acceleration", "R"]
+    blocks, lead = problem.parts.blocks, problem.parts.lead
+    known = np.full(300, np.nan)
+    for block in blocks[: len(problem.parts.training)]:
+        rows = slice(block.first + lead, block.first + block.rows)
+        known[rows] = Z[rows]
+    fit = tuning.fit(known, 0.1, model=NAME)
+    assert problem.given == pytest.approx({"acceleration": fit.numbers[0].value, "R": fit.r}, rel=1e-3)
+    changed = known.copy()
+    changed[np.isnan(known)] = rng.normal(size=np.isnan(known).sum())
+    again = problem_of((NAME, {"time": TRACK["time"], "pos [m]": changed}))
+    assert again.given == pytest.approx(problem.given, rel=1e-9)  # held-out rows and lead-ins count for nothing
+
+
+def test_an_estimate_uses_given_numbers_or_finds_them_and_says_which(log):
+    filter_ = kalman_filter(NAME, dt=0.1, noise=0.3, acceleration=0.5)
+    stated = tuning.estimate((f"{NAME}:acceleration=0.5,R=0.3", log), filter="kf")
+    np.testing.assert_allclose(stated.filter.model.process_noise_cov, filter_.model.process_noise_cov, rtol=1e-9)
+    assert not any("maximum-likelihood" in sentence for sentence in stated.sentences())
+    free, fit = tuning.estimate(("auto", log), filter="kf"), tuning.fit(log)
+    assert free.filter.model.measurement_noise_cov[0, 0] == pytest.approx(fit.r, rel=1e-4)
+    assert any(f"--model {NAME}:acceleration=" in sentence for sentence in free.sentences())
+    for numbers in (Z, Z.tolist()):
+        reading = tuning.read_logs(numbers, model=f"{NAME}:acceleration=0.5,R=0.3", dt=0.1)
+        np.testing.assert_allclose(tuning.estimate(reading, filter="kf").means, stated.means, rtol=1e-6, atol=1e-6)
+
+
+def test_identified_numbers_are_those_of_fit_and_a_preset_for_other_commands(log, tmp_path):
+    identified = tuning.identify((NAME, log), starts=1)
+    fit = tuning.fit(log, model=NAME)
+    assert set(identified.values) == {"acceleration", "R"} and identified.values["R"] == pytest.approx(
+        fit.r, rel=0.05
+    )
+    file = identified.save(tmp_path / "found.toml")
+    runs = tuning.read_logs(log, model=NAME, preset=file)
+    used = tuning.estimate(runs, filter="kf").filter.model
+    assert used.measurement_noise_cov[0, 0] == pytest.approx(identified.values["R"], rel=1e-12)
+
+
+def test_a_tuned_file_of_a_named_model_needs_no_model_again(log, tmp_path):
+    study = tuning.tune(("auto", str(log)), filter="kf", trials=3, progress=False)
+    assert study.problem.as_mapping()["options"]["model"] == NAME
+    file = study.save(tmp_path / "tuned.json")
+    used = tuning.estimate(str(log), file).filter.model
+    np.testing.assert_allclose(used.process_noise_cov, study.filter.model.process_noise_cov, rtol=1e-12)
+    assert not any("maximum-likelihood" in sentence for sentence in tuning.estimate(log, file).sentences())
+
+
+def test_columns_of_axes_are_those_that_are_named_or_as_many():
+    runs = [
+        tuning.read_logs(TRACK, model=f"{NAME}:axes=2,acceleration=1,R=1"),
+        tuning.read_logs(TRACK, model=f"{NAME}:acceleration=1,R=1", columns=["x,y"]),
+    ]
+    for each in runs:
+        recorded, maker = each.read()
+        assert [quantity.symbol for quantity in recorded.measured] == ["x", "y"] and maker(dt=0.1).n == 4
+    with pytest.raises(ValueError, match=r"one column of numbers beside its times"):
+        tuning.read_logs(TRACK, model=NAME).read()
+    with pytest.raises(ValueError, match="of 3 axes must have as many columns"):
+        tuning.read_logs(TRACK, model=f"{NAME}:axes=3", columns=["x,y"]).read()
+
+
+def test_numbers_without_a_model_and_logs_of_another_plant_name_the_way():
+    with pytest.raises(ValueError, match=r"tuning.fit\(z, dt=0.1\) finds the model"):
+        tuning.tune(Z)
+    with pytest.raises(ValueError, match=r"dt must be given to tuning.read_logs.*tuning.fit\(z, dt=0.1\)"):
+        tuning.tune(Z, dt=0.1)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'trial'"):
+        tuning.tune("mismatch", trial=3)
+    with pytest.raises(ValueError, match="has time, x .m., y .m.: tuning.fit finds a model.*--model auto"):
+        tuning.estimate(TRACK)
