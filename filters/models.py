@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -25,11 +25,11 @@ import numpy as np
 from filters.gaussian.kalman import KalmanFilter
 from thruster_env.core.checks import at_least, one_of, positive, short_repr
 from thruster_env.model.affine import AffineModel, affine_model
-from thruster_env.model.continuous import noise_of_densities
 from thruster_env.model.quantities import Quantity
 
 MOST_HARMONICS = 6
 UNDAMPED = 1e-6  # share of decay in a rate, below which it is that of a harmonic
+TERMS, LARGEST_TERM = 14, 0.5  # of the series of e^(A h), and the norm of A h from which on h is halved
 WIDE = 100.0  # spreads of the data in the prior's deviation: a start that knows nothing
 
 
@@ -65,35 +65,96 @@ class Signal(NamedTuple):
     """A linear signal in continuous time: A, S, C, and the symbols of its states with their units."""
 
     slope: np.ndarray  # A, (n, n)
-    densities: np.ndarray  # S, (n, n)
+    densities: np.ndarray  # S, (n, n), diagonal
     output: np.ndarray  # C, (n,)
     states: tuple[tuple[str, str], ...]  # symbol, and unit with U for the data's
     orders: tuple[int, ...]  # how often each state is differentiated by time: U/s^order
+    variances: np.ndarray  # (n,), stationary ones; infinite for states that start anywhere
 
     def transition(self, dt: float) -> np.ndarray:
         """F = e^(A dt), (n, n)."""
-        from scipy.linalg import expm
-
-        return expm(self.slope * dt)
+        return self.step(dt)[0]
 
     def noise(self, dt: float) -> np.ndarray:
-        """Q of a step of dt [s], (n, n), by van Loan."""
-        return noise_of_densities(self.densities, self.slope, dt)
+        """Q of a step of dt [s], (n, n)."""
+        return self.step(dt)[1]
 
     def step(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """F and Q of a step of dt [s] where S is diagonal; fast where A was met before."""
-        densities = np.diag(self.densities)
-        driven = tuple(np.flatnonzero(densities).tolist())
-        transition, noises = _step_of_units(self.slope.tobytes(), len(densities), driven, dt)
-        return transition, np.tensordot(densities[list(driven)], noises, 1)
+        """F and Q of a step of dt [s]."""
+        transitions, noises = steps(self.slope, self.driven, self.orders, np.array([dt]))
+        return transitions[0], np.tensordot(np.diag(self.densities)[list(self.driven)], noises[:, 0], 1)
+
+    def start(self, spread: float, dt: float) -> np.ndarray:
+        """Variances of the first state, (n,): stationary ones, or else those of a hundred spreads of the data."""
+        wide = (WIDE * spread / dt ** np.array(self.orders)) ** 2
+        return np.where(np.isfinite(self.variances), self.variances, wide)
+
+    @property
+    def driven(self) -> tuple[int, ...]:
+        """Indices of the states that white noise drives."""
+        return tuple(np.flatnonzero(np.diag(self.densities)).tolist())
 
 
-@lru_cache(maxsize=64)
-def _step_of_units(slope: bytes, n: int, driven: tuple[int, ...], dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """F of rates A, and Q of white noise of density 1 on each of some states, (driven, n, n)."""
-    a, unit = np.frombuffer(slope).reshape(n, n), np.eye(n)
-    signals = [Signal(a, np.diag(unit[i]), unit[0], (), ()) for i in driven]
-    return signals[0].transition(dt), np.array([signal.noise(dt) for signal in signals])
+def steps(
+    slope: np.ndarray, driven: Sequence[int], orders: Sequence[int], dts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """F of steps of different lengths, and Q of white noise of density 1 on each of some states.
+
+        F(h) = sum_k A^k h^k/k!,  Q(h) = sum_k L^k(S) h^(k+1)/(k+1)!,  L(X) = A X + X A'
+        F(2h) = F(h)^2,  Q(2h) = Q(h) + F(h) Q(h) F(h)'
+
+    No term cancels another in Q, and only products of matrices are computed, for all lengths at once.
+
+    Args:
+        slope: A, (..., n, n).
+        driven: indices of d states.
+        orders: how often each state is differentiated by time, (n,): units in which A is well scaled.
+        dts: lengths h [s], (u,).
+
+    Returns:
+        F, (..., u, n, n), and Q, (..., d, u, n, n).
+
+    Source: van Loan (1978), "Computing integrals involving the matrix exponential", IEEE Transactions on Automatic
+    Control 23(3); Moler, van Loan (2003), SIAM Review 45(1), method 3, for scaling and doubling.
+    """
+    n, unit = slope.shape[-1], float(dts.max())
+    scale = unit ** np.asarray(orders, dtype=np.float64)  # of x in units of the data
+    a = (slope * scale[:, None] / scale * unit)[..., None, :, :]  # an axis for what is driven
+    terms = [np.broadcast_to(np.eye(n), a.shape)]
+    while len(terms) < n and terms[-1].any():
+        terms.append(a @ terms[-1] / len(terms))
+    is_polynomial = not (a @ terms[-1]).any()
+    count = 2 * n - 1 if is_polynomial else TERMS
+    noise = np.zeros((len(driven), n, n))
+    noise[range(len(driven)), driven, driven] = 1.0
+    noises = [np.broadcast_to(noise, (*a.shape[:-3], *noise.shape))]
+    for k in range(1, count):
+        rate = a @ noises[-1]
+        noises.append((rate + np.swapaxes(rate, -1, -2)) / (k + 1))
+        if not is_polynomial and k >= len(terms):
+            terms.append(a @ terms[-1] / k)
+    doublings = np.zeros(len(dts), dtype=np.int64)
+    if not is_polynomial:
+        reach = float(np.abs(a).sum(axis=-1).max()) / LARGEST_TERM
+        doublings = np.maximum(np.ceil(np.log2(np.maximum(reach * dts / unit, 1e-300))), 0.0).astype(np.int64)
+    lengths = dts / unit * 0.5**doublings
+    f = _polynomials(np.concatenate(terms, axis=-3), lengths)
+    q = _polynomials(np.stack(noises, axis=-3), lengths) * lengths[:, None, None]
+    for turn in range(int(doublings.max(initial=0))):
+        now = doublings > turn
+        part, of_noise = f[..., now, :, :], q[..., now, :, :]
+        wide = part[..., None, :, :, :]
+        q[..., now, :, :] = of_noise + wide @ of_noise @ np.swapaxes(wide, -1, -2)
+        f[..., now, :, :] = part @ part
+    q *= (unit ** (1.0 + 2.0 * np.asarray(orders, dtype=np.float64)))[list(driven), None, None, None]
+    return f / scale[:, None] * scale, q / np.outer(scale, scale)
+
+
+def _polynomials(terms: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """sum_k terms_k h^k of matrices (..., k, n, n), for each length h (u,): (..., u, n, n)."""
+    *leading, count, n, _ = terms.shape
+    powers = lengths[:, None] ** np.arange(count)
+    return (powers @ terms.reshape(*leading, count, n * n)).reshape(*leading, len(lengths), n, n)
 
 
 class NamedModel(NamedTuple):
@@ -144,7 +205,8 @@ def _integrators(count: int, densities: tuple[float, ...], symbols: tuple[str, .
     """A chain x_1' = x_2, x_2' = x_3, ..., of which the first is measured."""
     units = ("U", "U/s", "U/s^2")
     states = tuple(zip(symbols, units[:count], strict=True))
-    return Signal(np.eye(count, k=1), np.diag(densities), np.eye(count)[0], states, tuple(range(count)))
+    anywhere = np.full(count, np.inf)
+    return Signal(np.eye(count, k=1), np.diag(densities), np.eye(count)[0], states, tuple(range(count)), anywhere)
 
 
 def constant(drift: float) -> Signal:
@@ -203,6 +265,7 @@ def ornstein_uhlenbeck(time_constant: float, std: float) -> Signal:
         np.ones(1),
         (("deviation", "U"),),
         (0,),
+        np.array([std**2]),
     )
 
 
@@ -220,7 +283,7 @@ def singer(time_constant: float, acceleration_std: float) -> Signal:
     chain = _integrators(
         3, (0.0, 0.0, 2.0 * acceleration_std**2 / time_constant), ("position", "velocity", "acceleration")
     )
-    return chain._replace(slope=slope)
+    return chain._replace(slope=slope, variances=np.array([np.inf, np.inf, acceleration_std**2]))
 
 
 def oscillator(frequency: float, damping: float, std: float) -> Signal:
@@ -242,6 +305,7 @@ def oscillator(frequency: float, damping: float, std: float) -> Signal:
         np.array([1.0, 0.0]),
         (("oscillation", "U"), ("quadrature", "U")),
         (0, 0),
+        np.array([std**2, std**2]),
     )
 
 
@@ -325,7 +389,8 @@ def harmonics(drift: float, period: float, count: int) -> Signal:
     slope = np.kron(np.diag(np.arange(1.0, count + 1.0)), [[0.0, w], [-w, 0.0]])
     states = [(f"{word}_{k + 1}", "U") for k in range(count) for word in ("harmonic", "quadrature")]
     output = np.tile([1.0, 0.0], count)
-    return Signal(slope, drift * np.eye(2 * count), output, tuple(states), (0,) * (2 * count))
+    orders, anywhere = (0,) * (2 * count), np.full(2 * count, np.inf)
+    return Signal(slope, drift * np.eye(2 * count), output, tuple(states), orders, anywhere)
 
 
 def _harmonic_model(settings: str) -> NamedModel:
@@ -366,17 +431,29 @@ class Sum(NamedTuple):
 
     def signal(self, values: Mapping[str, float]) -> Signal:
         """The signal for values of the free numbers by name."""
-        names, signals, remaining = [number.name for number in self.free], [], list(self.free)
+        names = [number.name for number in self.free]
         if set(values) != set(names):
             raise ValueError(f"{self.name} takes {', '.join(names)}, but got {short_repr(list(values))}")
-        for part in self.parts:
-            mine, remaining = remaining[: len(part.free)], remaining[len(part.free) :]
-            arguments = {
-                number.name: positive(free.name, values[free.name])
-                for number, free in zip(part.free, mine, strict=True)
-            }
-            signals.append(part.signal(**arguments))
+        return self.signal_of([positive(name, values[name]) for name in names])
+
+    def signal_of(self, values: Sequence[float]) -> Signal:
+        """The signal for values of the free numbers in order."""
+        ends = np.cumsum([0, *(len(part.free) for part in self.parts)]).tolist()
+        signals = [
+            part.signal(**{number.name: value for number, value in zip(part.free, values[first:], strict=False)})
+            for part, first in zip(self.parts, ends, strict=False)
+        ]
         return signals[0] if len(signals) == 1 else _added(signals)
+
+    def check_harmonics(self, signal: Signal, dt: float) -> None:
+        """Raise ValueError for a harmonic of fewer than two samples, which looks like another."""
+        rates = np.linalg.eigvals(signal.slope)
+        fastest = float(rates.imag[np.abs(rates.real) < UNDAMPED * np.abs(rates)].max(initial=0.0))
+        if fastest * dt > math.pi * (1.0 + UNDAMPED):
+            rule = f"each harmonic of {self.name} must have two samples in its period or more"
+            raise ValueError(
+                f"{rule}, but one has a period of {2.0 * math.pi / fastest:.4g} s, and dt is {dt:g} s"
+            )
 
     def model(
         self,
@@ -396,7 +473,8 @@ class Sum(NamedTuple):
             noise: R, the variance of the measurement noise [U^2].
             dt: sample time [s].
             first: the first measurement of each axis, where the filter begins, or one for all.
-            spread: of the data [U]; the prior is a hundred times as wide, and as fast as that within a step.
+            spread: of the data [U]; the prior is the stationary one, or else a hundred times as wide as the data,
+                and as fast as that within a step.
             offset: the mean of the data on each axis, about which the signal varies, or one for all.
             quantities: name, symbol and unit of the measurement on each axis.
 
@@ -404,14 +482,8 @@ class Sum(NamedTuple):
             ValueError: for a wrong number, and for a harmonic of fewer than two samples, which looks like another.
         """
         signal, axes = self.signal(values), len(quantities)
-        rates = np.linalg.eigvals(signal.slope)
-        fastest = float(rates.imag[np.abs(rates.real) < UNDAMPED * np.abs(rates)].max(initial=0.0))
-        if fastest * dt > math.pi * (1.0 + UNDAMPED):
-            rule = f"each harmonic of {self.name} must have two samples in its period or more"
-            raise ValueError(
-                f"{rule}, but one has a period of {2.0 * math.pi / fastest:.4g} s, and dt is {dt:g} s"
-            )
-        n, orders, each = len(signal.output), np.array(signal.orders), np.eye(axes)
+        self.check_harmonics(signal, dt)
+        n, each, (transition, noise_cov) = len(signal.output), np.eye(axes), signal.step(positive("dt", dt))
         offset = np.broadcast_to(np.asarray(offset, dtype=np.float64), axes)
         level = np.eye(n)[int(np.argmax(signal.output))]
         states = [
@@ -421,13 +493,13 @@ class Sum(NamedTuple):
             for name in [symbol if axes == 1 else f"{symbol}_{axis.symbol}"]
         ]
         return affine_model(
-            a=np.kron(each, signal.transition(positive("dt", dt))),
+            a=np.kron(each, transition),
             b=np.zeros((axes * n, 0)),
             c=np.kron(each, signal.output[None]),
-            process_noise_cov=np.kron(each, signal.noise(dt)),
+            process_noise_cov=np.kron(each, noise_cov),
             measurement_noise_cov=[noise] * axes,
             prior_mean=np.kron(np.broadcast_to(first, axes) - offset, level) + 0.0,  # no negative zeros
-            prior_cov=np.tile((WIDE * spread / dt**orders) ** 2, axes),
+            prior_cov=np.tile(signal.start(spread, dt), axes),
             measurement_offset=offset,
             states=states,
             input_quantities=[],
@@ -504,12 +576,19 @@ def _unique(part: str, name: str, names: list[str]) -> str:
 
 def _added(signals: list[Signal]) -> Signal:
     """The sum of signals, side by side."""
-    from scipy.linalg import block_diag
-
     return Signal(
-        block_diag(*(signal.slope for signal in signals)),
-        block_diag(*(signal.densities for signal in signals)),
+        _block_diagonal([signal.slope for signal in signals]),
+        _block_diagonal([signal.densities for signal in signals]),
         np.concatenate([signal.output for signal in signals]),
         tuple(state for signal in signals for state in signal.states),
         tuple(order for signal in signals for order in signal.orders),
+        np.concatenate([signal.variances for signal in signals]),
     )
+
+
+def _block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:
+    matrix, first = np.zeros((sum(map(len, blocks)),) * 2), 0
+    for block in blocks:
+        last = first + len(block)
+        matrix[first:last, first:last], first = block, last
+    return matrix

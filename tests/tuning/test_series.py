@@ -35,17 +35,15 @@ NUMBERS = {
 }
 
 
-def simulated(name, rows, dt=0.1, noise=0.2, seed=0, **numbers):
+def simulated(name, rows, dt=0.1, noise=0.2, seed=0, steps=None, **numbers):
     """Numbers drawn from a named model, without its code for Q: by many small steps of the rates."""
     signal, parts = named_model(name).signal(numbers or NUMBERS[name]), 40
     rng = np.random.default_rng(seed)
-    step, root = (
-        np.eye(len(signal.output)) + signal.slope * dt / parts,
-        np.sqrt(np.diag(signal.densities) * dt / parts),
-    )
-    x, z = np.zeros(len(root)), np.empty(rows)
-    for k in range(rows):
+    x, z = np.zeros(len(signal.output)), np.empty(rows)
+    for k, length in enumerate([dt] * rows if steps is None else [*steps, 0.0]):
         z[k] = signal.output @ x + math.sqrt(noise) * rng.normal()
+        part = length / parts
+        step, root = np.eye(len(x)) + signal.slope * part, np.sqrt(np.diag(signal.densities) * part)
         for _ in range(parts):
             x = step @ x + root * rng.normal(size=len(root))
     return z
@@ -194,6 +192,19 @@ def test_missing_numbers_and_gaps_are_rows_without_a_number(position):
     assert f"{int(lost.sum())} missing" in str(by_nan)
 
 
+def test_unequal_steps_are_taken_as_they_are():
+    """A position that goes far, on times with jitter: on a grid R would have jitter times velocity in it."""
+    times = np.cumsum(np.random.default_rng(6).uniform(0.05, 0.15, 800))
+    z = simulated("constant-acceleration", 800, seed=6, steps=np.diff(times), jerk=20.0)
+    fit = tuning.fit(z, times=times, model="constant-acceleration")
+    assert fit.r == pytest.approx(0.2, rel=0.2) and fit.numbers[0].low < 20.0 < fit.numbers[0].high
+    assert not fit.is_wrong and "s apart" in str(fit) and "Q of a step of " in str(fit)
+    terms = fit.estimates.log_likelihoods[0, 3:].sum()
+    assert terms == pytest.approx(fit.chosen.log_likelihood, abs=0.1)  # after a wide prior, in place of none
+    rounded = column_of(z, times=np.round(0.1 * np.arange(800), 3) + 0.0004 * (np.arange(800) % 2))
+    assert rounded.stamps is not None and column_of(z, times=np.round(np.arange(800) / 30, 3)).stamps is None
+
+
 def test_the_filter_is_the_one_of_the_estimates(position):
     belief_path = filters.run(position.filter, None, np.zeros((1, 599, 0)), position.column.values[None, :, None])
     np.testing.assert_array_equal(belief_path.means, position.estimates.means)
@@ -205,11 +216,43 @@ def test_the_filter_is_the_one_of_the_estimates(position):
 def test_the_likelihood_is_that_of_the_filters_innovations_and_its_scale_the_best(position):
     likelihood = ColumnLikelihood(named_model(position.name), position.column)
     at = likelihood.coordinates.of([number.value for number in position.numbers])
-    terms = position.estimates.log_likelihoods[0, position.model.n :]
-    assert likelihood.value(at) == pytest.approx(terms.sum(), rel=1e-9)
+    terms = position.estimates.log_likelihoods[0, position.model.n :]  # after a wide prior, in place of none
+    assert likelihood.value(at) == pytest.approx(terms.sum(), rel=1e-6)
     value, scaled = likelihood.scaled(at + [1.5, 0.7])
     here = likelihood(scaled)
     assert here.value == pytest.approx(value, rel=1e-9) and abs(here.gradient.sum()) < 1e-4
+
+
+@pytest.mark.parametrize(
+    "name", ["constant-acceleration", "singer", "ornstein-uhlenbeck", "constant + oscillator"]
+)
+def test_the_likelihood_is_that_of_an_exact_diffuse_filter_on_unequal_steps(name):
+    """statsmodels' filter, stationary states as their covariance says and the others diffuse."""
+    statespace = pytest.importorskip("statsmodels.tsa.statespace.api")
+    kalman_filter = pytest.importorskip("statsmodels.tsa.statespace.kalman_filter")
+    rng = np.random.default_rng(8)
+    z, times = 3.0 * rng.normal(size=60), np.cumsum(rng.uniform(0.1, 2.0, 60))
+    times[30:] += 9.0
+    z[[4, 40]] = np.nan
+    likelihood = ColumnLikelihood(named_model(name), column_of(z, times=times))
+    values = [1.5 + 0.2 * i for i in range(len(likelihood.coordinates.names))]
+    signal = likelihood._signal(values)
+    oracle = kalman_filter.KalmanFilter(1, len(signal.output))
+    oracle.bind(z[None].copy())
+    oracle["design"], oracle["obs_cov"] = signal.output[None], np.array([[values[-1]]])
+    oracle["selection"] = np.eye(len(signal.output))
+    f, q = zip(*map(signal.step, np.append(np.diff(times), 1.0)), strict=True)
+    oracle["transition"], oracle["state_cov"] = np.moveaxis(f, 0, 2), np.moveaxis(q, 0, 2)
+    first = statespace.Initialization(len(signal.output))
+    for i, variance in enumerate(signal.variances):
+        known = math.isfinite(variance)
+        first.set(i, "known" if known else "diffuse", **({"stationary_cov": [[variance]]} if known else {}))
+    oracle.initialize(first)
+    result = oracle.filter()
+    count = int(np.isinf(signal.variances).sum())
+    expected = result.llf_obs[result.nobs_diffuse :].sum()
+    assert result.nobs_diffuse == count
+    assert likelihood.value(likelihood.coordinates.of(values)) == pytest.approx(expected, rel=1e-9)
 
 
 def test_lines_for_python_make_the_same_filter(position):
@@ -323,7 +366,11 @@ def test_a_daily_course_and_steps_between_numbers():
         (["a"] * 30, {}, "z must be numbers"),
         (np.zeros((30, 9)), {}, "a column of numbers"),
         (np.arange(30.0), {"model": "harmonic"}, "must have a period"),
-        (np.arange(30.0) ** 2, {"model": "harmonic:period=7,harmonics=4"}, "two samples .* a period of 1.75 s"),
+        (
+            np.arange(30.0) ** 2 % 11.0,
+            {"model": "harmonic:period=7,harmonics=4"},
+            "two samples .* a period of 1.75 s",
+        ),
         (np.arange(30.0), {"times": np.arange(30.0)[::-1]}, "times must increase"),
         (np.arange(30.0), {"dt": np.ones(30)}, "a time for each number, so one step .* 30 numbers and 31 times"),
         (np.arange(30.0), {"dt": np.ones(29), "times": np.arange(30.0)}, "but got both"),
@@ -354,7 +401,6 @@ def test_every_start_lies_in_its_range():
 
 def test_data_without_noise_are_called_that():
     tiny = 1.0 + 1e-13 * np.random.default_rng(0).normal(size=100)
-    fit = tuning.fit(tiny, model="constant")
-    assert fit.is_exact and fit.sentences()[0].startswith("The model predicts all numbers but for their rounding")
-    with pytest.raises(ValueError, match="to the last digit have neither Q nor R"):
-        tuning.fit(3.0 + 2.0 * (0.1 * np.arange(200)), 0.1, model="constant-velocity")
+    for exact in (tiny, 3.0 + 2.0 * (0.1 * np.arange(200))):
+        with pytest.raises(ValueError, match="z must have noise, .* lie on a smooth curve to"):
+            tuning.fit(exact, 0.1)

@@ -55,6 +55,7 @@ class Recording(NamedTuple):
     holes: int = 0  # in so many places
     shifted: int = 0  # samples whose stamps were further from the grid than a tenth of a step
     farthest: float = 0.0  # [s], of them
+    jitter: float = 0.0  # [s], the furthest that any stamp is from the grid
     doubled: int = 0  # rows with the stamp of the row before
     dropped: tuple[tuple[str, int], ...] = ()  # samples of a channel beside a nearer one of the same grid time
     damage: tuple[str, ...] = ()  # what of the file is not read because it is damaged, in words

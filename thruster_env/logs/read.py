@@ -79,6 +79,7 @@ def read_log(
     stamps: str | None = None,
     inputs_act: str | None = None,
     name: str = "a table",
+    table: Table | None = None,
 ) -> Log:
     """Read a log of a model's inputs and measurements from a file; columns of states and outputs are references.
 
@@ -114,6 +115,7 @@ def read_log(
             a current that is sampled with the voltage. By default "until" for a model whose measurements have
             feed-through, h(x, u, c), and "from" for others.
         name: of a log that is not a file.
+        table: of the file, if it was read before.
 
     Raises:
         ValueError: if a column is missing, or a value is wrong; it names file, line and column.
@@ -138,7 +140,8 @@ def read_log(
         )
     else:
         check_stamps(description.stamps, None, path if is_file else name)
-        table = read_table(path) if is_file else table_of(path, name)
+        if table is None:
+            table = read_table(path) if is_file else table_of(path, name)
         column_of = find_columns(
             wanted, table.names, description.columns, description.units, table.file, description.dt is None
         )
@@ -228,7 +231,8 @@ def _recording(grid: Grid, rows: np.ndarray, dropped: tuple[tuple[str, int], ...
     shifts = grid.shifts[grid.shifts > TOLERANCE * grid.dt]
     farthest = float(shifts.max()) if len(shifts) else 0.0
     count = int((holes > 0).sum())
-    return Recording(gaps, int(holes.sum()), count, len(shifts), farthest, _doubled(grid), dropped)
+    jitter = float(grid.shifts.max(initial=0.0))
+    return Recording(gaps, int(holes.sum()), count, len(shifts), farthest, jitter, _doubled(grid), dropped)
 
 
 def _described(path: Path) -> Description:

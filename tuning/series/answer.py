@@ -21,7 +21,7 @@ from tuning.api.result import Result, frame
 from tuning.identification.objective import climb
 from tuning.series.column import Column
 from tuning.series.fit import Candidate, Number, behind, filtered
-from tuning.series.likelihood import ColumnLikelihood, model_of
+from tuning.series.likelihood import ColumnLikelihood, R, model_of
 from tuning.series.paste import lines_of
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 WHITE = 0.001  # probability from which innovations count as white
 HIDDEN = 1e-9  # share of a mode in the measurements, below which they do not show it
 LARGE = 0.05  # correlation of innovations that matters
-ROUNDING = 1e-9  # innovations over the largest number, below which they are rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,16 +38,18 @@ class SeriesFit(Result):
     """The model of a column of numbers, its Q and R, and what they mean.
 
     Attributes:
-        column: the numbers on their grid.
+        column: the numbers and their times.
         chosen: the chosen candidate.
         candidates: all that were tried, best first.
         numbers: the model's free numbers and R, with 95 % intervals.
+        level: the mean about which the signal of each axis varies, (axes,), if it does.
     """
 
     column: Column
     chosen: Candidate
     candidates: tuple[Candidate, ...]
     numbers: tuple[Number, ...]
+    level: np.ndarray | None = None
 
     @property
     def name(self) -> str:
@@ -57,8 +58,8 @@ class SeriesFit(Result):
 
     @cached_property
     def model(self) -> AffineModel:
-        """The model with its numbers."""
-        return model_of(named_model(self.name), self.column, self.chosen.values)
+        """The model with its numbers, for a step of the usual length."""
+        return model_of(named_model(self.name), self.column, self.chosen.values, self.level)
 
     @property
     def filter(self) -> KalmanFilter:
@@ -104,7 +105,8 @@ class SeriesFit(Result):
     @cached_property
     def estimates(self) -> Estimates:
         """The filter on the data."""
-        return filtered(self.model, self.column)
+        values = {name: value for name, value in self.chosen.values.items() if name != R}
+        return filtered(named_model(self.name).signal(values), self.model, self.column)
 
     @cached_property
     def whiteness(self) -> Whiteness:
@@ -117,12 +119,6 @@ class SeriesFit(Result):
         """Whether innovations are correlated so much that the model misses something in the data."""
         correlations = np.abs(self.whiteness.correlations)
         return self.whiteness.p_value < WHITE and float(correlations.max()) > LARGE
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether the model predicts all numbers but for rounding."""
-        innovations = self.estimates.innovations[0][self.column.counted(self.model)]
-        return float(np.abs(innovations).max()) < ROUNDING * float(np.nanmax(np.abs(self.column.table)))
 
     def axes_differ(self) -> float:
         """Probability of so large a likelihood ratio, if all axes have the same numbers; 1 for one axis."""
@@ -143,11 +139,6 @@ class SeriesFit(Result):
         white, sentences = self.whiteness, []
         largest = np.unravel_index(int(np.argmax(np.abs(white.correlations))), white.correlations.shape)
         lag = int(largest[0])
-        if self.is_exact:
-            return [
-                "The model predicts all numbers but for their rounding: Q and R are those of rounding.",
-                *self.column.remarks,
-            ]
         if self.is_wrong:
             correlation, time = white.correlations[largest], (lag + 1) * self.column.dt
             sentences.append(
@@ -201,9 +192,13 @@ class SeriesFit(Result):
         count = int(column.measured.any(axis=1).sum())
         missing = len(column.values) - count
         names = ", ".join(quantity.short_label for quantity in column.quantities)
-        heading = f"{names}: {count} numbers, one each {column.dt:.4g} s"
+        apart, step = f"one each {column.dt:.4g} s", "per step"
+        if column.stamps is not None:
+            steps = np.diff(column.stamps)
+            apart, step = f"{steps.min():.4g} to {steps.max():.4g} s apart", f"of a step of {column.dt:.4g} s"
+        heading = f"{names}: {count} numbers, {apart}"
         sentences = self.sentences()
-        if self.is_wrong or self.is_exact:
+        if self.is_wrong:
             first, sentences = [sentences[0]], sentences[1:]
         rows = [
             (
@@ -220,10 +215,11 @@ class SeriesFit(Result):
         numbers = Table(
             f"Model: {self.name}, {about}", ["", "value", "95 % from", "to", "unit", ""], rows, words=True
         )
+        forgets = f"the filter forgets in {self.memory:.3g} s"
         lines = [
-            f"Q per step = {_matrix(self.q)}",
+            f"Q {step} = {_matrix(self.q, f'Q {step} = ')}",
             f"R = {self.r:.6g}" + " of each axis" * (self.model.m > 1),
-            f"Steady-state gain = {_matrix(self.gain)}: the filter forgets in {self.memory:.3g} s",
+            f"Steady-state gain = {_matrix(self.gain, 'Q per step = ')}: {forgets}",
         ]
         rivals = [
             f"{name} {-loss:.1f} +- {error:.1f}" for name, loss, error in self._standings() if name != self.name
@@ -266,7 +262,7 @@ class SeriesFit(Result):
 
     def _plot_axis(self, axis: int, top: Any, bottom: Any) -> None:
         quantity, values, measured = self.column.quantities[axis], self.column.table[:, axis], self.column.measured
-        times = self.column.dt * np.arange(len(values))
+        times = self.column.times
         c, d = (part[axis] for part in self.model.matrices()[3:])
         means = self.estimates.means[0] @ c + d
         deviations = np.sqrt(np.einsum("i,kij,j->k", c, self.estimates.covs[0], c))
@@ -297,6 +293,6 @@ class SeriesFit(Result):
         return lines_of(language, self.model, self._gains())
 
 
-def _matrix(values: np.ndarray) -> str:
+def _matrix(values: np.ndarray, prefix: str) -> str:
     """Numbers as Python writes them, to six digits."""
-    return np.array2string(np.asarray(values), precision=6, separator=", ", prefix="Q per step = ")
+    return np.array2string(np.asarray(values), precision=6, separator=", ", prefix=prefix)

@@ -1,4 +1,8 @@
-"""One column of numbers with its times, or the columns of a track's axes, read as logs are, on a grid."""
+"""One column of numbers with its times, or the columns of a track's axes, read as logs are.
+
+Where steps are equal but for the rounding of times, numbers lie on a grid, NaN where one is missing; otherwise
+each has its own time, and a gap is a long step.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +28,8 @@ from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 
 LEAST_ROWS = 20  # with a number
+ROUNDING, MOST_DIGITS = 1e-6, 9  # of a sample time, and of stamps
+DIGITS = 1e-12  # of the largest number: noise that is rounding
 MOST_AXES = 6
 RANGES = 1e-60, 1e60  # of a column's numbers, of which Q and R are squares
 WIDTHS, PEAKS = (1, 5, 21), 2  # by how many points a spectrum is smoothed, and how many of its peaks are tried
@@ -31,19 +37,26 @@ WIDTHS, PEAKS = (1, 5, 21), 2  # by how many points a spectrum is smoothed, and 
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """Numbers on a grid of times, NaN where there is none: one column, or one for each axis of a track.
+    """Numbers and their times, NaN where there is none: one column, or one for each axis of a track.
 
     Attributes:
         values: (K,), or (K, axes).
-        dt: sample time [s].
+        dt: sample time [s], of unequal steps the usual one.
         quantities: name, symbol and unit of the numbers of each axis.
         remarks: what was found while they were read, in sentences.
+        stamps: times of the rows [s], (K,), 0 at the first, where steps are unequal; otherwise None.
     """
 
     values: np.ndarray
     dt: float
     quantities: tuple[Quantity, ...]
     remarks: tuple[str, ...] = ()
+    stamps: np.ndarray | None = None
+
+    @property
+    def times(self) -> np.ndarray:
+        """Times of the rows since the first [s], (K,)."""
+        return self.dt * np.arange(len(self.values)) if self.stamps is None else self.stamps
 
     @property
     def table(self) -> np.ndarray:
@@ -72,10 +85,18 @@ class Column:
     @cached_property
     def scales(self) -> Scales:
         """The spread of the data, root mean squares of the axes, their times and strongest frequencies."""
-        spreads, duration = np.nanstd(self.table, axis=0), self.dt * (len(self.values) - 1)
-        roughness = [_roughness(*axis) for axis in zip(self.table.T, spreads.tolist(), strict=True)]
-        peaks = _peaks(self.table[:, int(spreads.argmax())], self.dt)
-        return Scales(_root_mean_square(spreads), _root_mean_square(roughness), self.dt, duration, peaks)
+        times, spreads = self.times, np.nanstd(self.table, axis=0)
+        duration = float(times[-1] - times[0])
+        roughness = [_roughness(times, *axis) for axis in zip(self.table.T, spreads.tolist(), strict=True)]
+        peaks = _peaks(times, self.table[:, int(spreads.argmax())], self.dt)
+        noise, largest = _root_mean_square(roughness), float(np.nanmax(np.abs(self.table)))
+        if noise <= DIGITS * largest:
+            name = ", ".join(quantity.name for quantity in self.quantities)
+            rule = f"{name} must have noise, from which Q and R follow"
+            raise ValueError(
+                f"{rule}, but its numbers lie on a smooth curve to {noise / largest:.0e} of the largest"
+            )
+        return Scales(_root_mean_square(spreads), noise, self.dt, duration, peaks)
 
     def axis(self, index: int) -> Column:
         """One axis alone."""
@@ -84,16 +105,21 @@ class Column:
     def middle(self, most: int) -> Column:
         """The column itself, or its middle rows if it has more than `most`."""
         excess = len(self.values) - most
-        return self if excess <= 0 else replace(self, values=self.values[excess // 2 : excess // 2 + most])
+        if excess <= 0:
+            return self
+        rows = slice(excess // 2, excess // 2 + most)
+        stamps = None if self.stamps is None else self.stamps[rows] - self.stamps[rows.start]
+        return replace(self, values=self.values[rows], stamps=stamps)
 
 
 def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequence[str] | None = None) -> Column:
-    """The numbers on a grid, with NaN where there is none, as the reader of logs puts them there.
+    """The numbers on a grid if their steps are equal, as the reader of logs puts them there; else at their times.
 
     Args:
         z: numbers (K,) or (K, axes), a pandas Series or table, a mapping from headers to arrays, or the path of
             a log.
-        dt: sample time [s], for numbers without times, or of the grid; or the steps between numbers, (K - 1,).
+        dt: sample time [s], for numbers without times, or to which F and Q of the answer belong; or the steps
+            between numbers, (K - 1,).
         times: of an array's numbers [s], (K,).
         column: header of the numbers in a table with several columns, or one for each axis, also as "x,y".
 
@@ -109,11 +135,15 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
         rule = "the times of a table or a file must be one of its columns"
         raise ValueError(f"{rule}, but got {short_repr(times)} beside it")
     named = column.split(",") if isinstance(column, str) else column
-    log = log_of_columns(z, named, dt=dt, times=times)
+    log, stamps = log_of_columns(z, named, dt=dt, times=times), None
+    if log.irregular or log.recording.jitter > 0.0:
+        at_times = log_of_columns(z, named, dt=dt, times=times, grid=False)
+        if log.irregular or log.recording.jitter > _resolution(at_times.times + at_times.start, log.dt):
+            log, stamps = at_times, at_times.times
     for quantity, values in zip(log.measured, log.measurements.T, strict=True):
         _check_numbers(quantity.symbol, values)
     values = log.measurements[:, 0] if len(log.measured) == 1 else log.measurements
-    return Column(values, log.dt, log.measured, tuple(sentences(log.findings)))
+    return Column(values, log.dt, log.measured, tuple(sentences(log.findings)), stamps)
 
 
 def log_of_columns(
@@ -141,7 +171,7 @@ def log_of_columns(
     is_table = isinstance(z, str | Path | Mapping) or hasattr(z, "columns")
     source: Any = z if is_table else as_columns(z, times)
     is_file = isinstance(source, str | Path)
-    recorded = is_file and format_of(source) is not None
+    recorded, table = is_file and format_of(source) is not None, None
     if recorded:
         if named is None:
             rule = "the column of a recorder's file must be named (column=, --column TOPIC.FIELD)"
@@ -161,7 +191,18 @@ def log_of_columns(
     columns = {quantity.symbol: header for quantity, header in zip(quantities, headers, strict=True)}
     columns |= {} if time is None else {TIME: time}
     options["dt"] = 1.0 if dt is None and time is None and not recorded else dt
-    return read_log(source, reader, columns, **{key: value for key, value in options.items() if value is not None})
+    options = {key: value for key, value in options.items() if value is not None}
+    return read_log(source, reader, columns, table=table, **options)
+
+
+def _resolution(times: np.ndarray, dt: float) -> float:
+    """How far rounding moves stamps [s]: half a unit of the fewest digits that write all of them, or float64's."""
+    least = 2.0 * math.ulp(float(np.abs(times).max())) + ROUNDING * dt
+    for digits in range(-3, MOST_DIGITS):
+        unit = 10.0**-digits
+        if float(np.abs(times - unit * np.round(times / unit)).max()) <= least:
+            return 0.5 * unit + least
+    return least
 
 
 def _quantity(header: str) -> Quantity:
@@ -234,28 +275,38 @@ def _headers(table: Table, named: Sequence[str] | None, axes: int = 1) -> tuple[
     return numbers, time
 
 
-def _roughness(values: np.ndarray, spread: float) -> float:
-    """The least deviation of differences of order d, over that of white noise, (2d choose d)^1/2."""
-    deviations = [spread]
+def _roughness(times: np.ndarray, values: np.ndarray, spread: float) -> float:
+    """The least deviation of divided differences of order 1 to 4, over that of white noise."""
+    known = ~np.isnan(values)
+    times, values, deviations = times[known], values[known], [spread]
+    longest = float(np.quantile(np.diff(times), 0.8))
     for order in range(1, 5):
-        differences = np.diff(values, order)
-        if np.count_nonzero(~np.isnan(differences)) >= LEAST_ROWS // 2:
-            deviations.append(float(np.nanstd(differences)) / math.sqrt(math.comb(2 * order, order)))
-    return max(min(deviations), 1e-9 * spread)
+        points = [np.arange(i, len(times) - order + i) for i in range(order + 1)]
+        close = times[points[-1]] - times[points[0]] <= (order + 0.5) * longest
+        weights = [
+            1.0 / np.prod([(times[i] - times[j]) / longest for j in points if j is not i], axis=0) for i in points
+        ]
+        scale = np.sqrt(sum(weight**2 for weight in weights))
+        differences = sum(weight * values[i] for weight, i in zip(weights, points, strict=True)) / scale
+        if np.count_nonzero(close) >= LEAST_ROWS // 2:
+            deviations.append(float(np.std(differences[close])))
+    return min(deviations)
 
 
 def _root_mean_square(values: Any) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _peaks(values: np.ndarray, dt: float) -> tuple[float, ...]:
+def _peaks(times: np.ndarray, values: np.ndarray, dt: float) -> tuple[float, ...]:
     """Frequencies of the highest peaks of the spectrum [Hz], as it is for sharp ones, smoothed for wide ones.
 
-    The trend is taken off; missing numbers lie on it.
+    The trend is taken off; numbers are moved to multiples of dt, and missing ones lie on the trend.
     """
-    rows, known = np.arange(len(values)), ~np.isnan(values)
-    trend = np.polynomial.Polynomial.fit(rows[known], values[known], 1)(rows)
-    filled = np.where(known, values - trend, 0.0)
+    known = ~np.isnan(values)
+    trend = np.polynomial.Polynomial.fit(times[known], values[known], 1)(times)
+    rows = np.round(times / dt).astype(np.int64)
+    filled = np.zeros(rows[-1] + 1)
+    filled[rows[known]] = (values - trend)[known]
     power = np.abs(np.fft.rfft(filled * np.hanning(len(filled)))) ** 2
     frequencies, peaks = np.fft.rfftfreq(len(filled), dt)[1:], []
     for width in WIDTHS:

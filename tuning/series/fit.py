@@ -26,13 +26,13 @@ from scipy.special import chdtri
 
 from filters.engine.batch import Estimates, run
 from filters.gaussian.kalman import KalmanFilter
-from filters.models import Scales, Sum, named_model
+from filters.models import Scales, Signal, Sum, named_model, steps
 from thruster_env.core.streams import filter_keys
 from thruster_env.model.affine import AffineModel
-from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.objective import Ascent, climb
 from tuning.series.column import Column
-from tuning.series.likelihood import ColumnLikelihood, model_of
+from tuning.series.likelihood import ColumnLikelihood
+from tuning.series.recursion import Beginning, StepTables, filtered_runs
 
 AUTO = "auto"
 CANDIDATES = (
@@ -54,6 +54,7 @@ NOISE = "variance of the measurement noise"
 FALL = 0.5 * float(chdtri(1, 0.05))  # of the log-likelihood at the ends of a 95 % interval
 FAR = 100.0  # root of a fall where the filter has no likelihood
 PRECISION = 0.01  # of an interval's end, in coordinates
+NORMAL = 0.03  # standard error, in coordinates, below which the likelihood is normal to its own precision
 
 
 class Candidate(NamedTuple):
@@ -109,6 +110,7 @@ class Choice(NamedTuple):
     chosen: Candidate
     candidates: tuple[Candidate, ...]
     numbers: tuple[Number, ...]
+    level: np.ndarray | None  # the mean about which the signal of each axis varies, (axes,), if it does
 
 
 def choose(column: Column, names: Sequence[str], progress: Callable[[str], None] = lambda name: None) -> Choice:
@@ -135,7 +137,8 @@ def choose(column: Column, names: Sequence[str], progress: Callable[[str], None]
     if part is not column:
         progress(f"{chosen.model.name} on all rows")
         chosen = _on_all(chosen, column)
-    return Choice(chosen.candidate, candidates, _numbers(chosen))
+    level = chosen.objective.level(chosen.ascent.at) if chosen.model.about_mean else None
+    return Choice(chosen.candidate, candidates, _numbers(chosen), level)
 
 
 def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
@@ -147,11 +150,12 @@ def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
     if not prove:
         return fitted
     blocks = np.arange(len(column.values)) * BLOCKS // len(column.values)
-    held_out = np.empty(BLOCKS)
+    held_out, everything = np.empty(BLOCKS), ColumnLikelihood(candidate, column, rows=len(column.values))
     for fold in range(2):
         visible = replace(column, values=np.where((blocks % 2 == fold)[:, None], np.nan, column.table))
         values = _maximum(candidate, visible).candidate.values
-        held_out[fold::2] = _by_blocks(model_of(candidate, visible, values), column, blocks)[fold::2]
+        densities = everything.by_rows(everything.coordinates.of(list(values.values())))
+        held_out[fold::2] = np.bincount(blocks, weights=densities.sum(axis=1), minlength=BLOCKS)[fold::2]
     return fitted._replace(held_out=held_out[1:])
 
 
@@ -176,18 +180,41 @@ def _on_all(chosen: Fitted, column: Column) -> Fitted:
     return chosen._replace(objective=objective, ascent=ascent, rivals=())
 
 
-def _by_blocks(model: AffineModel, column: Column, blocks: np.ndarray) -> np.ndarray:
-    """Log-likelihood of each block of the record, filtered from its beginning, (BLOCKS,)."""
-    estimates = filtered(model, column)
-    v, s = estimates.innovations[0], np.diagonal(estimates.innovation_covs[0], axis1=1, axis2=2)
-    terms = np.where(column.counted(model), -0.5 * (np.log(2.0 * math.pi * s) + v**2 / s), 0.0)
-    return np.bincount(blocks, weights=terms.sum(axis=1), minlength=BLOCKS)
+def filtered(signal: Signal, model: AffineModel, column: Column) -> Estimates:
+    """The estimates of the Kalman filter on a column, with the F and Q of each step's length.
 
-
-def filtered(model: StateSpaceModel, column: Column) -> Estimates:
-    """The estimates of the Kalman filter on a column."""
-    inputs = np.zeros((1, len(column.values) - 1, 0))
-    return run(KalmanFilter(model=model), filter_keys([0]), inputs, column.table[None])
+    Args:
+        signal: of one axis, of which the model is the one for the usual step.
+        model: of all axes.
+        column: the numbers.
+    """
+    if column.stamps is None:
+        inputs = np.zeros((1, len(column.values) - 1, 0))
+        return run(KalmanFilter(model=model), filter_keys([0]), inputs, column.table[None])
+    axes, n, r = model.m, len(signal.output), float(model.measurement_noise_cov[0, 0])
+    dts, index = np.unique(np.diff(column.stamps), return_inverse=True)
+    f, noises = steps(signal.slope, signal.driven, signal.orders, dts)
+    q = np.tensordot(np.diag(signal.densities)[list(signal.driven)], noises, 1)
+    tables = StepTables(f, q, np.empty((0, 0, n, n)), np.empty((0, *q.shape)), np.empty(0))
+    prior_covs = np.tile(model.prior_cov[:n, :n].ravel(), (axes, 1))
+    priors = np.concatenate([model.prior_mean.reshape(axes, n), prior_covs], axis=1)
+    begin = Beginning(np.zeros(axes), True, priors, np.empty((axes, 0, n + n * n)), np.zeros(axes))
+    z, rows = (column.table - model.matrices()[4]).T, np.tile(np.append(0, index), (axes, 1))
+    sums = filtered_runs(z, rows, tables, signal.output, r, np.empty(0), begin, each_row=True)
+    v, s = sums.innovations[..., 0].T, sums.innovations[..., 1].T
+    of_axes = sums.beliefs[..., n:].reshape(axes, -1, n, n)
+    variances = np.einsum("i,akij,j->ka", signal.output, of_axes, signal.output) + r  # S without a measurement
+    densities = -0.5 * (np.log(2.0 * math.pi * s) + v**2 / s)
+    each, covs, all_s = np.arange(axes), np.zeros((len(v), axes, n, axes, n)), np.zeros((len(v), axes, axes))
+    covs[:, each, :, each, :], all_s[:, each, each] = of_axes, np.where(np.isnan(s), variances, s)
+    return Estimates(
+        np.moveaxis(sums.beliefs[..., :n], 0, 1).reshape(1, len(v), axes * n),
+        covs.reshape(1, len(v), axes * n, axes * n),
+        np.nan_to_num(v)[None],
+        all_s[None],
+        np.nan_to_num(densities).sum(axis=1)[None],
+        np.zeros(1),
+    )
 
 
 def _starts(objective: ColumnLikelihood, candidate: Sum, scales: Scales) -> list[np.ndarray]:
@@ -250,6 +277,7 @@ def _end(fitted: Fitted, index: int, limit: float) -> float:
     """
     objective, best = fitted.objective, fitted.ascent
     coordinates, fixed = objective.coordinates, np.arange(len(best.at)) == index
+    ends = coordinates.low[index], coordinates.high[index]
     likely = [best, *(rival for rival in fitted.rivals if best.found.value - rival.found.value < FALL)]
     outermost = min(likely, key=lambda maximum: abs(limit - maximum.at[index]))
     first, at = float(outermost.at[index]), outermost.at
@@ -266,8 +294,10 @@ def _end(fitted: Fitted, index: int, limit: float) -> float:
         at = profile.at
         return math.sqrt(max(fall, 0.0)) - math.sqrt(FALL)
 
-    variance = float(np.linalg.pinv(best.found.information)[index, index])
-    reach, outer = float(np.clip(2.0 * math.sqrt(max(variance, 0.0)), 0.01, 3.0)), first
+    deviation = math.sqrt(max(float(np.linalg.pinv(best.found.information)[index, index]), 0.0))
+    if 0.0 < deviation < NORMAL and len(likely) == 1:
+        return float(np.clip(first + math.copysign(math.sqrt(2.0 * FALL) * deviation, limit - first), *ends))
+    reach, outer = min(max(2.0 * deviation, NORMAL), 3.0), first
     while outer != limit and beyond(outer) < 0.0:
         inner, outer = outer, min(first + reach, limit) if limit > first else max(first - reach, limit)
         if beyond(outer) > 0.0:
