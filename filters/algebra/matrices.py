@@ -52,6 +52,24 @@ class Matrix:
     def __len__(self) -> int:
         return self.shape[0]
 
+    def __getitem__(self, index):
+        raise TypeError(
+            "a page must be written without entries, by the operations of filters.algebra,"
+            f" but it takes {index!r} of {self!r}"
+        )
+
+    def __iter__(self):
+        raise TypeError(f"a page must be written without entries, but it goes through those of {self!r}")
+
+    def __bool__(self):
+        raise TypeError(f"a page must not branch on values, but it asks whether {self!r} is true")
+
+    def __array__(self, *arguments, **options):
+        raise TypeError(
+            "a page must call the operations of filters.algebra, as divide(C, S) for C S^-1,"
+            f" not functions of NumPy, but it calls one with {self!r}"
+        )
+
     def __add__(self, other):
         return add(self, other) if isinstance(other, Matrix) else shifted(self, float(other))
 

@@ -79,7 +79,7 @@ def as_filter(estimator: Any, label: str, model: StateSpaceModel, numbers: dict)
 
 
 def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
-    what = f"estimator {label!r}"
+    what = f"{'filter' if is_filter_class(make) else 'estimator'} {label!r}"
     if not callable(make):
         raise ValueError(f"{what} must be an estimator, or make one of a model, but it is {short_repr(make)}")
     try:

@@ -262,6 +262,19 @@ def with_extras(results: Any) -> tuple:
     return values if values and isinstance(values[-1], dict) else (*values, {})
 
 
+def updated(results: Any) -> tuple:
+    """What `update` of a page for one Gaussian belief returns: x, P, v, S, log density, extras that change.
+
+    Raises:
+        ValueError: if it returns another number of values.
+    """
+    values = with_extras(results)
+    if len(values) != 6:
+        rule = "update of a page must return x, P, the innovation v, its covariance S and its log density"
+        raise ValueError(f"{rule}, and perhaps a dictionary, but it returned {len(values) - 1} values")
+    return values
+
+
 def as_tuple(results: Any) -> tuple:
     """The results of a page, one or several, as a tuple."""
     return results if isinstance(results, tuple) else (results,)
@@ -281,7 +294,7 @@ def stages_of(page: Page, memory: RowMemory, model: PagedModel) -> list[Stage]:
         Stage({}, {}) if page.represent is None else stored(begun, predicted),
         stored(advanced, predicted, memory.extras),
         stored(page.add_process_noise(model, *predicted), (x, p), memory.extras),
-        stored(page.update(model, x, p, memory.z), (x, p, *outputs), memory.extras),
+        stored(updated(page.update(model, x, p, memory.z)), (x, p, *outputs), memory.extras),
     ]
 
 

@@ -106,7 +106,12 @@ class Page(NamedTuple):
 
 @cache
 def _own_class(names: tuple[str, ...]) -> type:
-    return namedtuple("Own", names)
+    return type("Own", (namedtuple("Own", names),), {"__slots__": (), "__getattr__": _not_a_field})
+
+
+def _not_a_field(own: Any, name: str) -> Any:
+    fields = ", ".join(own._fields) or "none"
+    raise AttributeError(f"model.own must be asked for one of the filter's fields ({fields}), not {name!r}")
 
 
 def acting_places(extras: Mapping[str, Matrix]) -> tuple[int, ...]:

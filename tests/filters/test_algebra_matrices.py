@@ -152,7 +152,7 @@ def test_calls_of_functions_are_the_formula(name, sizes):
     matrices, numbers = {}, []
     for key, value in values.items():
         matrices[key] = input_matrix(Place("numbers", place), value.shape, symmetric=key in "PR", like=first)
-        first, place = first or matrices[key], place + value.size
+        first, place = matrices[key] if first is None else first, place + value.size
         numbers.append(value.ravel())
     wanted = FORMULAS[name](matrices)
     expected = np.array(FORMULAS[name](values))

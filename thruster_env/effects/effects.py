@@ -238,9 +238,15 @@ def run_chain(
     for kind, numbers, memory in zip(kinds, parameters, memories or (None,) * len(kinds), strict=True):
         name = kind.effect.name
         try:
-            value, after = traceable(kind.effect.act)(
+            results = traceable(kind.effect.act)(
                 kind.arguments(numbers), value, memory, t._replace(number=kind.number)
             )
+            if not isinstance(results, tuple) or len(results) != 2 or shape_of(results[0]) != shape_of(value):
+                rule = f"act of {name!r} must return the value, here {_form(value)}, and the memory"
+                raise ValueError(f"{rule}, but got {results!r}")
+            value, after = results
+        except AttributeError as error:
+            raise ValueError(f"act of {name!r} must take what its arguments have, but {error}") from error
         except TypeError as error:
             rule = f"act of {name!r} must be a function of numbers, and where(condition, a, b) choose between them"
             raise ValueError(f"{rule}, but {error}") from error
@@ -249,6 +255,10 @@ def run_chain(
             raise ValueError(f"act of {name!r} {rule}, but got {after!r}")
         memories_after.append(after)
     return value, tuple(memories_after)
+
+
+def _form(value: Any) -> str:
+    return f"a {type(value).__name__}" if hasattr(value, "_fields") else "a number"
 
 
 def chain_runner(kinds_of: Mapping[str, Sequence[Kind]]) -> Callable:

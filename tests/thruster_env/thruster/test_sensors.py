@@ -292,6 +292,9 @@ def test_an_effect_of_one_s_own_may_decide_and_keep_what_it_likes(monkeypatch):
     np.testing.assert_allclose(changed, np.where(raw < 0, -1.5 * peak, peak), rtol=1e-12)
 
 
+GENERATOR = np.random.default_rng(1)  # of the user's own: tracing would freeze what it draws
+
+
 @pytest.mark.parametrize(
     ("act", "rule"),
     [
@@ -300,6 +303,13 @@ def test_an_effect_of_one_s_own_may_decide_and_keep_what_it_likes(monkeypatch):
             "must have a memory of the same shape in",
         ),
         (lambda e, reading, n, t: (reading._replace(z=[0.0, 1.0][reading.z]), n), "must be a function of numbers"),
+        (
+            lambda e, reading, n, t: (reading._replace(z=GENERATOR.normal()), n),
+            "must be .* something else at each",
+        ),
+        (lambda e, reading, n, t: (reading.z, n), "must return the value, here a Reading, and the memory"),
+        (lambda e, reading, n, t: reading, "must return the value, here a Reading, and the memory"),
+        (lambda e, reading, n, t: (reading._replace(z=e.nothing), n), "must take what its arguments have"),
     ],
 )
 def test_an_effect_that_is_no_function_of_numbers_is_refused(monkeypatch, act, rule):
