@@ -281,6 +281,8 @@ class Copies:
         value = stands_for(getattr(value, "py_func", value))  # of a function compiled by numba
         if isinstance(value, types.ModuleType) and value in MODULES:
             return Module(value, self._in_place_of)
+        if isinstance(value, types.ModuleType) and _top(value) not in LIBRARIES:
+            return Module(value, lambda module, name: self.of(getattr(module, name)))
         if self._silent and (value is logging or value is warnings or isinstance(value, logging.Logger)):
             return _Silent()
         name = getattr(value, "__name__", "")
