@@ -188,18 +188,6 @@ def test_a_package_says_that_it_is_typed(floor):
     assert (ROOT / floor / "__init__.py").is_file() and (ROOT / floor / "py.typed").is_file()
 
 
-def test_the_command_line_starts_without_packages_that_learn_policies():
-    code = f"import sys, tuning.cli.app; print([name for name in {sorted(LEARNING)} if name in sys.modules])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
-
-
-def test_training_of_estimators_imports_torch_when_it_is_called():
-    code = "import sys, tuning.api.train_estimator; print('torch' in sys.modules)"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "False"
-
-
 ASKED = "filters, importlib.util; importlib.util.find_spec('gymnasium'); import gymnasium"  # whether it is there
 ORDERS = (
     "filters, gymnasium",
@@ -220,9 +208,52 @@ def test_envs_are_registered_in_whichever_order_packages_are_imported(order):
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("package, below", [("thruster_env", ["filters"]), ("filters", [])])
-def test_importing_envs_and_filters_stays_light(package, below):
-    heavy = ["gymnasium", "numba", "llvmlite", "scipy", "matplotlib", "optuna", "torch", "tuning", *below]
-    code = f"import sys, {package}; print([name for name in {heavy} if name in sys.modules])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
+HEAVY = {
+    *(
+        "bokeh",
+        "gymnasium",
+        "h5py",
+        "jinja2",
+        "llvmlite",
+        "matplotlib",
+        "numba",
+        "numpy",
+        "optuna",
+        "pandas",
+        "pint",
+    ),
+    *("pyarrow", "pydantic", "pygame", "rich", "sqlalchemy", "stable_baselines3", "torch", "filters", "tuning"),
+    *(f"scipy.{part}" for part in ("integrate", "linalg", "optimize", "signal", "special", "stats")),
+}
+TERMINAL = {"rich", "tuning"}
+COMMAND = {*TERMINAL, "pydantic"}  # Typer's
+MAY_LOAD = {  # what imports, and commands of the command line, may load
+    "import thruster_env": set(),
+    "import filters": {"numpy", "filters"},
+    "import tuning": {"tuning"},
+    "import gymnasium, thruster_env; gymnasium.make('BowThruster-v0')": {"gymnasium", "numpy", "llvmlite"},
+    "thruster --help": TERMINAL,
+    "thruster new problem mine": COMMAND,
+    "thruster inspect": {*COMMAND, "numpy", "scipy.linalg"},
+    "thruster fit acc.csv": {
+        *COMMAND,
+        "numpy",
+        "filters",
+        "llvmlite",
+        "scipy.linalg",
+        "scipy.optimize",
+        "scipy.special",
+    },
+}
+
+
+@pytest.mark.parametrize("started", MAY_LOAD)
+def test_what_users_start_loads_no_heavy_package_that_it_does_not_need(started, tmp_path):
+    (tmp_path / "acc.csv").write_text("\n".join(f"{(7 * k) % 11}" for k in range(40)))
+    program = started
+    if started.startswith("thruster "):
+        call = "from tuning.cli.main import main\ntry: main()\nexcept SystemExit: pass"
+        program = f"import sys; sys.argv = {started.split()}\n{call}"
+    program += f"\nimport sys; sys.stderr.write(repr([name for name in {sorted(HEAVY)} if name in sys.modules]))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path)
+    assert set(ast.literal_eval(done.stderr.splitlines()[-1])) <= MAY_LOAD[started]

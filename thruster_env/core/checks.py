@@ -9,9 +9,15 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from difflib import get_close_matches
 from functools import lru_cache, wraps
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
+from thruster_env.core.modules import AtFirstUse
+
+if TYPE_CHECKING:
+    import numpy as np
+
+if not TYPE_CHECKING:
+    np = AtFirstUse("numpy")
 
 FEW, MANY = 4, 8  # choices that a message names of more than so many
 MOST_LISTED, LONG = 24, 80  # names that a message has, and characters of each
@@ -197,7 +203,7 @@ def covariance(
     *,
     positive_definite: bool = False,
     variances: np.ndarray | None = None,
-    largest: float = np.inf,
+    largest: float = math.inf,
 ) -> np.ndarray:
     """Return a covariance, shape (size, size), from a matrix, `size` variances or one variance if size is 1.
 

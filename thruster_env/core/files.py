@@ -14,9 +14,15 @@ import tempfile
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
-import numpy as np
+from thruster_env.core.modules import AtFirstUse
+
+if TYPE_CHECKING:
+    import numpy as np
+
+if not TYPE_CHECKING:
+    np = AtFirstUse("numpy")
 
 STREAMS = (1, 2)  # descriptors of standard output and standard error
 

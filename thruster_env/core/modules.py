@@ -155,6 +155,15 @@ def when_imported(package: str, act: Callable[[], None]) -> None:
         sys.meta_path.insert(0, _Import(package, act))  # before all others: the last one calls the first
 
 
+class AtFirstUse(ModuleType):
+    """A module that is imported at the first use of one of its names: `np = AtFirstUse("numpy")`."""
+
+    def __getattr__(self, name: str) -> Any:
+        module = importlib.import_module(self.__name__)
+        vars(self).update(vars(module))
+        return getattr(module, name)
+
+
 class _Import:
     """Watches for the import of a package."""
 

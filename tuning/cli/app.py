@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from importlib.metadata import version
+from inspect import cleandoc
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
+from rich.panel import Panel
+from rich.table import Table as RichTable
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 import tuning
+from thruster_env.core.text_tables import console
 from tuning.cli.main import PrintedWhole
 
 PANELS = {
@@ -40,6 +44,7 @@ VERBS = {
 }  # made from the function of that name
 MARKUP: Final = "markdown"
 LOADING = "loading ..."
+VERSION = "Print the version and exit."
 RENAMED = {"--way": "--method", "--sampler": "--method", "ways": "methods", "study": "reproduce"}
 
 
@@ -147,6 +152,19 @@ class Commands(LazyGroup):
         """A command with its name, panel and help alone, read from its file."""
         return listed(name)
 
+    def format_help(self, ctx, formatter) -> None:
+        """List the commands in panels: Typer's own first imports a reader of Markdown, which takes as long."""
+        panels = {"Options": {"--version": VERSION, "--help": "Show this message and exit."}}
+        panels |= {title: {name: str(listed(name).help) for name in names} for title, names in PANELS.items()}
+        with PrintedWhole():
+            console.print(f"\nUsage: thruster [OPTIONS] COMMAND [ARGS]...\n\n{self.help}\n")
+            for title, entries in panels.items():
+                rows = RichTable.grid(padding=(0, 2, 0, 0))
+                rows.add_column(style="bold cyan", width=max(map(len, COMMANDS)))
+                for name, text in entries.items():
+                    rows.add_row(name, " ".join(text.partition("\n\n")[0].replace("`", "").split()))
+                console.print(Panel(rows, title=title, title_align="left", border_style="dim"))
+
     def loaded(self, name: str) -> typer.Typer:
         """The app of a command's module, or of its function."""
         is_verb = name in VERBS
@@ -176,12 +194,10 @@ def listed(name: str) -> TyperCommand:
     if name in VERBS:
         parts = tuning.home_of(file_of(name)).split(".")[1:]
         file, function = file.parents[1].joinpath(*parts).with_suffix(".py"), file_of(name)
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    functions = [part for part in tree.body if isinstance(part, ast.FunctionDef) and part.name == function]
-    text = (ast.get_docstring(functions[0] if functions else tree) or "").partition("\n\nArgs:")[0]
-    return TyperCommand(
-        name, help=text if functions else text.partition(": ")[2].capitalize(), rich_help_panel=COMMANDS[name]
-    )
+    source = file.read_text(encoding="utf-8")
+    match = re.search(rf'^def {function}\(.*?"""(.*?)(?:\n\n    Args:|""")', source, re.DOTALL | re.MULTILINE)
+    text = cleandoc(match[1]) if match else source.split('"""')[1].partition(": ")[2].capitalize()
+    return TyperCommand(name, help=text, rich_help_panel=COMMANDS[name])
 
 
 def imported(module: str):
@@ -216,8 +232,6 @@ app = typer.Typer(
 
 @app.callback()
 def _callback(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
-    ] = False,
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help=VERSION)] = False,
 ) -> None:
     pass

@@ -27,7 +27,6 @@ from thruster_env.thruster.analysis import (
     step_response,
 )
 from thruster_env.thruster.linear import NO_LINEARISATION, SAMPLE_TIME, PublishedLinearModel, published_for
-from thruster_env.thruster.parameters import is_file
 from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, Plant, make_plant
 from tuning.api.markers import INPUT, OUTPUT, WRITTEN, Option, PresetOption
 from tuning.api.result import Printed
@@ -45,7 +44,7 @@ def command(
     max_voltage: Annotated[float, Option(INPUT)] = DEFAULT_MAX_VOLTAGE,
     out: Annotated[Path | None, Option(OUTPUT, metavar="FILE", file=WRITTEN)] = None,
 ) -> Printed:
-    """Print and draw a thruster's linear model at a voltage: steady state, stiffness, control, responses.
+    """Print, and draw, a thruster's linear model at a voltage: steady state, stiffness, control, responses.
 
     Example: thruster inspect --preset tunnel --voltage 12 --out tunnel.png
 
@@ -55,7 +54,7 @@ def command(
         ambient_velocity: ambient flow along the axis U_0 [m/s].
         dt: sample time [s].
         max_voltage: voltage range the integration must follow [V].
-        out: Bode plot and step response, .png, .svg or .pdf; by default out/inspect-PRESET-VOLTAGE.png.
+        out: also draw a Bode plot and the step response: .png, .svg or .pdf.
     """
     if out is not None:
         check_picture(out, "--out")
@@ -73,8 +72,6 @@ def command(
         columns[f"published: {name}"] = theirs
         words = ["", f"{NO_LINEARISATION} {model.remark} Source: {model.source}."]
         published = _plain_published(name, model, theirs)
-    if out is None and ours.model.c.any():  # at rest there is no Bode plot
-        out = Path("out") / f"inspect-{Path(preset).stem if is_file(preset) else preset}-{voltage:g}V.png"
     if out is not None:
         response_figure(out, ours.model, dt, title.replace("U_0", "$U_0$"))
         words += ["", f"Bode plot and step response: {out}"]

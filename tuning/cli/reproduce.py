@@ -15,7 +15,6 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from thruster_env import __version__
 from thruster_env.core.modules import to_install
 from tuning.api.markers import PythonOnly
 from tuning.api.result import Printed
@@ -28,8 +27,8 @@ def experiments() -> Mapping[str, Any]:
     """All experiments by name; ValueError where the package lacks them."""
     if find_spec(PACKAGE) is None:
         raise ValueError(
-            "experiments must be run in a checkout of the project, but this installation is without: "
-            f"pip download --no-deps --no-binary :all: thruster-env=={__version__}, unpack it, and run there"
+            "experiments must be run in a checkout of the project, but this installation has none: "
+            "pip install -e . in the project's folder"
         )
     return import_module(PACKAGE).EXPERIMENTS
 

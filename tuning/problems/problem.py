@@ -13,7 +13,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
-import gymnasium as gym
 import numpy as np
 
 from filters.consistency.time_constants import Run
@@ -24,6 +23,7 @@ from tuning.problems import data as seeds
 from tuning.problems.data import Data, runs_of
 
 if TYPE_CHECKING:
+    import gymnasium as gym
     from optuna.distributions import FloatDistribution, IntDistribution
 
 PART = 0.1  # fraction of its range that is the unit of a parameter on a linear scale

@@ -150,7 +150,7 @@ def test_inspect_shows_the_published_model_beside_ours(thruster, as_json, tmp_pa
     assert gain == pytest.approx(data["dc_gain"]["T [N]"][0], rel=1e-3)
     assert len(data["step"]["V_s"]["T [N]"]) == len(data["step"]["time [s]"])
     assert as_json("inspect", "--preset", "t200")["published"] is None
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]  # the picture; nothing else
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.slow
@@ -159,8 +159,7 @@ def test_inspect_draws(thruster, as_json, tmp_path):
     assert done.returncode == 0 and "new/tunnel.png" in done.stdout
     assert (tmp_path / "new" / "tunnel.png").read_bytes().startswith(b"\x89PNG")
     assert as_json("inspect", "--out", "again.png")["picture"] == "again.png"
-    assert (tmp_path / as_json("inspect", "--voltage", 3)["picture"]).stat().st_size > 10_000
-    assert as_json("inspect", "--voltage", 0)["picture"] is None  # at rest thrust does not move with the voltage
+    assert as_json("inspect", "--voltage", 0)["picture"] is None
 
 
 @pytest.mark.parametrize("preset", slow_but(PRESETS, ["tunnel", "t200"]))
