@@ -135,9 +135,10 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     @inlined
     def estimate(row, numbers):
         x = read_open(row)
-        if inverts and row[known_offset] > 0.0:
-            x = solve(x, row[smooth_offset], (at_last(row), constants(numbers)), numbers[reach_offset])
         store_mean(row, x)
+        if inverts and row[known_offset] > 0.0:
+            c = at_last(row), constants(numbers)
+            store_mean(row, solve(x, row[smooth_offset], c, numbers[reach_offset]))
 
     @inlined
     def start(memory, numbers, size):
@@ -152,12 +153,11 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
-        x, v, c = read_open(row), control(u), constants(numbers)
+        v, c = control(u), constants(numbers)
         for _ in range(int(numbers[substeps_offset])):
-            x = transition(x, v, c)
+            store_open(row, transition(read_open(row), v, c))
         for i in range(feed):
             row[acting + i] = u[i]
-        store_open(row, x)
         estimate(row, numbers)
         row[step_offset] += 1.0
 

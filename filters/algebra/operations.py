@@ -473,22 +473,29 @@ def geometric_mean_of(size: int) -> Callable:
     source = Source("unit", "l", l=(size, size))  # l l' over this has determinant 1
     unit = source.function(source.product(f"l[{i}][{i}] ** {2.0 / size!r}" for i in source.range(size)))
     scaled = entrywise("scaled", "a, f", (size, size), lambda i, j: f"f * a[{i}][{j}]", a=(size, size))
+    (read_first, write_first), (read_second, write_second) = (
+        (matrix_reader(size, size, at), matrix_writer(size, size, at)) for at in (0, size * size)
+    )
 
     @inlined
     def mean(a, b):
         unit_a, unit_b = unit(cholesky(a)), unit(cholesky(b))
-        a, b = scaled(a, 1.0 / unit_a), scaled(b, 1.0 / unit_b)
+        pair = np.empty(2 * size * size)
+        write_first(pair, scaled(a, 1.0 / unit_a))
+        write_second(pair, scaled(b, 1.0 / unit_b))
         rounds_left = count
         while rounds_left > 0:
             rounds_left -= 1
-            both = add(a, b)
+            first, second = read_first(pair), read_second(pair)
+            both = add(first, second)
             root = cholesky(both)
-            parallel = times(solve(a, root), b)
+            parallel = times(solve(first, root), second)
             unit_both = unit(root)
             if 0.5 * unit_both < close:  # it is 1 for equal ones, else larger
                 rounds_left = min(rounds_left, 1)
-            a, b = scaled(both, 1.0 / unit_both), scaled(add(parallel, parallel), 0.5 * unit_both)
-        return scaled(a, (unit_a * unit_b) ** 0.5)
+            write_first(pair, scaled(both, 1.0 / unit_both))
+            write_second(pair, scaled(add(parallel, parallel), 0.5 * unit_both))
+        return scaled(read_first(pair), (unit_a * unit_b) ** 0.5)
 
     return mean
 

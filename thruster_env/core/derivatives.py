@@ -73,9 +73,19 @@ def _sides(name: str, rows: int, call: str, width: str, h: str) -> list[str]:
     lines = [f"{width} = 2.0 * {h}"]
     for word, side in (("if", "above"), ("elif", "below")):
         value_name = name.format(side)
-        finite = f"np.isfinite({value_name}).all()" if is_array(rows) else _all_finite(value_name, rows)
-        lines += [f"{word} not ({finite}):", f"    {value_name}, {width} = {call}, {h}"]
+        finite = f"all_finite({value_name})" if is_array(rows) else _all_finite(value_name, rows)
+        value = f"{value_name}[:]" if is_array(rows) else value_name
+        lines += [f"{word} not ({finite}):", f"    {value}, {width} = {call}, {h}"]
     return lines
+
+
+@inlined
+def all_finite(values):
+    """Whether all entries of an array are finite."""
+    for i in range(len(values)):
+        if not math.isfinite(values[i]):
+            return False
+    return True
 
 
 def _all_finite(name: str, rows: int) -> str:
@@ -143,7 +153,13 @@ def by_complex_step(function: Callable) -> bool:
     return isinstance(function, FunctionType) and function in _EXACT  # others need not have a hash
 
 
-TOOLS: dict[str, Any] = {"np": np, "isfinite": math.isfinite, "step_of": step_of, **NAMES}
+TOOLS: dict[str, Any] = {
+    "np": np,
+    "isfinite": math.isfinite,
+    "all_finite": all_finite,
+    "step_of": step_of,
+    **NAMES,
+}
 
 
 def _differences_in_loops(

@@ -16,7 +16,7 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 
 from thruster_env.core.streams import nearest_whole
-from thruster_env.graphs.instructions import DOUBLE, FLAGS, IN_LIBRARY, LONG, OF_LLVM
+from thruster_env.graphs.instructions import DOUBLE, IN_LIBRARY, LONG, OF_LLVM
 
 BOOL = ir.IntType(1)
 OPERATORS: dict[str, Callable] = {  # of two known numbers
@@ -58,8 +58,8 @@ def as_value(value: Any) -> ir.Value:
 class Arithmetic:
     """Operations on numbers, which a builder adds to its block."""
 
-    def __init__(self, builder: ir.IRBuilder):
-        self.builder = builder
+    def __init__(self, builder: ir.IRBuilder, flags: tuple[str, ...]):
+        self.builder, self._flags = builder, flags
 
     def as_float(self, value: Any) -> ir.Value:
         """A number as a float."""
@@ -117,7 +117,7 @@ class Arithmetic:
             return self._of_whole(name, a, b)
         if name not in OF_FLOATS:
             raise Untranslated(f"{name} of two numbers")
-        return getattr(self.builder, OF_FLOATS[name])(self.as_float(a), self.as_float(b), flags=FLAGS)
+        return getattr(self.builder, OF_FLOATS[name])(self.as_float(a), self.as_float(b), flags=self._flags)
 
     def _of_whole(self, name: str, a: Any, b: Any) -> ir.Value:
         if name == "RShift" and isinstance(b, np.unsignedinteger):
@@ -151,7 +151,7 @@ class Arithmetic:
         values, module = [self.as_float(value) for value in arguments], self.builder.module
         if name in OF_LLVM:
             return self.builder.call(
-                module.declare_intrinsic(f"llvm.{OF_LLVM[name]}", [DOUBLE]), values, fastmath=FLAGS
+                module.declare_intrinsic(f"llvm.{OF_LLVM[name]}", [DOUBLE]), values, fastmath=self._flags
             )
         name = IN_LIBRARY.get(name, name)
         kind = ir.FunctionType(DOUBLE, [DOUBLE] * len(values))
@@ -235,3 +235,5 @@ FUNCTIONS: dict[Any, Callable] = {
     max: lambda arithmetic, *values: arithmetic.extreme("Gt", *values),
 }
 """Functions of Python, NumPy and this package, as functions (arithmetic, *arguments)."""
+OF_ENTRIES = {abs, np.abs, *(getattr(np, name) for name in NAMES)}
+"""Those that take arrays entry by entry."""

@@ -7,22 +7,23 @@ import builtins
 import types
 from collections.abc import Callable, Iterator, Sequence
 from functools import reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 
-from thruster_env.core.compiled import FASTMATH, instead_of
+from thruster_env.core.compiled import fastmath_of, instead_of
 from thruster_env.core.optimising import WIDE
+from thruster_env.core.results import fill
 from thruster_env.core.streams import fill_normals
-from thruster_env.graphs.arithmetic import BOOL, FUNCTIONS, Arithmetic, Untranslated, as_value, is_known
+from thruster_env.graphs.arithmetic import BOOL, FUNCTIONS, OF_ENTRIES, Untranslated, as_value, is_known
+from thruster_env.graphs.arrays import POINTER, Arrays, Memory
 from thruster_env.graphs.forms import Array, Known, common_form, form_of, value_of
 from thruster_env.graphs.instructions import DOUBLE, LONG, LoopWriter, Writer
-from thruster_env.graphs.programs import OF_MEMBERS, cut
+from thruster_env.graphs.programs import CALLED, OF_MEMBERS, READ_NUMBERS, cut
 
-LONGEST = 4096  # numbers of an array that a function makes for itself, on the stack
-POINTER = DOUBLE.as_pointer()
 FILL_NORMALS = "fill_normals"
+MOST_NUMBERS = 2**40  # the length of an array of which only the pointer is known
 
 
 class Functions(dict):
@@ -36,23 +37,37 @@ class Functions(dict):
     programs_apart, draws = True, False
 
 
-class Expressions:
+class Translated(NamedTuple):
+    """A function of a module.
+
+    Attributes:
+        function: that takes the numbers of its arguments, then the memory of results.
+        form: of its result.
+        has_loops: whether it has loops or calls of programs.
+        memory: how many numbers each array takes that it returns.
+        leads: of each number of the result, where it leads if it is a pointer, see `arrays.Memory`.
+    """
+
+    function: ir.Function
+    form: Any
+    has_loops: bool
+    memory: Sequence[int]
+    leads: Sequence[set]
+
+
+class Expressions(Arrays):
     """Translates expressions: names stand for values of LLVM, arrays, tuples, or objects of Python that are known.
 
     Attributes:
-        numbers: operations on numbers.
         has_loops: whether there are loops or calls of programs, also in what is called.
     """
 
-    def __init__(self, builder: ir.IRBuilder, functions: Functions):
-        self.numbers, self._builder, self._functions = Arithmetic(builder), builder, functions
-        self.has_loops = False
+    def __init__(self, builder: ir.IRBuilder, functions: Functions, flags: frozenset[str]):
+        super().__init__(builder, flags)
+        self._functions, self.has_loops = functions, False
         self._names: dict[str, Any] = {}
         self._slots: dict[str, Any] = {}  # forms and addresses of what changes
         self._function: Any = None
-        self._ways_out: list[tuple[ir.Block, ir.Block]] = []  # of loops: where `continue` and `break` lead
-        self._on_heap: list[ir.Value] = []  # slots of addresses that are freed at the end
-        self._makes_arrays = self._makes_in_loop = False
 
     def call(self, function: Any, arguments: Sequence) -> Any:
         """Call a function with these arguments; return its result."""
@@ -61,11 +76,13 @@ class Expressions:
         if function in BUILTINS:
             return BUILTINS[function](self, *arguments)
         if function in FUNCTIONS:
+            if function in OF_ENTRIES and any(isinstance(argument, Array) for argument in arguments):
+                return self._by_entries(lambda *entries: FUNCTIONS[function](self.numbers, *entries), *arguments)
             return FUNCTIONS[function](self.numbers, *arguments)
         if hasattr(function, "evaluation"):
             return self._evaluate(*function.evaluation, *arguments)
         if (instead := instead_of(function)) is not None:
-            if instead.function is None or instead.fastmath != FASTMATH:
+            if instead.function is None:
                 raise Untranslated(f"a call of {function!r}")
             return self.call(instead.function, arguments)
         if hasattr(function, "_fields"):  # a kind of tuple
@@ -78,36 +95,44 @@ class Expressions:
         if not known:
             self._functions[key] = None  # which a function that calls itself would unpack
             self._functions[key] = self._added(key, [number.type for number in numbers])
-        called, form, has_loops = self._functions[key]
-        self.has_loops |= has_loops
-        if known and has_loops:  # a second copy of loops would only take time to compile
-            called.attributes.add("noinline")
-        result = self._builder.call(called, numbers)
-        if isinstance(result.type, ir.LiteralStructType):
-            parts = [self._builder.extract_value(result, k) for k in range(len(result.type.elements))]
-            return value_of(form, iter(parts))
-        return value_of(form, iter([result]))
+        called: Translated = self._functions[key]
+        self.has_loops |= called.has_loops
+        if known and called.has_loops:  # a second copy of loops would only take time to compile
+            called.function.attributes.add("noinline")
+        results = [Memory(self, count) for count in called.memory]
+        value = self._builder.call(called.function, [*numbers, *(memory.pointer for memory in results)])
+        parts = [value]
+        if isinstance(value.type, ir.LiteralStructType):
+            parts = [self._builder.extract_value(value, k) for k in range(len(value.type.elements))]
+        for part, leads in zip(parts, called.leads, strict=False):
+            self._leads[part] = {
+                lead for way in leads for lead in self._where_result_leads(way, part, numbers, results)
+            }
+        return value_of(called.form, iter(parts))
 
-    def add_body(self, function: types.FunctionType, arguments: Sequence) -> Any:
-        """Add the body of a function for its arguments; return the form of its results."""
+    def _where_result_leads(self, way: Any, part: ir.Value, numbers: Sequence, results: Sequence) -> set:
+        """Where a pointer leads that another function returns, see `Translated.leads`."""
+        if way is None:  # memory that it has asked for
+            return {Memory(self, pointer=part)}
+        kind, k = way
+        return {results[k]} if kind == "result" else self._leads[numbers[k]]
+
+    def add_body(self, function: types.FunctionType, arguments: Sequence) -> tuple[Any, list[int], list[set]]:
+        """Add the body of a function for its arguments; return form, memory and leads of `Translated`."""
         raise NotImplementedError
 
-    def _added(self, key: tuple, kinds: Sequence[ir.Type]) -> tuple:
-        """A new function, for arguments of these forms; with the form of its result, and whether it has loops."""
+    def _added(self, key: tuple, kinds: Sequence[ir.Type]) -> Translated:
+        """A new function, for arguments of these forms."""
         function, *forms = key
         kind = ir.FunctionType(ir.VoidType(), kinds)  # the type of the result is known after the body
         target = new_function(self._builder.module, kind, function.__name__)
-        translator = type(self)(ir.IRBuilder(target.append_basic_block("entry")), self._functions)
+        builder = ir.IRBuilder(target.append_basic_block("entry"))
+        translator = type(self)(builder, self._functions, frozenset(fastmath_of(function)))
+        for k, argument in enumerate(target.args):
+            translator._leads[argument] = {("argument", k)}
         numbers = iter(target.args)
-        form = translator.add_body(function, [value_of(form, numbers) for form in forms])
-        return target, form, translator.has_loops
-
-    def array_at(self, pointer: ir.Value, shape: Sequence) -> Array:
-        """An array in C order."""
-        steps: list = [1]
-        for size in reversed(shape[1:]):
-            steps.insert(0, self.numbers.of_two("Mult", size, steps[0]))
-        return Array(pointer, tuple(shape), tuple(steps[: len(shape)]))
+        form, memory, leads = translator.add_body(function, [value_of(form, numbers) for form in forms])
+        return Translated(target, form, translator.has_loops, memory, leads)
 
     def _value(self, node: ast.expr | None) -> Any:
         return self._translated(node)
@@ -128,10 +153,6 @@ class Expressions:
             number for part, entry in zip(form[1:], value, strict=True) for number in self._numbers_of(part, entry)
         ]
 
-    def _slot(self, kind: ir.Type, count: int = 1) -> ir.Value:
-        with self._builder.goto_entry_block():
-            return self._builder.alloca(kind, count)
-
     # Expressions.
 
     def _constant(self, node: ast.Constant) -> Any:
@@ -140,7 +161,11 @@ class Expressions:
     def _name(self, node: ast.Name) -> Any:
         if node.id in self._slots:
             form, slots = self._slots[node.id]
-            return value_of(form, (self._builder.load(slot, typ=kind) for slot, kind in slots))
+            numbers = []
+            for slot, kind, leads in slots:
+                numbers.append(self._builder.load(slot, typ=kind))
+                self._leads[numbers[-1]] = leads
+            return value_of(form, iter(numbers))
         function = self._function
         cells = dict(zip(function.__code__.co_freevars, function.__closure__ or (), strict=True))
         if node.id in self._names:
@@ -153,12 +178,16 @@ class Expressions:
 
     def _attribute(self, node: ast.Attribute) -> Any:
         value = self._value(node.value)
-        if is_known(value) or node.attr in getattr(value, "_fields", ()):
+        if isinstance(value, Array) and node.attr in ATTRIBUTES:
+            return ATTRIBUTES[node.attr](self, value)
+        if not isinstance(value, Array) and (is_known(value) or node.attr in getattr(value, "_fields", ())):
             return getattr(value, node.attr)
         raise Untranslated(f"the attribute {node.attr}")
 
-    def _tuple(self, node: ast.Tuple) -> tuple:
+    def _tuple(self, node: ast.Tuple | ast.List) -> tuple:
         return tuple(self._value(part) for part in node.elts)
+
+    _list = _tuple  # what reads it cannot change it
 
     def _call(self, node: ast.Call) -> Any:
         if node.keywords:
@@ -168,6 +197,8 @@ class Expressions:
         return self.call(self._value(node.func), [self._value(argument) for argument in node.args])
 
     def _method(self, value: Any, name: str, arguments: list) -> Any:
+        if name == "copy" and isinstance(value, Array) and not arguments:
+            return self._copied(value)
         if name == "reshape" and isinstance(value, Array):
             shape = arguments[0] if isinstance(arguments[0], tuple) else tuple(arguments)
             if value.steps == self.array_at(value.pointer, value.shape).steps:  # in C order
@@ -180,7 +211,12 @@ class Expressions:
         a, b = self._value(node.left), self._value(node.right)
         if isinstance(node.op, ast.Add) and type(a) is type(b) is tuple:
             return a + b
-        return self.numbers.of_two(type(node.op).__name__, a, b)
+        name = type(node.op).__name__
+        if isinstance(a, Array) or isinstance(b, Array):
+            if name not in ("Add", "Sub", "Mult", "Div", "Pow"):
+                raise Untranslated(f"{name} of arrays")
+            return self._by_entries(lambda *entries: self.numbers.of_two(name, *entries), a, b)
+        return self.numbers.of_two(name, a, b)
 
     def _unaryop(self, node: ast.UnaryOp) -> Any:
         value = self._value(node.operand)
@@ -188,6 +224,8 @@ class Expressions:
             return not value if is_known(value) else self._builder.not_(self.numbers.truth(value))
         if not isinstance(node.op, ast.USub):
             raise Untranslated("an operator")
+        if isinstance(value, Array):
+            return self._by_entries(lambda entry: self.numbers.of_two("Sub", 0, entry), value)
         return -value if is_known(value) else self.numbers.of_two("Sub", 0, value)
 
     def _compare(self, node: ast.Compare) -> Any:
@@ -237,62 +275,17 @@ class Expressions:
     def _selected(self, test: Any, values: Sequence) -> Any:
         """The first of two values if the test is true, else the second."""
         test, form = self.numbers.truth(test), common_form(values)
-        pairs = zip(*(self._numbers_of(form, value) for value in values), strict=True)
-        return value_of(form, (self._builder.select(test, *pair) for pair in pairs))
+        numbers = []
+        for pair in zip(*(self._numbers_of(form, value) for value in values), strict=True):
+            numbers.append(self._builder.select(test, *pair))
+            self._leads[numbers[-1]] = {lead for number in pair for lead in self._leads[number]}
+        return value_of(form, iter(numbers))
 
     def _slice(self, node: ast.Slice) -> slice:
         return slice(*(part and self._value(part) for part in (node.lower, node.upper, node.step)))
 
     def _subscript(self, node: ast.Subscript) -> Any:
         return self._part(self._value(node.value), self._value(node.slice))
-
-    def _part(self, value: Any, index: Any) -> Any:
-        """An entry or a part of a tuple or an array."""
-        entry = self._entry(value, index)
-        if isinstance(entry, Array) and not entry.shape:
-            return self._builder.load(entry.pointer, align=8, typ=DOUBLE)
-        return entry
-
-    def _entry(self, value: Any, index: Any) -> Any:
-        """What lies at an index: a tuple's entry, or an array's part, which has no lengths if it is a number."""
-        if not isinstance(value, Array):
-            if isinstance(value, tuple):
-                return value[index] if is_known(index) else self._entry_of_known(value, index)
-            raise Untranslated("an index")
-        indices = list(index) if isinstance(index, tuple) else [index]
-        indices += [slice(None)] * (len(value.shape) - len(indices))
-        at, shape, steps, of_two = 0, [], [], self.numbers.of_two
-        for part, size, step in zip(indices, value.shape, value.steps, strict=True):
-            first: Any = _from_the_end(part, size, of_two)
-            if isinstance(part, slice):
-                if part.step is not None:
-                    raise Untranslated("a slice with a step")
-                if all(map(is_known, (part.start, part.stop, size))):
-                    first, stop, _ = part.indices(size)
-                    stop = max(first, stop)
-                else:
-                    first = 0 if part.start is None else _from_the_end(part.start, size, of_two)
-                    stop = size if part.stop is None else _from_the_end(part.stop, size, of_two)
-                shape.append(of_two("Sub", stop, first))
-                steps.append(step)
-            at = of_two("Add", at, of_two("Mult", first, step))
-        return Array(self._behind(value.pointer, at), tuple(shape), tuple(steps))
-
-    def _entry_of_known(self, values: tuple, index: Any) -> ir.Value:
-        """An entry of a tuple of known numbers, at an index that is not known."""
-        numbers = [as_value(value) for value in values if is_known(value)]
-        kind = DOUBLE if any(number.type == DOUBLE for number in numbers) else LONG
-        if len(numbers) < len(values) or not values:
-            raise Untranslated("an index")
-        module = self._builder.module
-        table = ir.GlobalVariable(module, ir.ArrayType(kind, len(values)), module.get_unique_name("known"))
-        table.linkage, table.global_constant = "internal", True
-        table.initializer = ir.Constant(table.value_type, [float(v) if kind == DOUBLE else int(v) for v in values])
-        pointer = self._builder.gep(table, [ir.Constant(LONG, 0), self.numbers.as_whole(index)])
-        return self._builder.load(pointer, typ=kind)
-
-    def _behind(self, pointer: ir.Value, count: Any) -> ir.Value:
-        return self._builder.gep(pointer, [self.numbers.as_whole(count)], source_etype=DOUBLE)
 
     # Branches and loops.
 
@@ -322,38 +315,8 @@ class Expressions:
             numbers.append(builder.phi(incoming[0][0].type))
             for number, block in incoming:
                 numbers[-1].add_incoming(number, block)
+            self._leads[numbers[-1]] = {lead for number, _ in incoming for lead in self._leads[number]}
         return value_of(form, iter(numbers))
-
-    def _loop(self, first: Any, stop: Any, step: Any = 1) -> Iterator[ir.Value]:
-        """The index of a loop, once: what is translated meanwhile is its body."""
-        builder = self._builder
-        head, inside, following, after = map(builder.append_basic_block, ("head", "inside", "following", "after"))
-        self.has_loops = True
-        first, stop, step = (self.numbers.as_whole(bound) for bound in (first, stop, step))
-        before = builder.block
-        self._lead_to(head)
-        at = builder.phi(LONG)
-        at.add_incoming(first, before)
-        up, down = (builder.icmp_signed(sign, at, stop) for sign in "<>")
-        if isinstance(step, ir.Constant):
-            goes_on = up if step.constant > 0 else down
-        else:
-            goes_on = builder.select(builder.icmp_signed(">", step, ir.Constant(LONG, 0)), up, down)
-        builder.cbranch(goes_on, inside, after)
-        builder.position_at_end(inside)
-        self._ways_out.append((following, after))
-        yield at
-        self._ways_out.pop()
-        self._lead_to(following)
-        at.add_incoming(builder.add(at, step, flags=("nsw",)), following)
-        builder.branch(head)
-        builder.position_at_end(after)
-
-    def _lead_to(self, block: ir.Block) -> None:
-        """Go on in another block."""
-        if not self._builder.block.is_terminated:
-            self._builder.branch(block)
-        self._builder.position_at_end(block)
 
     # Calls.
 
@@ -379,14 +342,26 @@ class Expressions:
             if self._functions.programs_apart:
                 called.attributes.add("noinline")
             builder, data = ir.IRBuilder(called.append_basic_block()), dict(zip(names, called.args, strict=False))
+            translator = type(self)(builder, self._functions, frozenset())
             if names == OF_MEMBERS:
-                LoopWriter(None, builder, data, width, *called.args[-2:]).write(cut(program, scratch))
+                LoopWriter(translator.call_by_name, builder, data, width, *called.args[-2:]).write(
+                    cut(program, scratch)
+                )
             else:
-                writer = Writer(None, builder, data, width)
+                writer = Writer(translator.call_by_name, builder, data, width)
                 writer.stride = called.args[-1]
                 writer.write(program)
+            translator.arrange_memory([[]])
+            translator.free_all_but([])
             builder.ret_void()
         self._builder.call(called, [*(array.pointer for array in arrays), *map(self.numbers.as_whole, more)])
+
+    def call_by_name(self, name: str, numbers: Sequence, count: int, table: ir.Value | None) -> list[ir.Value]:
+        """The `count` results of a function of CALLED for some numbers, and perhaps the array `numbers`."""
+        given, results = self._copied((*numbers,)), self._array_on_stack(count)
+        tables = [self.array_at(table, (MOST_NUMBERS,))] if name in READ_NUMBERS else []
+        self.call(CALLED[name], [given, results, *tables])
+        return [self._part(results, k) for k in range(count)]
 
     def _evaluate(self, work: Callable, shape: Sequence, sizes: Sequence, vectors: tuple, out: Any = None) -> Any:
         """The results of a program of vectors of some sizes: in a tuple of this shape, or in an array."""
@@ -403,36 +378,6 @@ class Expressions:
         rows = zip(*[iter(numbers)] * shape[-1], strict=True)
         return tuple(numbers) if len(shape) == 1 else tuple(rows)
 
-    def _array_on_stack(self, count: int) -> Array:
-        return self.array_at(self._slot(DOUBLE, max(count, 1)), (count,))
-
-    def _new_array(self, shape: Any) -> Array:
-        sizes, self._makes_arrays = shape if isinstance(shape, tuple) else (shape,), True
-        self._makes_in_loop |= bool(self._ways_out)
-        count = self._count(sizes)
-        if not is_known(count) or count > LONGEST:
-            return self._new_array_on_heap(sizes, count)
-        array = self.array_at(self._slot(DOUBLE, max(count, 1)), sizes)
-        for at in self._loop(0, count):
-            self._builder.store(ir.Constant(DOUBLE, 0.0), self._behind(array.pointer, at), align=8)
-        return array
-
-    def _new_array_on_heap(self, sizes: tuple, count: Any) -> Array:
-        """An array that is freed when the function ends, or another one takes its place."""
-        slot, builder = self._slot(POINTER), self._builder
-        with builder.goto_entry_block():
-            builder.store(ir.Constant(POINTER, None), slot)
-        self._on_heap.append(slot)
-        builder.call(self._of_c("free"), [builder.load(slot, typ=POINTER)])
-        pointer = builder.call(self._of_c("calloc"), [self.numbers.as_whole(count), ir.Constant(LONG, 8)])
-        builder.store(pointer, slot)
-        return self.array_at(pointer, sizes)
-
-    def _of_c(self, name: str) -> ir.Function:
-        kinds = {"calloc": (POINTER, [LONG, LONG]), "free": (ir.VoidType(), [POINTER])}[name]
-        module = self._builder.module
-        return module.globals.get(name) or ir.Function(module, ir.FunctionType(*kinds), name)
-
     def _fill_normals(self, out: Array, count: Any, *counter_and_key: Any) -> None:
         if out.steps != (1,):
             raise Untranslated("normals in a part of an array")
@@ -442,18 +387,25 @@ class Expressions:
         numbers = self.numbers.as_whole(count), *map(self.numbers.as_float, counter_and_key)
         self._builder.call(function, [out.pointer, *numbers])
 
-    def _count(self, shape: Sequence) -> Any:
-        return reduce(lambda a, b: self.numbers.of_two("Mult", a, b), shape)
-
-    def _length(self, value: Any) -> Any:
-        return value.shape[0] if isinstance(value, Array) else len(value)
-
 
 BUILTINS: dict[Any, Callable] = {
-    np.zeros: Expressions._new_array,
+    np.zeros: Expressions._zeros,
     np.empty: Expressions._new_array,
+    np.empty_like: lambda translator, like: translator._new_array(like.shape),
+    np.zeros_like: lambda translator, like: translator._zeros(like.shape),
+    np.ones: lambda translator, shape: translator._full(shape, 1.0),
+    np.full: Expressions._full,
+    np.array: Expressions._copied,
+    np.linalg.eigh: Expressions._eigenvectors,
+    fill: Expressions._fill,
     len: Expressions._length,
     fill_normals: Expressions._fill_normals,
+}
+ATTRIBUTES: dict[str, Callable] = {
+    "shape": lambda translator, array: array.shape,
+    "ndim": lambda translator, array: len(array.shape),
+    "size": lambda translator, array: translator._count(array.shape),
+    "T": lambda translator, array: Array(array.pointer, array.shape[::-1], array.steps[::-1]),
 }
 
 
@@ -473,12 +425,6 @@ def new_function(module: ir.Module, kind: ir.FunctionType, name: str) -> ir.Func
     function.linkage = "internal"
     set.add(function.attributes, WIDE)  # its own `add` knows attributes without a value only
     return function
-
-
-def _from_the_end(bound: Any, size: Any, of_two: Callable) -> Any:
-    """A known index or bound that is negative counts from the end; one that is not known must not be negative."""
-    is_negative = isinstance(bound, int | np.integer) and bound < 0
-    return of_two("Add", size, bound) if is_negative else bound
 
 
 def _is_plain(node: ast.expr, test: ast.expr) -> bool:

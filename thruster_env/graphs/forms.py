@@ -71,6 +71,6 @@ def changing_form(value: Any) -> Any:
     return LONG if kind == BOOL else kind
 
 
-def has_array(value: Any) -> bool:
-    """Whether a value is an array, or a tuple with one."""
-    return isinstance(value, Array) or isinstance(value, tuple) and any(map(has_array, value))
+def is_tuple(value: Any) -> bool:
+    """Whether a value is a tuple, and no array."""
+    return isinstance(value, tuple) and not isinstance(value, Array)

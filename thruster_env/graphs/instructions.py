@@ -22,9 +22,7 @@ from thruster_env.core.streams import ROUNDER, ROUNDER_BITS, SQRT_HALF_BITS
 from thruster_env.graphs.graphs import COMPARISONS, Number
 from thruster_env.graphs.programs import (
     BY_MEMBERS,
-    CALLED,
     OF_MEMBERS,
-    READ_NUMBERS,
     SIDE_BY_SIDE,
     Body,
     Cut,
@@ -79,9 +77,9 @@ class Writer:
         stride: numbers between two rows of the array `memory`.
     """
 
-    def __init__(self, context, builder: ir.IRBuilder, arrays: dict, width: int):
+    def __init__(self, call: Callable, builder: ir.IRBuilder, arrays: dict, width: int):
         """Begin; arrays are pointers to their first numbers."""
-        self._context, self._builder, self._arrays, self._width = context, builder, arrays, width
+        self._call, self._builder, self._arrays, self._width = call, builder, arrays, width
         self._vector, self._longs = ir.VectorType(DOUBLE, width), ir.VectorType(LONG, width)
         self.stride: ir.Value | None = None
         self.values: dict[int, ir.Value] = {}
@@ -245,30 +243,12 @@ class Writer:
 
     def _worked_out_by(self, name: str, count: int, values: list[ir.Value]) -> list[ir.Value]:
         """The results of a function of two arrays, run after run."""
-        from numba.core import cgutils, types, typing
-        from numba.np.arrayobj import populate_array
-
-        if self._context is None:
-            raise TypeError(f"numba compiles {name}")
-        builder, context, kind = self._builder, self._context, types.Array(types.float64, 1, "C")
-        arrays, eight = [], ir.Constant(LONG, 8)
-        lengths = [len(values), count] + [MOST_NUMBERS] * (name in READ_NUMBERS)
-        for length, data in zip(lengths, (None, None, self._arrays.get("numbers")), strict=False):
-            array, size = context.make_array(kind)(context, builder), ir.Constant(LONG, length)
-            data = cgutils.alloca_once(builder, DOUBLE, size) if data is None else data
-            populate_array(array, data, (size,), (eight,), eight, None)
-            arrays.append(array)
-        signature, work = typing.signature(types.none, *[kind] * len(arrays)), CALLED[name]
-        results = [ir.Constant(self._vector, ir.Undefined)] * count
+        builder, results = self._builder, [ir.Constant(self._vector, ir.Undefined)] * count
         for k in range(self._width):
             at = ir.Constant(ir.IntType(32), k)
-            for i, value in enumerate(values):
-                pointer = builder.gep(arrays[0].data, [ir.Constant(LONG, i)], source_etype=DOUBLE)
-                builder.store(builder.extract_element(value, at), pointer)
-            context.compile_internal(builder, work, signature, [array._getvalue() for array in arrays])
-            for i in range(count):
-                pointer = builder.gep(arrays[1].data, [ir.Constant(LONG, i)], source_etype=DOUBLE)
-                results[i] = builder.insert_element(results[i], builder.load(pointer, typ=DOUBLE), at)
+            numbers = [builder.extract_element(value, at) for value in values]
+            for i, result in enumerate(self._call(name, numbers, count, self._arrays.get("numbers"))):
+                results[i] = builder.insert_element(results[i], result, at)
         return results
 
     def _called(self, name: str, values: list[ir.Value], flags: Sequence[str]) -> ir.Value:
@@ -320,11 +300,11 @@ class LoopWriter:
     """Writes what is done once, and loops; `columns` of the table, and `size` members."""
 
     def __init__(
-        self, context, builder: ir.IRBuilder, arrays: dict, width: int, columns: ir.Value, size: ir.Value
+        self, call: Callable, builder: ir.IRBuilder, arrays: dict, width: int, columns: ir.Value, size: ir.Value
     ):
-        self._context, self._builder, self._arrays, self._width = context, builder, arrays, width
+        self._call, self._builder, self._arrays, self._width = call, builder, arrays, width
         self._columns, self._size = columns, size
-        self._once = Writer(context, builder, arrays, 1)
+        self._once = Writer(call, builder, arrays, 1)
         self._once.values_of["size"] = self._as_vector(builder.sitofp(size, DOUBLE))
 
     def _as_vector(self, value: ir.Value) -> ir.Value:
@@ -342,7 +322,7 @@ class LoopWriter:
 
     def _loop(self, body: Body) -> None:
         builder, width = self._builder, self._width
-        each = Writer(self._context, builder, self._arrays, width)
+        each = Writer(self._call, builder, self._arrays, width)
         self._same_for_all(each, body)
         mask = ir.Constant(ir.VectorType(LONG, width), list(range(width))) if body.sums else None
         before = builder.block

@@ -27,12 +27,14 @@ from typing import Any, NamedTuple
 
 from llvmlite import ir  # type: ignore[import-untyped]
 
-from thruster_env.core.compiled import CompiledOrPython, is_interpreting
+from thruster_env.core.compiled import FASTMATH, CompiledOrPython, is_interpreting
 from thruster_env.core.optimising import WIDE
 from thruster_env.core.streams import fill_in_loop
+from thruster_env.core.user_functions import OURS
 from thruster_env.graphs.arithmetic import Untranslated, is_known
-from thruster_env.graphs.expressions import FILL_NORMALS, POINTER, Expressions, Functions
-from thruster_env.graphs.forms import changing_form, common_form, has_array
+from thruster_env.graphs.arrays import LAPACK, POINTER, Memory, of_lapack
+from thruster_env.graphs.expressions import FILL_NORMALS, Expressions, Functions
+from thruster_env.graphs.forms import Array, changing_form, common_form, is_tuple
 from thruster_env.graphs.instructions import DOUBLE, LONG
 from thruster_env.graphs.machine_code import Code, NotLinked, add_builtin, code_folder, code_of, function_of
 
@@ -76,7 +78,8 @@ def common_code_of(*entries: Entry, unrolled: bool = True) -> Code | None:
         return None
     try:
         libraries = [_library_of_normals()] if functions.draws else []
-        return code_of(module, *names, unrolled=unrolled, libraries=libraries)
+        symbols = {name: of_lapack(name) for name in LAPACK if name in module.globals}
+        return code_of(module, *names, unrolled=unrolled, libraries=libraries, symbols=symbols)
     except NotLinked:  # numba brings the function that is lacking
         return None
 
@@ -89,7 +92,7 @@ def _library_of_normals() -> Code:
     target = ir.Function(module, kind, FILL_NORMALS)
     builder = ir.IRBuilder(target.append_basic_block())
     out, count, *counter_and_key = target.args
-    translator = _Translator(builder, Functions())
+    translator = _Translator(builder, Functions(), FASTMATH)
     translator.call(fill_in_loop, (translator.array_at(out, [count]), count, *counter_and_key))
     builder.ret_void()
     set.add(target.attributes, WIDE)
@@ -116,7 +119,7 @@ def add_function(
     """
     target = ir.Function(module, ir.FunctionType(LONG, [LONG.as_pointer()]), name)
     builder, word = ir.IRBuilder(target.append_basic_block("entry")), 0
-    translator = _Translator(builder, Functions() if functions is None else functions)
+    translator = _Translator(builder, Functions() if functions is None else functions, FASTMATH)
 
     def next_word() -> ir.Value:
         nonlocal word
@@ -133,9 +136,29 @@ def add_function(
         return translator.array_at(pointer, lengths)
 
     result = translator.call(function, [argument_of(shape) for shape in shapes])
+    translator.arrange_memory([[]])
+    translator.free_all_but([])
     builder.ret(translator.numbers.as_whole(0 if result is None else result))
     set.add(target.attributes, WIDE)
     return target, word
+
+
+def unknown(count: int, *, as_array: bool) -> Any:
+    """As many numbers that are not known, in an array or a tuple, for `refusal_of`."""
+    if as_array:
+        return Array(ir.Constant(POINTER, ir.Undefined), (count,), (1,))
+    return (ir.Constant(DOUBLE, ir.Undefined),) * count
+
+
+def refusal_of(function: Callable, arguments: Sequence) -> str:
+    """Why a function cannot be translated for arguments of these kinds; an empty text if it can."""
+    target = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), []), "refused")
+    translator = _Translator(ir.IRBuilder(target.append_basic_block()), Functions(), FASTMATH)
+    try:
+        translator.call(function, arguments)
+    except TypeError as error:
+        return str(error) or type(error).__name__
+    return ""
 
 
 class Loops:
@@ -175,14 +198,16 @@ class Loops:
 class _Translator(Expressions):
     """Translates functions."""
 
-    def __init__(self, builder: ir.IRBuilder, functions: Functions):
-        super().__init__(builder, functions)
+    def __init__(self, builder: ir.IRBuilder, functions: Functions, flags: frozenset[str]):
+        super().__init__(builder, functions, flags)
         self._changing: set[str] = set()  # names of what changes
+        self._of_names: dict[str, tuple[Array, Memory]] = {}  # of arrays that change
         self._returns: list[tuple[ir.Block, Any]] = []
 
-    def add_body(self, function: types.FunctionType, arguments: Sequence) -> Any:
-        """Add the body of a function for its arguments; return the form of its results."""
+    def add_body(self, function: types.FunctionType, arguments: Sequence) -> tuple[Any, list[int], list[set]]:
+        """Add the body of a function for its arguments; return form, memory and leads of `Translated`."""
         node, self._function = _definition(function.__code__), function
+        self.wraps = (function.__module__ or "").partition(".")[0] not in OURS
         if len(arguments) != len(node.args.args):
             raise Untranslated(f"{function.__name__} with arguments by default, or too many")
         self._names = dict(zip((argument.arg for argument in node.args.args), arguments, strict=True))
@@ -197,28 +222,30 @@ class _Translator(Expressions):
         if not self._builder.block.is_terminated:
             self._returns.append((self._builder.block, None))
         values, builder = [value for _, value in self._returns], self._builder
-        if self._makes_arrays and any(map(has_array, values)):
-            raise Untranslated("an array that a function makes and returns")
         form = common_form(values)
+        results = []
         for block, value in self._returns:
             builder.position_at_end(block)
-            results = self._numbers_of(form, value)
-            for slot in self._on_heap:
-                builder.call(self._of_c("free"), [builder.load(slot, typ=POINTER)])
-            kind = ir.LiteralStructType([it.type for it in results])
-            _set_result(builder.function, results[0].type if len(results) == 1 else kind if results else None)
-            if not results:
+            results.append(self._numbers_of(form, value))
+        memory, leads = self.arrange_memory(results)
+        kinds = [number.type for number in results[0]]
+        kind = ir.LiteralStructType(kinds)
+        _set_result(builder.function, kinds[0] if len(kinds) == 1 else kind if kinds else None)
+        for (block, _), numbers in zip(self._returns, results, strict=True):
+            builder.position_at_end(block)
+            self.free_all_but(numbers)
+            if not numbers:
                 builder.ret_void()
-            elif len(results) == 1:
-                builder.ret(results[0])
+            elif len(numbers) == 1:
+                builder.ret(*numbers)
             else:
                 struct = ir.Constant(kind, ir.Undefined)
-                for k, number in enumerate(results):
+                for k, number in enumerate(numbers):
                     struct = builder.insert_value(struct, number, k)
                 builder.ret(struct)
         builder.position_at_end(entry)
         builder.branch(body)
-        return form
+        return form, memory, leads
 
     def _statements(self, body: Sequence[ast.stmt]) -> None:
         for statement in body:
@@ -247,36 +274,76 @@ class _Translator(Expressions):
     def _assign(self, statement: ast.Assign) -> None:
         value = self._value(statement.value)
         for target in statement.targets:
+            if (
+                isinstance(target, ast.Tuple)
+                and is_tuple(value)
+                and any(isinstance(part, ast.Subscript) for part in target.elts)
+            ):
+                value = tuple(self._copied(part) if isinstance(part, Array) else part for part in value)
             self._store(target, value)
 
     def _augassign(self, statement: ast.AugAssign) -> None:
-        self._store(statement.target, self._value(ast.BinOp(statement.target, statement.op, statement.value)))
+        before = self._value(statement.target)
+        value = self._value(ast.BinOp(statement.target, statement.op, statement.value))
+        if isinstance(before, Array):
+            if any(memory.is_copy for memory in self._memory_of(before)):
+                raise Untranslated("an argument that changes in place")
+            self._fill(before, value)
+        else:
+            self._store(statement.target, value)
 
     def _store(self, target: ast.expr, value: Any) -> None:
         if isinstance(target, ast.Tuple):
-            if not isinstance(value, tuple):
+            if not is_tuple(value):
                 raise Untranslated("an assignment of parts of what is no tuple")
             for part, entry in zip(target.elts, value, strict=True):
                 self._store(part, entry)
         elif isinstance(target, ast.Subscript):
-            entry = self._entry(self._value(target.value), self._value(target.slice))
+            array = self._value(target.value)
+            if not isinstance(array, Array):
+                raise Untranslated("an assignment to a part of what is no array")
+            if any(memory.is_copy for memory in self._memory_of(array)):
+                raise Untranslated("an assignment to a part of an argument that changes")
+            entry = self._entry(array, self._value(target.slice))
             if entry.shape:
-                raise Untranslated("an assignment to a part of an array")
-            self._builder.store(self.numbers.as_float(value), entry.pointer, align=8)
+                self._fill(entry, value)
+            else:
+                self._builder.store(self.numbers.as_float(value), entry.pointer, align=8)
         elif not isinstance(target, ast.Name):
             raise Untranslated("an assignment")
+        elif target.id in self._changing and isinstance(value, Array) and is_known(value.shape):
+            self._store_array(target.id, value)
         elif target.id in self._changing:
             if target.id not in self._slots:
                 form = changing_form(value)
                 kinds = [number.type for number in self._numbers_of(form, value)]
-                self._slots[target.id] = form, [(self._slot(kind), kind) for kind in kinds]
-            if self._makes_in_loop and has_array(value):  # the next turn makes it at the same address
-                raise Untranslated("an array that is made in a loop, in a name that changes")
+                self._slots[target.id] = form, [(self._slot(kind), kind, set()) for kind in kinds]
             form, slots = self._slots[target.id]
-            for number, (slot, _) in zip(self._numbers_of(form, value), slots, strict=True):
+            for number, (slot, _, leads) in zip(self._numbers_of(form, value), slots, strict=True):
+                if self._ways_out and self._leads[number]:
+                    raise Untranslated("arrays of unknown size that change in a loop")
+                leads |= self._leads[number]
                 self._builder.store(number, slot)
         else:
+            for memory in self._memory_of(value):
+                if memory.changes:
+                    raise Untranslated(f"{target.id} as another name for an array that changes")
+                memory.has_name = True
             self._names[target.id] = value
+
+    def _store_array(self, name: str, value: Array) -> None:
+        """Copy an array to the memory of a name that changes; no other name may stand for either."""
+        memory_list = self._memory_of(value)
+        is_new = len(memory_list) == len(self._leads[value.pointer]) > 0
+        if any(memory.has_name for memory in memory_list) or self.wraps and not is_new:
+            raise Untranslated(f"another name for what {name} stands for, which changes")
+        if name not in self._of_names:
+            memory = Memory(self, self._count(value.shape))
+            self._of_names[name] = self.array_at(memory.pointer, value.shape), memory
+        self._names[name], memory = self._of_names[name]
+        memory.changes = memory.has_name = True
+        memory.is_copy |= not is_new
+        self._fill(self._names[name], value)
 
     def _if(self, statement: ast.If) -> None:
         test = self._value(statement.test)
@@ -294,6 +361,8 @@ class _Translator(Expressions):
             return
         bounds = [self._value(argument) for argument in source.args]
         first, stop, step = (0, *bounds, 1) if len(bounds) == 1 else (*bounds, 1)[:3]
+        if all(map(is_known, bounds)) and not range(*bounds):
+            return
         for at in self._loop(first, stop, step):
             self._store(statement.target, at)
             self._statements(statement.body)

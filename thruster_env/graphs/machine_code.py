@@ -14,7 +14,7 @@ import os
 import sys
 import threading
 from array import array
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -60,14 +60,21 @@ class NotLinked(RuntimeError):
 class Code:
     """Machine code in memory, for as long as this object lives."""
 
-    def __init__(self, object_code: bytes, names: Iterable[str], libraries: Iterable[Code] = ()):
-        """Link object code; `names` are those of the functions to be called, which may call those of libraries."""
+    def __init__(
+        self, object_code: bytes, names: Iterable[str], libraries: Iterable[Code], symbols: Mapping[str, int]
+    ):
+        """Link object code; `names` are those of the functions to be called, which may call those of libraries.
+
+        `symbols` are the addresses of further functions.
+        """
         builder = llvm.JITLibraryBuilder().add_object_img(object_code).add_current_process()
         self.addresses: dict[str, int] = {}
         self._libraries = [*libraries]  # which live as long
         for library in self._libraries:
             for name, address in library.addresses.items():
                 builder.import_symbol(name, address)
+        for name, address in symbols.items():
+            builder.import_symbol(name, address)
         for name in names:
             builder.export_symbol(name)
         for symbol in OF_PYTHON:
@@ -80,10 +87,16 @@ class Code:
         self.addresses.update((name, self._library[name]) for name in names)
 
 
-def code_of(module: ir.Module, *names: str, unrolled: bool = True, libraries: Iterable[Code] = ()) -> Code:
+def code_of(
+    module: ir.Module,
+    *names: str,
+    unrolled: bool = True,
+    libraries: Iterable[Code] = (),
+    symbols: Mapping[str, int] | None = None,
+) -> Code:
     """Compile a module, or load its object code, unless it is in memory; `names` are the functions to be called.
 
-    What it calls and does not contain must be in libraries, or in this process.
+    What it calls and does not contain must be in libraries, in this process, or have an address in `symbols`.
     Loops are unrolled, or not: those whose bodies are wide vectors gain nothing, and take three times as long to
     compile.
 
@@ -95,7 +108,7 @@ def code_of(module: ir.Module, *names: str, unrolled: bool = True, libraries: It
         code = _loaded.get(digest)
         if code is None:
             code = _loaded[digest] = Code(
-                _kept(digest) or _keep(digest, _compiled(text, unrolled)), names, libraries
+                _kept(digest) or _keep(digest, _compiled(text, unrolled)), names, libraries, symbols or {}
             )
     return code
 

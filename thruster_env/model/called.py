@@ -32,6 +32,7 @@ from thruster_env.core.user_functions import codes_in, functions_in, is_copy, is
 from thruster_env.graphs.graphs import TooLarge
 from thruster_env.graphs.programs import OF_STEPS, Program, callable_of
 from thruster_env.graphs.python_floats import in_python
+from thruster_env.model.shape import constants_are_array
 from thruster_env.model.traced import traced_function
 
 MOST = 3000  # operations of a program: numba compiles loops of more in less time
@@ -70,7 +71,9 @@ def _machine_code(function: Callable, arguments: str, sizes: Sequence[int], form
     """Machine code of a function's graph, else the function for numba, if that takes it."""
     parts, for_numba = [*functions_in(function)], array_valued(function, arguments, *shape)
     large = is_array(max(sizes[:-1])) or is_array(*shape)
-    if not parts or large and all(map(_has_plain_loops, parts)):
+    if not parts or large and _is_translated(for_numba, sizes, form):
+        return Instead(for_numba, "", frozenset(fastmath_of(function)))
+    if large and all(map(_has_plain_loops, parts)):
         return Instead(for_numba, "", frozenset(fastmath_of(function)))
     try:
         program = traced_function(function, sizes, form, shape).program()
@@ -83,6 +86,16 @@ def _machine_code(function: Callable, arguments: str, sizes: Sequence[int], form
     if not isinstance(function, types.FunctionType) and not hasattr(function, "py_func"):
         return Instead(None, reason=f"{reason}; numba takes no {type(function).__name__}")
     return Instead(None if needs_python(function) else for_numba, "", frozenset(fastmath_of(function)), reason)
+
+
+def _is_translated(function: Callable, sizes: Sequence[int], form: type | int) -> bool:
+    """Whether `graphs.loops` can translate a function of vectors and constants: loops are shorter than a graph."""
+    from thruster_env.graphs.loops import refusal_of, unknown
+
+    *before, count = sizes
+    vectors = [unknown(size, as_array=is_array(size)) for size in before]
+    constants = unknown(count, as_array=constants_are_array(form))
+    return not refusal_of(function, [*vectors, constants if isinstance(form, int) else form(*constants)])
 
 
 def _has_plain_loops(function: types.FunctionType) -> bool:

@@ -12,7 +12,7 @@ from llvmlite import ir
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.graphs import machine_code
 from thruster_env.graphs.graphs import Graph
-from thruster_env.graphs.loops import Untranslated, add_function, machine_code_of
+from thruster_env.graphs.loops import Loops, Untranslated, add_function, machine_code_of
 from thruster_env.graphs.machine_code import NotLinked, add_builtin, builtin_of, code_of, function_of
 from thruster_env.graphs.programs import OF_STEPS, Place, callable_of, program_of
 
@@ -447,3 +447,86 @@ def test_code_can_be_loaded_where_memory_is_crowded(tmp_path):
     file.write_text(CROWDED)  # `machine_code_of` reads it
     result = subprocess.run([sys.executable, file], capture_output=True, text=True, env=environment)
     assert result.stdout == "True True\n", result.stderr
+
+
+def doubled(x):
+    out = np.empty(x.shape[0])
+    for i in range(x.shape[0]):
+        out[i] = 2.0 * x[i]
+    return out
+
+
+def four(x):
+    return doubled(x[:4])
+
+
+def sorted_pair(x, y):
+    if x[0] > y[0]:
+        return y, x, np.zeros((2, 2))
+    return x, y, np.ones((2, 2))
+
+
+def of_arrays(x, n):
+    half, many = four(x), doubled(x[:n])
+    for _ in range(n):
+        half = doubled(half) + 1.0
+        half[1] -= 0.5
+    low, high, square = sorted_pair(four(x)[:2], x[1:3])
+    x[0] += half[1]
+    x[4:8] = x[3:7]
+    x[:2], x[3] = np.array([x[1], x[0]]), many[n - 1]
+    square *= np.sin(high[0]) / low[1]
+    x[2] = square.T.copy()[0, 1] + square.reshape((4,))[3] + len(half) - many.size
+
+
+def test_arrays_are_results_and_change_by_entries():
+    run = machine(of_arrays, (8,), None)
+    for n in (1, 2, 5):
+        x = np.linspace(-1.0, 2.0, 8)
+        expected = x.copy()
+        of_arrays(expected, n)
+        run(x, n)
+        np.testing.assert_allclose(x, expected, rtol=1e-14)
+
+
+def turned(x):
+    values, vectors = np.linalg.eigh(x)
+    x[:] = vectors
+    x[0, 0] += 100.0 * values[1]
+
+
+def test_eigenvectors_are_numpys():
+    root = np.random.default_rng(3).normal(size=(4, 4))
+    x = root @ root.T
+    expected = x.copy()
+    turned(expected)
+    Loops(turned, [(None, None)])(x)
+    np.testing.assert_allclose(abs(x), abs(expected), rtol=1e-12)
+
+
+def of_two_names(x):
+    other = doubled(x)
+    for _ in range(2):
+        before = other  # noqa: F841
+        other = doubled(other)
+    x[:] = other
+
+
+def changed_for_its_caller(x):
+    x[0] = 1.0
+    x = doubled(x)
+    return x[0]
+
+
+def of_truths(x):
+    x[:] = (x > 0.0) + (x > 1.0)
+
+
+def of_another_shape(x):
+    x[:] = x[:3] + x[3:5]
+
+
+@pytest.mark.parametrize("function", [of_two_names, changed_for_its_caller, of_truths, of_another_shape])
+def test_arrays_that_would_be_others_than_pythons_are_refused(function):
+    with pytest.raises(Untranslated):
+        add_function(ir.Module(), "run", function, [(8,)])
