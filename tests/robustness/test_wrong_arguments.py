@@ -23,6 +23,9 @@ def vector(**arguments):
     return gym.make_vec("BowThruster-v0", 3, **arguments)
 
 
+GENERATOR = np.random.default_rng(0)  # whose draws no model may have
+
+
 def refused(call, rule):
     with pytest.raises(ValueError, match=rule) as error:
         call()
@@ -281,6 +284,10 @@ def fails(x, c):
         (
             {"transition": lambda x, u, c: (x[0], np.log(u[0] - 1.0))},
             r"transition must not be NaN at the prior mean with inputs of zero, but got \(0.5, .*nan",
+        ),
+        (
+            {"observe": lambda x, c: (x[0] + GENERATOR.normal(), x[1])},
+            "observe .* must depend on its arguments alone, .* belongs in measurement_noise_cov",
         ),
     ],
 )

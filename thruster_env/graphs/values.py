@@ -119,6 +119,10 @@ def built(shape: Any, numbers: Iterator, line: Callable[[Line], Line] = lambda l
     return kind(*values) if hasattr(kind, "_fields") else tuple(values)
 
 
+def _name(function: Callable) -> str:
+    return getattr(function, "__qualname__", repr(function))
+
+
 @lru_cache(maxsize=256)
 def traceable(function: Callable) -> Callable:
     """A user's function of values that takes Numbers, too, and may decide by them.
@@ -147,7 +151,10 @@ def traceable(function: Callable) -> Callable:
 
         results = on_every_side(entries, graph)
         if any(a is not b for a, b in zip(results, on_every_side(entries, graph), strict=False)):
-            raise TypeError("it returns something else at each call: t.normals() and t.uniforms() draw numbers")
+            raise TypeError(
+                f"{_name(function)} must depend on its arguments alone, but two calls returned different values: "
+                "t.normals() and t.uniforms() of an effect draw numbers"
+            )
         if any(shape != shapes[0] for shape in shapes):
             raise TypeError("results of a traced function must have one shape in all its branches")
         return built(shapes[0], iter(results))

@@ -466,6 +466,13 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
             raise ValueError(_not_nan(name, short_repr(result)))
         if at_mean and slopes and not by_complex_step(function) and not np.isfinite(as_floats(result)).all():
             _refuse_slopes(name, model, arguments, short_repr(result))
+        again = function(*_arguments(arguments, model, point))
+        if not np.array_equal(as_floats(again), as_floats(result), equal_nan=True):
+            where, noise = _place(function), "process" if name.startswith("transition") else "measurement"
+            raise ValueError(
+                f"{name}{where} must depend on its arguments alone, but two calls gave {short_repr(result)} and "
+                f"{short_repr(again)}: noise belongs in {noise}_noise_cov"
+            )
         return
 
 

@@ -305,7 +305,7 @@ GENERATOR = np.random.default_rng(1)  # of the user's own: tracing would freeze 
         (lambda e, reading, n, t: (reading._replace(z=[0.0, 1.0][reading.z]), n), "must be a function of numbers"),
         (
             lambda e, reading, n, t: (reading._replace(z=GENERATOR.normal()), n),
-            "must be .* something else at each",
+            "must be .* must depend on its arguments alone",
         ),
         (lambda e, reading, n, t: (reading.z, n), "must return the value, here a Reading, and the memory"),
         (lambda e, reading, n, t: reading, "must return the value, here a Reading, and the memory"),
