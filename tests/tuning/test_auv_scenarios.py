@@ -11,7 +11,7 @@ from tests.slow import slow_but
 from tests.tuned_files import write_untuned
 from thruster_env.auv.paths import MANOEUVRES
 from thruster_env.core.streams import episode_keys
-from tuning.auv.scenario import SAILING, SCENARIOS, computed_scale, find_scenario
+from tuning.auv.scenario import SAILING, SCENARIOS, find_scenario
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import read_tuned
 from tuning.problems.check import checked_problem
@@ -61,7 +61,7 @@ def test_what_one_instrument_measures_is_lost_together():
 @pytest.mark.slow
 def test_scales_are_those_of_the_code():
     for name in ("auv:motion", "auv:navigation"):
-        found = computed_scale(find_scenario(name), 6)
+        found = find_scenario(name).computed_scale(6)
         np.testing.assert_allclose(found, find_scenario(name).scale, rtol=0.08)
 
 

@@ -14,7 +14,7 @@ from tuning.evaluation.tuned import write_tuned
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import SCENARIOS, computed_scale, find_scenario, is_stable
+from tuning.thruster.scenario import SCENARIOS, find_scenario, is_stable
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_only_the_open_bladed_system_is_unstable():
     unstable = {name for name, scenario in SCENARIOS.items() if not is_stable(scenario.plant)}
     assert unstable == {"published_open_bladed"}
     with pytest.raises(ValueError, match="a bound or a stable open loop .* Q is singular, .*, and .* is unstable"):
-        computed_scale(SCENARIOS["published_open_bladed"].replace(process_noise_cov=(1.0, 0.0)), 2)
+        SCENARIOS["published_open_bladed"].replace(process_noise_cov=(1.0, 0.0)).computed_scale(2)
 
 
 def test_another_content_of_a_file_is_another_study(file):

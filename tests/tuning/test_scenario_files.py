@@ -8,7 +8,7 @@ from tuning.problems.excitation import BinarySequence, Steps
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import StudyResult
-from tuning.thruster.scenario import computed_scale, find_scenario
+from tuning.thruster.scenario import find_scenario
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_a_file_changes_its_base(file):
 def test_without_base_and_scale_it_is_nominal_and_the_scale_is_computed(file):
     scenario = find_scenario(file("measurement_noise_cov = 4.0\nsteps = 60"))
     assert scenario.excitation == Steps() and scenario.about == ""
-    assert scenario.scale == tuple(computed_scale(scenario, 200))
+    assert scenario.scale == tuple(scenario.computed_scale(200))
     assert scenario.scale[1] > find_scenario("nominal").scale[1]
 
 

@@ -1,5 +1,4 @@
 import dataclasses
-from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -10,8 +9,9 @@ from filters import EstimateState, run
 from filters.bounds import riccati_covariances
 from thruster_env.thruster.model import model_of_plant
 from tuning.problems.data import held_out_seeds, training_seeds
+from tuning.problems.scenario import print_scales
 from tuning.search.space import untuned_choice
-from tuning.thruster.scenario import SCENARIOS, computed_scale, find_scenario, main
+from tuning.thruster.scenario import SCENARIOS, Scenario, find_scenario
 
 
 def test_an_env_stepped_with_a_scenarios_voltages_makes_the_scenarios_data_and_estimates():
@@ -99,7 +99,7 @@ def test_voltages_hold_their_level_and_fill_the_range():
 @pytest.mark.parametrize("name", ["nominal", "published_noise", "speed_magnitude", "reversal", "bias", "mixed"])
 def test_the_stored_scale_is_the_bound(name):
     scenario = find_scenario(name)
-    np.testing.assert_allclose(computed_scale(scenario, 120, truths=50), scenario.scale, rtol=0.03)
+    np.testing.assert_allclose(scenario.computed_scale(120, truths=50), scenario.scale, rtol=0.03)
 
 
 @pytest.mark.parametrize("name", ["published_tunnel", "published_open_bladed"])
@@ -114,9 +114,8 @@ def test_the_scale_of_the_published_tunnel_is_the_optimum_of_the_papers_runs():
 
 
 def test_anyone_can_compute_a_scale_anew(capsys, monkeypatch):
-    few = partial(computed_scale, sequences=2, truths=2)  # a linear bound depends on neither
-    monkeypatch.setattr("tuning.thruster.scenario.computed_scale", few)
-    main(["published_tunnel"])
+    monkeypatch.setattr(Scenario, "scale_sequences", 2)  # on which a linear bound does not depend
+    print_scales(SCENARIOS, ["published_tunnel"])
     assert capsys.readouterr().out == "published_tunnel: (0.8066, 0.1457), stored (0.8066, 0.1457)\n"
 
 

@@ -146,6 +146,6 @@ def _is_tuned_file(text: str) -> bool:
 def _told_apart(problem: Problem) -> Problem:
     """A problem that a user changed, under another name than that of the package's: files know these by name."""
     known = built_in()
-    if problem.name in known and known[problem.name].find_scenario(problem.name).digest != problem.digest:
+    if problem.name in known and known[problem.name].digest != problem.digest:
         return find.named(problem, f"{problem.name} (changed)")
     return problem

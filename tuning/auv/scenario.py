@@ -10,14 +10,13 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from functools import cached_property
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 
 from filters.bounds import path_bound, wrapped_variances
+from thruster_env.auv import plant as plants
 from thruster_env.auv.equations import simulate
 from thruster_env.auv.model import MODELS, model_of_plant, state_range
 from thruster_env.auv.paths import MANOEUVRES
@@ -28,24 +27,19 @@ from thruster_env.auv.plant import (
     MAX_CHANNELS,
     STATES,
     Plant,
-    check_same_plant,
     make_plant,
-    plant_data,
 )
-from thruster_env.core.checks import at_least, one_of, positive, short_repr, vector
+from thruster_env.core.checks import one_of, positive, short_repr, vector
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.effects.effects import set_field
-from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.excitation import EXCITATIONS, Excitation, Levels
 from tuning.problems.find import find_in
-from tuning.problems.problem import GIVEN, PATH_BOUND
-from tuning.problems.scenario import BaseScenario, plain
+from tuning.problems.problem import PATH_BOUND
+from tuning.problems.scenario import PlantScenario, print_scales
 
 TORQUE = 1  # index of K_prop among the inputs of a manoeuvre
-UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
 RUNS_AT_ONCE = 16  # runs whose covariances of all steps are in memory at the same time
-SEQUENCES = 200  # input sequences for a stored scale
 PLANE = math.radians(6.0)
 SAILING = Levels(low=(2.0, -PLANE, -PLANE), high=(4.0, PLANE, PLANE), shortest=60, longest=160)
 """Thrusts of 2 to 4 N and planes within 6 deg, each held for 3 to 8 s."""
@@ -87,18 +81,18 @@ def commands_of(excitation: Excitation, plant: Plant, keys: np.ndarray, steps: i
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scenario(BaseScenario):
+class Scenario(PlantScenario):
     """A vehicle, an excitation and what a filter assumes of the vehicle.
 
     A filter's model has the first of the twelve states; it is the vehicle's model, except for `parameter_factors`,
     and knows the distribution of the initial state. It does not know the sensor effects; the current is among the
     states of "current", and unknown to the other models.
 
-    Attributes, beside those of `BaseScenario`:
+    Attributes, beside those of `PlantScenario`:
         process_noise_cov: the vehicle's Q, twelve variances per step; they do not scale with `dt`.
         measurement_noise_cov: the vehicle's R, one variance for each channel; those of the data sheets if None.
         scale: of each of the model's states, the standard deviation by the Riccati equation along the noise-free
-            path: fixed numbers, computed by `scale.computed_scale`.
+            path: fixed numbers, from `computed_scale`.
         states: those of the model, "velocities" (6), "motion" (8), "navigation" (12) or "current" (14). With
             "velocities" roll and pitch are inputs, true ones.
         preset: the vehicle, as for `thruster_env.auv.plant.make_plant`; so are all that follow.
@@ -112,6 +106,10 @@ class Scenario(BaseScenario):
     """
 
     plant_kind = "auv"
+    of_plant: ClassVar[Any] = plants
+    model_of_plant = staticmethod(model_of_plant)
+    env_id = "thruster_env.auv:SegorogeniAUV-v0"
+    not_of_env = ("states",)
     process_noise_cov: Sequence[float] = DEFAULT_PROCESS_NOISE
     measurement_noise_cov: Sequence[float] | None = None
     states: str = "motion"
@@ -124,7 +122,7 @@ class Scenario(BaseScenario):
     propeller_lag: float = 0.0
     plane_lag: float = 0.0
 
-    __hash__ = BaseScenario.__hash__
+    __hash__ = PlantScenario.__hash__
 
     def own_checks(self) -> dict:
         """Noise, and the scale of the model's states."""
@@ -150,60 +148,14 @@ class Scenario(BaseScenario):
         return MODELS[self.states].count
 
     @property
-    def env_id(self) -> str:
-        """`SegorogeniAUV-v0`."""
-        return "thruster_env.auv:SegorogeniAUV-v0"
-
-    @property
-    def plant_arguments(self) -> dict:
-        """Arguments of the env of the same vehicle, `SegorogeniAUV-v0`."""
-        of_scenario = {
-            "name",
-            "about",
-            "scale",
-            "parameter_factors",
-            "excitation",
-            "steps",
-            "first_scored_step",
-            "states",
-        }
-        names = [entry.name for entry in fields(self) if entry.name not in of_scenario]
-        return {name: plain(getattr(self, name)) for name in names}
-
-    @cached_property
-    def plant(self) -> Plant:
-        """The true vehicle."""
-        return make_plant(**self.plant_arguments)
-
-    def model(self, **changes) -> StateSpaceModel:
-        """What the filter assumes; changes are arguments of `thruster_env.auv.model.model_of_plant`."""
-        fixed = {"states": self.states, "parameter_factors": dict(self.parameter_factors) or None}
-        return model_of_plant(self.plant, **{**fixed, **changes})
-
-    @property
     def held(self) -> dict:
         """Where the model differs from the vehicle in every choice: its states, and wrong parameters."""
         return {"states": self.states, **super().held}
 
     @property
-    def plant_data(self) -> dict:
-        """The vehicle as data, for comparison with an env's."""
-        return plant_data(self.plant)
-
-    def check_tuned_for(self, plant: Mapping | None, file: str | Path) -> None:
-        """Raise ValueError if a tuned file is for another vehicle, dt or sensors."""
-        if plant is not None:
-            check_same_plant(plant, self.plant, file)
-
-    @property
-    def untuned(self) -> dict:
-        """Model arguments of the untuned filter: R from the data sheets, Q from 1 % of each state's range."""
-        top = state_range(self.plant, self.count)
-        deviation = UNTUNED_RANGE_FRACTION * np.where(np.arange(self.count) == 0, 1.0, 2.0) * top
-        return {
-            "process_noise_cov": tuple(float(v) for v in deviation**2),
-            "measurement_noise_cov": self.measurement_noise_cov,
-        }
+    def state_ranges(self) -> np.ndarray:
+        """Range (n,) of each state: forwards up to the largest speed, else to either side."""
+        return np.where(np.arange(self.count) == 0, 1.0, 2.0) * state_range(self.plant, self.count)
 
     @property
     def true(self) -> dict:
@@ -213,9 +165,9 @@ class Scenario(BaseScenario):
         return {**super().true, "process_noise_cov": (*of_vehicle, *of_current.tolist())}
 
     @property
-    def scale_about(self) -> str:
-        """A description of the scale, which a file may set freely."""
-        return GIVEN if self.name.endswith(".toml") else PATH_BOUND
+    def computed_scale_about(self) -> str:
+        """A description of the scale where it is computed."""
+        return PATH_BOUND
 
     def bound(self, data: Data) -> np.ndarray:
         """Standard deviation of each state (n,) by the Riccati equation along noise-free paths, over scored steps.
@@ -248,21 +200,6 @@ class Scenario(BaseScenario):
         outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
         measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # NaN: missing
         return Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
-
-
-# The scale of a vehicle's scenario: standard deviations by the Riccati equation along noise-free paths.
-
-
-def computed_scale(scenario: Scenario, sequences: int = SEQUENCES) -> np.ndarray:
-    """The scale (n,) of a scenario, its bound over the seeds 0, 1, 2, ...
-
-    Raises:
-        ValueError: if it is zero or not finite, as it is without any noise.
-    """
-    scale = scenario.bound(scenario.data(range(at_least("sequences", sequences, 1))))
-    if not (np.isfinite(scale).all() and (scale > 0).all()):
-        raise ValueError(f"scale must be positive in every state, but the bound is {scale.tolist()}")
-    return scale
 
 
 PAPERS: dict[str, Any] = {
@@ -457,20 +394,13 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 # The vehicle's scenarios by name or file, for `tuning.problems.find`.
-NAMES = tuple(SCENARIOS)
 NOMINAL = "auv:motion"
 
 
 def find_scenario(name: str) -> Scenario:
     """A scenario by its name, or from a file that ends in .toml; ValueError for another."""
-    return find_in(SCENARIOS, Scenario, "the vehicle's", name)
-
-
-def main(names: list[str]) -> None:
-    """Print the scales of scenarios, all of them if none is named."""
-    for name in names or SCENARIOS:
-        print(name, tuple(float(f"{part:.4g}") for part in computed_scale(SCENARIOS[name])), flush=True)
+    return find_in(SCENARIOS, Scenario, name)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    print_scales(SCENARIOS, sys.argv[1:])

@@ -22,7 +22,7 @@ from tuning.policies.observations import find_observation_set
 from tuning.policies.plants import plant_of
 from tuning.policies.setup import TrainingConfiguration, in_scenario
 from tuning.problems.data import held_out_seeds
-from tuning.problems.scenario import BaseScenario
+from tuning.problems.scenario import PlantScenario
 from tuning.reporting.leaderboard import about, unless_blank
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.thruster.logs import of_preset
@@ -102,7 +102,7 @@ def command(
     return Printed(report(scored, held_out), as_json(scored, held_out))
 
 
-def check_alike(setups: Sequence[TrainingConfiguration], plant: BaseScenario | None) -> None:
+def check_alike(setups: Sequence[TrainingConfiguration], plant: PlantScenario | None) -> None:
     """Raise ValueError unless all policies do the same task, on the same plant once a scenario is given."""
     for name in ("task", "env_id") + (("scenario",) if plant is None else ()):
         values = sorted({getattr(setup, name) for setup in setups})
@@ -114,7 +114,7 @@ def check_alike(setups: Sequence[TrainingConfiguration], plant: BaseScenario | N
 
 
 def _learnt(
-    model: Path, folder: Path, setup: TrainingConfiguration, plant: BaseScenario | None, seeds: Sequence[int]
+    model: Path, folder: Path, setup: TrainingConfiguration, plant: PlantScenario | None, seeds: Sequence[int]
 ) -> Scored:
     from tuning.policies.environments import make_environments
     from tuning.policies.saved import load, score
@@ -126,7 +126,7 @@ def _learnt(
 
 
 def _classical(
-    name: str, setup: TrainingConfiguration, plant: BaseScenario | None, seeds: Sequence[int]
+    name: str, setup: TrainingConfiguration, plant: PlantScenario | None, seeds: Sequence[int]
 ) -> Scored:
     from tuning.policies.saved import classical_policy, score
 

@@ -26,7 +26,7 @@ from tuning.problems.check import data_of
 from tuning.problems.data import Data, estimates_on, mask_of, only, padded
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Parameter, Problem, score_label
-from tuning.problems.scenario import BaseScenario, plain
+from tuning.problems.scenario import PlantScenario, plain
 from tuning.search.parameters import PRIOR, Correlation, FilterParameter, MeasurementVariance, ProcessVariance, Q
 from tuning.search.space import Choice, everything_of, neutral, parameters, parameters_of
 
@@ -258,7 +258,7 @@ DISTURBANCES = (
 @lru_cache(maxsize=32)
 def disturbances_of(problem: Problem) -> dict[Disturbance, float]:
     """The disturbances that a problem's plant may have, with their present values; none without a plant."""
-    if not isinstance(problem, BaseScenario):
+    if not isinstance(problem, PlantScenario):
         return {}
     return {
         disturbance: _present(disturbance, problem)
@@ -276,7 +276,7 @@ def disturbed(problem: Problem, values: Mapping[str, float]) -> Problem:
     """
     present = disturbances_of(problem)
     wanted = {disturbance: values.get(disturbance.name, value) for disturbance, value in present.items()}
-    if not isinstance(problem, BaseScenario) or all(
+    if not isinstance(problem, PlantScenario) or all(
         _same(wanted[disturbance], value) for disturbance, value in present.items()
     ):
         return problem
@@ -323,7 +323,7 @@ def _with(effects: list[dict], wanted: Mapping, present: Mapping, component: str
     return list(chain.values())
 
 
-def _present(disturbance: Disturbance, problem: BaseScenario) -> float:
+def _present(disturbance: Disturbance, problem: PlantScenario) -> float:
     """The number as the scenario has it, of the first channel that has the effect."""
     if disturbance.place == AMPLIFIER:
         chains = [(_amplifier(problem), 1.0)]

@@ -33,7 +33,7 @@ from tuning.problems.data import Data
 from tuning.problems.env_problem import measurement_noise
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Problem
-from tuning.problems.scenario import BaseScenario
+from tuning.problems.scenario import PlantScenario
 
 LARGEST_GRADIENT = 1.0  # its norm is cut to this: one outlier shall not undo what was learned
 START = "ekf"
@@ -328,7 +328,7 @@ def _large(values: np.ndarray) -> np.ndarray:
 
 def twice_as_long(problem: Problem, seeds: Sequence[int]) -> Data | None:
     """Runs of a problem that are twice as long; None of one whose runs have their length."""
-    if isinstance(problem, BaseScenario):
+    if isinstance(problem, PlantScenario):
         return problem.replace(steps=2 * problem.steps).data(seeds)
     if isinstance(problem, ModelProblem) and not isinstance(problem.inputs, np.ndarray):
         longer = copy.copy(problem)

@@ -36,7 +36,7 @@ from tuning.policies.observations import (
     TrainingReturns,
     find_observation_set,
 )
-from tuning.problems.scenario import BaseScenario
+from tuning.problems.scenario import PlantScenario
 from tuning.thruster.scenario import SCENARIOS, Scenario, find_scenario
 
 if TYPE_CHECKING:
@@ -110,11 +110,11 @@ class TrainingPlant(ABC):
     errors: ClassVar[str]
 
     @abstractmethod
-    def find_scenario(self, name: str) -> BaseScenario:
+    def find_scenario(self, name: str) -> PlantScenario:
         """A scenario by its name or file; ValueError for one of another plant."""
 
     @abstractmethod
-    def check_scenario(self, scenario: BaseScenario) -> None:
+    def check_scenario(self, scenario: PlantScenario) -> None:
         """Raise ValueError for a scenario in which no policy can learn, or of another plant."""
 
     @abstractmethod
@@ -175,7 +175,7 @@ class Thruster(TrainingPlant):
         """A scenario of the thruster by its name or file."""
         return find_scenario(name)
 
-    def check_scenario(self, scenario: BaseScenario) -> None:
+    def check_scenario(self, scenario: PlantScenario) -> None:
         """Raise ValueError unless a scenario is one of the thruster's equations."""
         if not isinstance(scenario, Scenario) or scenario.system is not None:
             kind = "linear" if isinstance(scenario, Scenario) else "of another plant"
@@ -278,7 +278,7 @@ class Vehicle(TrainingPlant):
         """A scenario of the vehicle by its name or file."""
         return find_vehicle_scenario(name)
 
-    def check_scenario(self, scenario: BaseScenario) -> None:
+    def check_scenario(self, scenario: PlantScenario) -> None:
         """Raise ValueError unless a scenario is one of the vehicle, with attitude in its model."""
         if not isinstance(scenario, VehicleScenario) or not _may_learn(scenario):
             rule = f"scenario must be the vehicle's, with roll and pitch as states and dt from {SHORTEST_STEP} s"

@@ -19,7 +19,7 @@ from thruster_env.core.checks import at_least, one_of, positive, short_repr
 from tuning.policies.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm
 from tuning.policies.observations import find_observation_set
 from tuning.policies.plants import plant_of
-from tuning.problems.scenario import BaseScenario, plain
+from tuning.problems.scenario import PlantScenario, plain
 
 # Checks of a training configuration: known names, and known arguments of env, filter and algorithm, all data.
 
@@ -142,7 +142,7 @@ class TrainingConfiguration:
 
 def make_configuration(
     task: str,
-    scenario: BaseScenario,
+    scenario: PlantScenario,
     observe: str,
     algo: str = "ppo",
     steps: int | None = None,
@@ -208,7 +208,7 @@ def make_configuration(
     )
 
 
-def in_scenario(setup: TrainingConfiguration, scenario: BaseScenario) -> TrainingConfiguration:
+def in_scenario(setup: TrainingConfiguration, scenario: PlantScenario) -> TrainingConfiguration:
     """The same observations on another scenario's plant, which is unknown to the filter.
 
     The filter still assumes the plant of the training configuration.

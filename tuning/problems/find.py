@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import copy
 import importlib
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
@@ -16,22 +19,36 @@ from thruster_env.core.modules import error_line, is_code, object_named
 from tuning.problems.assumed import augmented, name_and_unknown
 from tuning.problems.check import checked_problem
 from tuning.problems.problem import Problem
-from tuning.problems.scenario import BaseScenario
+from tuning.problems.scenario import FILE_SEQUENCES, PlantScenario
 
-# Packages that know a plant, named as text: they are imported when a scenario is looked up.
-# Each has the class Scenario, NAMES of scenarios, the NOMINAL one, find_scenario(name) and
-# computed_scale(scenario, sequences).
+# Modules that know a plant, named as text: they are imported when a scenario is looked up. Each has the class
+# Scenario, a `PlantScenario`, SCENARIOS by name, and the name of the NOMINAL one.
 PLANT_PACKAGES = {"thruster": "tuning.thruster.scenario", "auv": "tuning.auv.scenario"}
+PLANTS = "tuning.plants"  # group of entry points: such modules of other packages, by the plant
 LOGS = "tuning.thruster.logs"
-FILE_SEQUENCES = 200  # input sequences for the scale of a file that gives none
 PLANT = "plant"  # the key that names the plant
 BASE = "base"
-S = TypeVar("S", bound=BaseScenario)
+S = TypeVar("S", bound=PlantScenario)
 
 
-def plant_package(plant: str) -> ModuleType:
-    """The package of a plant by its key in `PLANT_PACKAGES`."""
-    return importlib.import_module(PLANT_PACKAGES[plant])
+@cache
+def plant_packages() -> dict[str, ModuleType]:
+    """The modules of scenarios by plant: those of this package, and of the entry points `tuning.plants`.
+
+    One that cannot be imported is left out with a warning.
+    """
+    packages = {plant: importlib.import_module(module) for plant, module in PLANT_PACKAGES.items()}
+    for point in entry_points(group=PLANTS):
+        try:
+            package = point.load()
+            if not issubclass(package.Scenario, PlantScenario) or package.NOMINAL not in package.SCENARIOS:
+                raise TypeError("its Scenario is no PlantScenario, or its NOMINAL none of its SCENARIOS")
+        except Exception as error:  # whatever its lines raise
+            rule = f"a module of the entry points {PLANTS} must offer Scenario, SCENARIOS and NOMINAL"
+            warnings.warn(f"{rule}, but {point.value} does not: {error_line(error)}", stacklevel=2)
+            continue
+        packages.setdefault(point.name, package)
+    return packages
 
 
 def logs_package() -> ModuleType:
@@ -39,15 +56,15 @@ def logs_package() -> ModuleType:
     return importlib.import_module(LOGS)
 
 
-def built_in() -> dict[str, ModuleType]:
-    """Names of the built-in problems, and the package of each."""
-    return {name: room for room in map(plant_package, PLANT_PACKAGES) for name in room.NAMES}
+def built_in() -> dict[str, PlantScenario]:
+    """The scenarios of all plants by name."""
+    return {name: scenario for room in plant_packages().values() for name, scenario in room.SCENARIOS.items()}
 
 
-def read_scenario(path: str | Path) -> BaseScenario:
+def read_scenario(path: str | Path) -> PlantScenario:
     """A scenario from a TOML file, named by the path.
 
-    Its keys are `plant`, one of `PLANT_PACKAGES` ("thruster" by default); the fields of that plant's `Scenario`
+    Its keys are `plant`, one of `plant_packages` ("thruster" by default); the fields of that plant's `Scenario`
     without the name; and `base`, the scenario whose fields are used where the file has none of its own (the
     plant's nominal one by default). A `scale` that is not in the file is computed.
 
@@ -70,24 +87,23 @@ def read_scenario(path: str | Path) -> BaseScenario:
         raise ValueError(f"keys of a scenario must be among {', '.join(known)}, but {path} has {unknown}")
     scale = content.pop("scale", None)
 
-    def make() -> BaseScenario:
-        base = room.find_scenario(content.pop(BASE, room.NOMINAL))
+    def make() -> PlantScenario:
+        base = find_in(room.SCENARIOS, room.Scenario, content.pop(BASE, room.NOMINAL))
         changes = {"about": "", **content, "name": str(path)}
         scenario = _checked(base.replace(**changes, scale=base.scale if scale is None else scale))
         if scale is not None:
             return scenario
-        return scenario.replace(scale=tuple(room.computed_scale(scenario, FILE_SEQUENCES)))
+        return scenario.replace(scale=tuple(scenario.computed_scale(FILE_SEQUENCES)))
 
     return _made(make, content, path)
 
 
-def find_in(known: Mapping[str, S], kind: type[S], owner: str, name: str) -> S:
+def find_in(known: Mapping[str, S], kind: type[S], name: str) -> S:
     """A scenario of one plant, by its name or from a file.
 
     Args:
         known: the plant's scenarios by name.
         kind: the class of the plant's scenarios.
-        owner: the plant in messages, such as "the thruster's".
         name: the name of one of them, or of a file that ends in .toml.
 
     Raises:
@@ -96,7 +112,9 @@ def find_in(known: Mapping[str, S], kind: type[S], owner: str, name: str) -> S:
     if isinstance(name, str) and name.endswith(".toml"):
         scenario = read_scenario(name)
         if not isinstance(scenario, kind):
-            raise ValueError(f"scenario must be {owner}, but {name} is of plant {scenario.plant_kind!r}")
+            raise ValueError(
+                f"scenario must be of plant {kind.plant_kind!r}, but {name} is of plant {scenario.plant_kind!r}"
+            )
         return scenario
     known_name = any_case(name, known)
     if not isinstance(known_name, str) or known_name not in known:
@@ -105,8 +123,8 @@ def find_in(known: Mapping[str, S], kind: type[S], owner: str, name: str) -> S:
     return known[known_name]
 
 
-def scenario_of(content, name: str, file: str | Path) -> BaseScenario:
-    """The scenario whose `BaseScenario.as_mapping` is the content, as a tuned file stores it.
+def scenario_of(content, name: str, file: str | Path) -> PlantScenario:
+    """The scenario whose `PlantScenario.as_mapping` is the content, as a tuned file stores it.
 
     Args:
         content: the mapping.
@@ -129,23 +147,22 @@ def scenario_of(content, name: str, file: str | Path) -> BaseScenario:
 def _room(content: dict, path: str | Path):
     """The package of the plant of a scenario file; removes the key from the content."""
     try:
-        return plant_package(
-            one_of("plant of a scenario", content.pop(PLANT, next(iter(PLANT_PACKAGES))), tuple(PLANT_PACKAGES))
-        )
+        known = plant_packages()
+        return known[one_of("plant of a scenario", content.pop(PLANT, next(iter(known))), tuple(known))]
     except ValueError as error:
         raise ValueError(f"{error} (in {path})") from None
 
 
-def _fields(scenario: type[BaseScenario]) -> list[str]:
+def _fields(scenario: type[PlantScenario]) -> list[str]:
     return [entry.name for entry in fields(scenario) if entry.name != "name"]
 
 
-def _checked(scenario: BaseScenario) -> BaseScenario:
+def _checked(scenario: PlantScenario) -> PlantScenario:
     scenario.model()  # makes the plant, which checks the other fields
     return scenario
 
 
-def _made(make: Callable[[], BaseScenario], content: Mapping, path: str | Path) -> BaseScenario:
+def _made(make: Callable[[], PlantScenario], content: Mapping, path: str | Path) -> PlantScenario:
     """The scenario that `make` makes from a file's content; a ValueError with the path if it fails."""
     try:
         return make()
@@ -172,7 +189,7 @@ def find_problem(name: str) -> Problem:
     known = built_in()  # whose names may have a colon, too
     known_name = any_case(name, known)
     if isinstance(known_name, str) and known_name in known:
-        return known[known_name].find_scenario(known_name)
+        return known[known_name]
     if is_code(name):
         return _from_module(name)
     if isinstance(name, str) and name.endswith(".toml"):

@@ -1,25 +1,32 @@
-"""`BaseScenario`: a problem that is plain data, an immutable recipe that files store completely."""
+"""`PlantScenario`: a problem that is plain data, an immutable recipe that files store completely."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import gymnasium as gym
+import numpy as np
 
 from thruster_env.core.checks import at_least, short_repr, vector
 from thruster_env.env.env import as_json
+from thruster_env.model.state_space import StateSpaceModel
+from tuning.problems.assumed import RANGE_FRACTION
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step
 from tuning.problems.excitation import Excitation, Steps, excitation_of
-from tuning.problems.problem import Problem
+from tuning.problems.problem import BOUND, GIVEN, Problem
 
 DEEPEST = 10  # levels of mappings and lists
+OF_SCENARIO = "name", "about", "scale", "parameter_factors", "excitation", "steps", "first_scored_step"  # fields
 MOST_STEPS = 1_000_000
+FILE_SEQUENCES = 200  # input sequences for the scale of a file that gives none
 
 
 # Plain data: mappings and lists as immutable values, and as values for JSON.
@@ -42,14 +49,17 @@ def plain(value):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaseScenario(Problem):
+class PlantScenario(Problem):
     """What the scenarios of all plants have in common; the subclass of a plant adds the fields of this plant.
 
-    A subclass is a frozen dataclass of plain data; it checks its own fields in `own_checks`, and makes its data in
-    `make`.
+    A subclass is a frozen dataclass of plain data whose further fields are arguments of the plant's env. It checks
+    them in `own_checks`, makes its data in `make`, and has `state_ranges`, from which the untuned Q follows.
 
     Attributes:
-        plant_kind: key of its plant in `find.PLANT_PACKAGES`.
+        plant_kind: key of its plant in `find.plant_packages`.
+        of_plant: the module with `make_plant`, `plant_data` and `check_same_plant` of the plant.
+        model_of_plant: a function of the plant and changes that makes the model.
+        scale_sequences: input sequences for the scale of a built-in scenario.
         name: its name; that of its file if it was read from one.
         about: one line for tables and help.
         scale: by which the score divides the error of each state, fixed numbers.
@@ -63,6 +73,9 @@ class BaseScenario(Problem):
     """
 
     plant_kind: ClassVar[str]
+    of_plant: ClassVar[Any]
+    model_of_plant: ClassVar[Callable[..., StateSpaceModel]]
+    scale_sequences: ClassVar[int] = FILE_SEQUENCES
     name: str
     about: str = ""
     scale: Sequence[float]
@@ -114,14 +127,74 @@ class BaseScenario(Problem):
         return hash((self.name, self.process_noise_cov, self.measurement_noise_cov, self.excitation, self.steps))
 
     @property
+    @abstractmethod
     def env_id(self) -> str:
         """The env of the same plant."""
-        raise NotImplementedError
+
+    @property
+    def not_of_env(self) -> tuple[str, ...]:
+        """Fields beyond those of all scenarios that are no arguments of this env."""
+        return ()
+
+    @property
+    @abstractmethod
+    def state_ranges(self) -> np.ndarray:
+        """Range of each of the model's states, (n,)."""
+
+    def computed_scale(self, sequences: int) -> np.ndarray:
+        """The scale (n,), by default the bound over input sequences of the seeds 0, 1, 2, ...; not this one's own.
+
+        Raises:
+            ValueError: if it is zero or not finite, as it is without any noise.
+        """
+        scale = self.bound(self.data(range(at_least("sequences", sequences, 1))))
+        if not (np.isfinite(scale).all() and (scale > 0).all()):
+            raise ValueError(f"scale must be positive in every state, but the bound is {scale.tolist()}")
+        return scale
 
     @property
     def plant_arguments(self) -> dict:
         """Arguments of this env that make the same plant."""
-        raise NotImplementedError
+        names = [entry.name for entry in fields(self) if entry.name not in (*OF_SCENARIO, *self.not_of_env)]
+        return {name: plain(getattr(self, name)) for name in names}
+
+    @cached_property
+    def plant(self) -> Any:
+        """The true plant."""
+        return self.of_plant.make_plant(**self.plant_arguments)
+
+    def model(self, **changes) -> StateSpaceModel:
+        """What the filter assumes; changes are arguments of `model_of_plant`."""
+        return type(self).model_of_plant(self.plant, **{**self.held, **changes})
+
+    @property
+    def plant_data(self) -> dict:
+        """The plant as data, for comparison with an env's."""
+        return self.of_plant.plant_data(self.plant)
+
+    def check_tuned_for(self, plant: Mapping | None, file: str | Path) -> None:
+        """Raise ValueError if a tuned file is for another plant, dt or sensors."""
+        if plant is not None:
+            self.of_plant.check_same_plant(plant, self.plant, file)
+
+    @property
+    def untuned(self) -> dict:
+        """Model arguments of the untuned filter: R from the data sheets, Q from 1 % of each state's range."""
+        deviation = RANGE_FRACTION * self.state_ranges
+        return {
+            "process_noise_cov": tuple(float(v) for v in deviation**2),
+            "measurement_noise_cov": self.measurement_noise_cov,
+        }
+
+    @property
+    def scale_about(self) -> str:
+        """A description of the scale, which a file may set freely."""
+        return GIVEN if self.name.endswith(".toml") else self.computed_scale_about
+
+    @property
+    def computed_scale_about(self) -> str:
+        """A description of the scale where it is computed."""
+        return BOUND
 
     @property
     def true(self) -> dict:
@@ -178,5 +251,13 @@ class BaseScenario(Problem):
 
 
 @lru_cache(maxsize=8)
-def _data(scenario: BaseScenario, seeds: tuple[int, ...]) -> Data:
+def _data(scenario: PlantScenario, seeds: tuple[int, ...]) -> Data:
     return scenario.make(seeds).read_only()
+
+
+def print_scales(scenarios: Mapping[str, PlantScenario], names: Sequence[str]) -> None:
+    """Print computed and stored scales of scenarios, all of them if none is named."""
+    for name in names or scenarios:
+        scenario = scenarios[name]
+        scale = tuple(float(f"{part:.4g}") for part in scenario.computed_scale(scenario.scale_sequences))
+        print(f"{name}: {scale}, stored {scenario.scale}", flush=True)

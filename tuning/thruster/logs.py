@@ -18,9 +18,8 @@ from thruster_env.thruster.env import ModelledThruster
 from thruster_env.thruster.model import NO_BAND, Recorder, lag_weights, logged_plant, model_of_plant, with_recorder
 from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, checked, is_file, read_preset
 from thruster_env.thruster.plant import Plant
-from tuning.problems.find import FILE_SEQUENCES
 from tuning.problems.problem import Parameter, Problem, squared
-from tuning.problems.scenario import BaseScenario
+from tuning.problems.scenario import FILE_SEQUENCES, PlantScenario
 from tuning.search.parameters import r_name
 
 DEFAULT_PRESET = "tunnel"
@@ -65,7 +64,7 @@ def is_preset(name: str | Path) -> bool:
 
 
 @overload
-def of_preset(problem: BaseScenario, preset: str | Path | None, sequences: int = ...) -> BaseScenario: ...
+def of_preset(problem: PlantScenario, preset: str | Path | None, sequences: int = ...) -> PlantScenario: ...
 
 
 @overload
@@ -85,7 +84,7 @@ def of_preset(problem: Problem, preset: str | Path | None, sequences: int = FILE
     """
     if preset is None:
         return problem
-    from tuning.thruster.scenario import Scenario, computed_scale
+    from tuning.thruster.scenario import Scenario
 
     preset = str(preset)
     if not isinstance(problem, Scenario) or problem.system is not None:
@@ -94,7 +93,7 @@ def of_preset(problem: Problem, preset: str | Path | None, sequences: int = FILE
         )
     name = f"{problem.name} ({preset})"
     changed = problem.replace(preset=preset, name=name, scale=problem.scale)
-    return changed.replace(scale=tuple(float(value) for value in computed_scale(changed, sequences)))
+    return changed.replace(scale=tuple(float(value) for value in changed.computed_scale(sequences)))
 
 
 def family_of_preset(

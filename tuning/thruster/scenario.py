@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -20,10 +19,11 @@ from filters.baselines import OpenLoop
 from filters.bounds import has_bound
 from filters.engine.batch import run
 from filters.tuned_file import NOISE
-from thruster_env.core.checks import at_least, one_of, positive, short_repr, vector
+from thruster_env.core.checks import at_least, positive, short_repr, vector
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.effects.effects import Effect, set_field
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster import plant as plants
 from thruster_env.thruster.analysis import equilibrium, jacobians, state_range, steady_state
 from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.controllers import PIController, lambda_gains
@@ -37,20 +37,15 @@ from thruster_env.thruster.plant import (
     DEFAULT_MAX_VOLTAGE,
     DEFAULT_PROCESS_NOISE,
     Plant,
-    check_same_plant,
-    make_plant,
-    plant_data,
 )
 from thruster_env.thruster.task import Task
 from tuning.problems.bound import average_bound
 from tuning.problems.data import Data
 from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, Excitation, MultiSine
 from tuning.problems.find import find_in
-from tuning.problems.problem import BOUND, GIVEN, OPEN_LOOP
-from tuning.problems.scenario import BaseScenario, plain
+from tuning.problems.problem import BOUND, OPEN_LOOP
+from tuning.problems.scenario import PlantScenario, print_scales
 
-UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
-SEQUENCES = 1200  # voltage sequences for a stored scale
 ROUNDING = 1e-6  # of the untuned noise: anything below is rounding
 PARTS = (0.5, 1.0)  # of the largest voltage, where stability is checked: at rest the quadratic drag vanishes
 LINEAR_NOISE: dict[str, Any] = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5, "steps": 100}
@@ -121,18 +116,18 @@ class ClosedLoop(Excitation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scenario(BaseScenario):
+class Scenario(PlantScenario):
     """A plant, an excitation and what a filter assumes of the plant.
 
     A filter's model is the plant's, except for `parameter_factors`; it knows the distribution of the initial state
     and a constant `ambient_velocity`. It does not know sensor effects, `flow`, `amplifier` and `uncertainty`.
 
-    Attributes, beside those of `BaseScenario`:
+    Attributes, beside those of `PlantScenario`:
         measurement_noise_cov: the plant's R, the variance on the sensor's data sheet [N^2, or the channel's
             unit^2]; one for each of several channels.
         process_noise_cov: the plant's Q, two variances per step [(rad/s)^2, (m/s)^2]; they do not scale with `dt`.
         scale: bound on the standard error of each state, (omega_m [rad/s], U_a [m/s]), of the scenario's Gaussian
-            core: fixed numbers, by which errors are divided, computed by `scale.computed_scale`.
+            core: fixed numbers, by which errors are divided, from `computed_scale`.
         system: a published linear system that is the plant, "tunnel" or "open_bladed"; None for the equations.
         preset: the thruster, as for `thruster_env.thruster.plant.make_plant`; so are all that follow. The content
             of a file is stored in place of its path.
@@ -147,6 +142,9 @@ class Scenario(BaseScenario):
     """
 
     plant_kind = "thruster"
+    of_plant: ClassVar[Any] = plants
+    scale_sequences = 1200
+    model_of_plant = staticmethod(model_of_plant)
     process_noise_cov: tuple[float, float] = DEFAULT_PROCESS_NOISE
     measurement_noise_cov: float | Sequence[float] = CHANNELS["thrust"].variance
     scale: tuple[float, float]
@@ -161,7 +159,7 @@ class Scenario(BaseScenario):
     amplifier: Sequence = ()
     uncertainty: Mapping = field(default_factory=dict)
 
-    __hash__ = BaseScenario.__hash__
+    __hash__ = PlantScenario.__hash__
 
     def own_checks(self) -> dict:
         """Sensors, variances and scale of the thruster's two states."""
@@ -183,22 +181,19 @@ class Scenario(BaseScenario):
         return "thruster_env:BowThruster-v0" if self.system is None else "thruster_env:BowThrusterLinear-v0"
 
     @property
-    def plant_arguments(self) -> dict:
-        """Arguments of the env of the same plant, `BowThruster-v0`, or `BowThrusterLinear-v0` of a linear one."""
-        of_scenario = {"name", "about", "scale", "parameter_factors", "excitation", "steps", "first_scored_step"}
-        left_out = {"system"} if self.system is None else {"preset", "uncertainty"}
-        names = [entry.name for entry in fields(self) if entry.name not in of_scenario | left_out]
-        return {name: plain(getattr(self, name)) for name in names}
+    def not_of_env(self) -> tuple[str, ...]:
+        """Fields that only the other plant's env takes."""
+        return ("system",) if self.system is None else ("preset", "uncertainty")
 
     @cached_property
     def plant(self) -> Plant:
         """The true plant."""
-        return (make_plant if self.system is None else make_linear_plant)(**self.plant_arguments)
+        return super().plant if self.system is None else make_linear_plant(**self.plant_arguments)
 
     def model(self, **changes) -> StateSpaceModel:
         """What the filter assumes; changes are arguments of `thruster_env.thruster.model.model_of_plant`."""
         if not self._are_noise(changes):
-            return model_of_plant(self.plant, **{"parameter_factors": dict(self.parameter_factors), **changes})
+            return super().model(**changes)
         return self._assumed.replace(**{name: cov for name, cov in changes.items() if cov is not None})
 
     def _are_noise(self, changes: Mapping) -> bool:
@@ -212,26 +207,15 @@ class Scenario(BaseScenario):
     @cached_property
     def _assumed(self) -> StateSpaceModel:
         """The model without changes; a trial changes its covariances."""
-        return model_of_plant(self.plant, parameter_factors=dict(self.parameter_factors))
+        return super().model()
 
     @property
-    def untuned(self) -> dict:
-        """Model arguments of the untuned filter: R from the data sheet, Q from 1 % of each state's range."""
-        deviation = UNTUNED_RANGE_FRACTION * _range(self.plant)
-        return {
-            "process_noise_cov": tuple(float(v) for v in deviation**2),
-            "measurement_noise_cov": self.measurement_noise_cov,
-        }
-
-    @property
-    def plant_data(self) -> dict:
-        """The plant as data, for comparison with an env's."""
-        return plant_data(self.plant)
-
-    def check_tuned_for(self, plant: Mapping | None, file: str | Path) -> None:
-        """Raise ValueError if a tuned file is for another thruster, dt or sensor."""
-        if plant is not None:
-            check_same_plant(plant, self.plant, file)
+    def state_ranges(self) -> np.ndarray:
+        """Range (2,) of the steady states over the voltage range."""
+        if self.plant.linear is None:
+            return state_range(self.plant.parameters, self.plant.max_voltage)
+        ends = (equilibrium(self.plant.linear, (sign * self.plant.max_voltage, 0.0)) for sign in (1.0, -1.0))
+        return np.abs(np.subtract(*ends))[:2]
 
     @property
     def has_bound(self) -> bool:
@@ -239,10 +223,8 @@ class Scenario(BaseScenario):
         return has_bound(self.plant.process_noise_cov)
 
     @property
-    def scale_about(self) -> str:
-        """A description of the scale, which a file may set freely."""
-        if self.name.endswith(".toml"):
-            return GIVEN
+    def computed_scale_about(self) -> str:
+        """A description of the scale where it is computed."""
         return BOUND if self.has_bound else f"{OPEN_LOOP}, for the true Q is singular"
 
     def bound(self, data: Data, truths: int = 100) -> np.ndarray:
@@ -254,6 +236,37 @@ class Scenario(BaseScenario):
         if not self.has_bound:
             return np.full(2, np.nan)
         return average_bound(model_of_plant(self.plant), data, truths)
+
+    def computed_scale(self, sequences: int, truths: int = 100) -> np.ndarray:
+        """The scale (2,), over voltage sequences of the seeds 0, 1, 2, ...; this one's own is not used.
+
+        It is `bound`, and a score is then RMSE over the bound. Where there is no bound, because Q is singular, it
+        is the RMSE of the open loop: a score below 1 then shows what the measurements contribute.
+
+        Args:
+            sequences: number of seeds.
+            truths: number of true paths drawn for each seed, for the bound.
+
+        Raises:
+            ValueError: if there is neither a bound nor a stable open loop, or the scale is zero or not finite.
+        """
+        data = self.data(range(at_least("sequences", sequences, 1)))
+        if self.has_bound:
+            what, scale = "the bound", self.bound(data, truths)
+        elif is_stable(self.plant):
+            open_loop = OpenLoop(model=model_of_plant(self.plant))
+            estimates = run(open_loop, data.filter_keys, data.inputs, data.measurements)
+            errors = (estimates.means - data.states)[:, data.late]
+            what, scale = "the RMSE of the open loop", np.sqrt((errors**2).mean(axis=(0, 1)))
+        else:
+            raise ValueError(
+                "a scenario needs a bound or a stable open loop as the scale of errors, but Q is singular, "
+                f"{list(self.process_noise_cov)}, and the open loop is unstable"
+            )
+        rounding = ROUNDING * np.sqrt(self.untuned["process_noise_cov"])
+        if not (np.isfinite(scale).all() and (scale > rounding).all()):
+            raise ValueError(f"scale must be positive in every state, but {what} is {scale.tolist()}")
+        return scale
 
     def make(self, seeds: tuple[int, ...]) -> Data:
         """Truth and measurements under the excitation's voltages."""
@@ -281,50 +294,6 @@ def _variances(variances, channels: int) -> float | tuple[float, ...]:
         positive("measurement_noise_cov", v) for v in vector("measurement_noise_cov", variances, channels)
     )
     return each[0] if channels == 1 else each
-
-
-def _range(plant: Plant) -> np.ndarray:
-    """Range (2,) of the steady states over the voltage range."""
-    if plant.linear is None:
-        return state_range(plant.parameters, plant.max_voltage)
-    ends = (equilibrium(plant.linear, (sign * plant.max_voltage, 0.0)) for sign in (1.0, -1.0))
-    return np.abs(np.subtract(*ends))[:2]
-
-
-# The scale of a thruster's scenario: its bound or, where there is none, the error of the open loop.
-
-
-def computed_scale(scenario: Scenario, sequences: int = SEQUENCES, truths: int = 100) -> np.ndarray:
-    """The scale (2,) of a scenario, over voltage sequences of the seeds 0, 1, 2, ...
-
-    It is `Scenario.bound`, and a score is then RMSE over the bound. Where there is no bound, because Q is
-    singular, it is the RMSE of the open loop: a score below 1 then shows what the measurements contribute.
-
-    Args:
-        scenario: its own scale is not used.
-        sequences: number of seeds.
-        truths: number of true paths drawn for each seed, for the bound.
-
-    Raises:
-        ValueError: if there is neither a bound nor a stable open loop, or the scale is zero or not finite.
-    """
-    data = scenario.data(range(at_least("sequences", sequences, 1)))
-    if scenario.has_bound:
-        what, scale = "the bound", scenario.bound(data, truths)
-    elif is_stable(scenario.plant):
-        open_loop = OpenLoop(model=model_of_plant(scenario.plant))
-        estimates = run(open_loop, data.filter_keys, data.inputs, data.measurements)
-        errors = (estimates.means - data.states)[:, data.late]
-        what, scale = "the RMSE of the open loop", np.sqrt((errors**2).mean(axis=(0, 1)))
-    else:
-        raise ValueError(
-            "a scenario needs a bound or a stable open loop as the scale of errors, but Q is singular, "
-            f"{list(scenario.process_noise_cov)}, and the open loop is unstable"
-        )
-    rounding = ROUNDING * np.sqrt(scenario.untuned["process_noise_cov"])
-    if not (np.isfinite(scale).all() and (scale > rounding).all()):
-        raise ValueError(f"scale must be positive in every state, but {what} is {scale.tolist()}")
-    return scale
 
 
 def is_stable(plant: Plant) -> bool:
@@ -472,22 +441,13 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 # The thruster's scenarios by name or file, for `tuning.problems.find`.
-NAMES = tuple(SCENARIOS)
 NOMINAL = "nominal"
 
 
 def find_scenario(name: str) -> Scenario:
     """A scenario by its name, or from a file that ends in .toml; ValueError for another."""
-    return find_in(SCENARIOS, Scenario, "the thruster's", name)
-
-
-def main(names: list[str]) -> None:
-    """Print the scales of scenarios beside the stored ones, all of them if none is named."""
-    for name in names or SCENARIOS:
-        scenario = SCENARIOS[one_of("scenario", name, tuple(SCENARIOS))]
-        computed = ", ".join(f"{value:.4f}" for value in computed_scale(scenario))
-        print(f"{name}: ({computed}), stored {scenario.scale}")
+    return find_in(SCENARIOS, Scenario, name)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    print_scales(SCENARIOS, sys.argv[1:])
