@@ -21,6 +21,7 @@ from thruster_env.model.continuous import AtDt, ContinuousModel
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 
+AUTO = "auto"  # in place of a name: the simplest model that predicts unseen data as well as the best
 R, AXES, DT, MEAN = "R", "axes", "dt", "mean"  # settings of every model of `filters.models` beside its numbers
 NUMBERS = {number.name for model in NAMED.values() for number in model.free}
 MOST_AXES = 64

@@ -3,13 +3,14 @@
 from functools import cache
 
 import numpy as np
+import pytest
 
 import tuning
 from thruster_env.core.streams import episode_keys
 from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
 from tuning.identification.profiles import validate
-from tuning.logs.problem import remarks
+from tuning.logs.problem import LoggedFamily, remarks
 
 DT, COOLING, SPEED = 0.1, 52_000.0, 55.0  # [s], [J/(min K)], [rad/s/V]
 HEAT, PERIOD = 6e5, 25  # heat capacity [J/K]; rows for which the coolant keeps its temperature
@@ -47,6 +48,23 @@ def found_in(run, make, free, hold_gaps=False, **options):
     return tuning.identify(
         tuning.read_logs(run, model=make, hold_gaps=hold_gaps), free, starts=1, use_all=True, **options
     )
+
+
+def test_a_late_actuator_has_a_negative_clock_offset_that_its_file_takes_off(tmp_path):
+    run = table(motor(), 8.0, 300, seed=5)
+    run["u"] = np.r_[run["u"][3:], run["u"][-1:], run["u"][-1:], run["u"][-1:]]  # it acts three rows later
+    options = {"noise": False, "start": {"clock_offset_u": -0.25}, "progress": False}
+    late = found_in(run, motor, "gain,clock_offset_u", **options)
+    assert late.values["clock_offset_u"] == pytest.approx(-3 * DT, abs=0.1 * DT)
+    assert late.values["gain"] == pytest.approx(50.0, abs=4.0 * late.standard_errors["gain"])
+    reading = tuning.read_logs(run, model=motor, preset=late.save(tmp_path / "late.toml"))
+    log, _ = reading.read()
+    assert log.offsets == {"input:u": late.values["clock_offset_u"]}
+    read_with = tuning.read_logs(run, model=motor, clock_offset={"z": 0.05})
+    parameter = LoggedFamily([read_with.read()[0]], motor, ["clock_offset_z"]).free[0]
+    assert (parameter.default, parameter.low, parameter.high) == pytest.approx((0.05, -0.95, 1.05))
+    with pytest.raises(ValueError, match="clock_offset_z, clock_offset_u, but got 'clock_offset_T'"):
+        found_in(run, motor, "gain,clock_offset_T")
 
 
 @cache

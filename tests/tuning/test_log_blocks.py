@@ -73,6 +73,14 @@ def test_an_identification_has_the_pieces_of_a_run_as_runs():
     assert [one.steps for one in few] == [239]
 
 
+def test_the_last_quarter_of_a_recording_is_held_out_unless_it_is_short():
+    (first, second), (late,) = split_runs(with_gap(100), model=MODEL)
+    assert (first.steps, second.steps + 1, late.steps + 1) == (239, 111, 150)  # of 601 rows
+    (early,), (late,) = split_runs(with_gap(100), model=MODEL, hold_gaps=True)
+    assert early.steps + 1 == 451 and late.name == "run1, rows 451 to 600"
+    assert split_runs({name: values[:150] for name, values in with_gap(100).items()}, model=MODEL)[1] == []
+
+
 def test_pieces_keep_the_samples_of_their_own_times():
     table = with_gap(100)
     table["z_1"][1::2] = np.nan

@@ -53,7 +53,7 @@ def test_an_estimate_uses_given_numbers_or_finds_them_and_says_which(log):
 
 
 def test_identified_numbers_are_those_of_fit_and_a_preset_for_other_commands(log, tmp_path):
-    identified = tuning.identify((NAME, log), starts=1)
+    identified = tuning.identify((NAME, log), starts=1, use_all=True, progress=False)
     fit = tuning.fit(log, model=NAME)
     assert set(identified.values) == {"acceleration", "R"} and identified.values["R"] == pytest.approx(
         fit.r, rel=0.05

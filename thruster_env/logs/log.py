@@ -254,10 +254,11 @@ def seen_by(model: StateSpaceModel, measurements: np.ndarray) -> np.ndarray:
 def cut_at_gaps(log: Log, shortest: int = FEWEST_STEPS + 1) -> list[Log]:
     """The pieces of a log between gaps with at least `shortest` rows, each a log; the log itself without gaps."""
     long = [(first, rows) for first, rows in log.pieces if rows >= max(shortest, FEWEST_STEPS + 1)]
-    return [log] if len(log.pieces) == 1 else [_piece(log, first, rows) for first, rows in long]
+    return [log] if len(log.pieces) == 1 else [piece_of(log, first, rows) for first, rows in long]
 
 
-def _piece(log: Log, first: int, rows: int) -> Log:
+def piece_of(log: Log, first: int, rows: int) -> Log:
+    """So many rows of a log from one of them on, which remembers the log."""
     kept_rows, since, source = slice(first, first + rows), first * log.dt, {}
     for channel, series in log.source.items():
         times = series.times - since

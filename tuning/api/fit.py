@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
+from filters.named import AUTO
 from thruster_env.core.files import check_target, save_figure, write_whole
 from thruster_env.logs.write import check_picture
 from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, Argument, Option, Progress, PythonOnly
 from tuning.api.progress import console_for
 from tuning.series.answer import SeriesFit
 from tuning.series.column import column_of
-from tuning.series.fit import AUTO, CANDIDATES, choose
+from tuning.series.fit import CANDIDATES, choose
 from tuning.series.paste import LANGUAGES
 
 

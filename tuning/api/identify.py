@@ -271,8 +271,8 @@ def identify(
 
     The free parameters of a thruster may be its constants (motor_damping, voltage_gain, ...), dead_band or
     dead_band_low and dead_band_high, thrust_asymmetry, ambient_velocity, bias_CHANNEL, lag_CHANNEL,
-    clock_offset_CHANNEL, and the variances of Q and R; of another model, the arguments with numeric defaults and
-    its named constants.
+    clock_offset_CHANNEL, and the variances of Q and R; of another model, the arguments with numeric defaults, its
+    named constants, and clock_offset_CHANNEL of each measurement and input: an actuator's delay is a negative one.
 
     With `predicted` the result predicts that channel best for a filter that does not see it: --sensor speed
     --sensor thrust --predicted thrust identifies, on a test stand, a model that estimates thrust on the ship.
@@ -296,7 +296,7 @@ def identify(
         ranges: range of a parameter; may be repeated. In Python (low, high) by name.
         start: where the search begins; may be repeated. In Python values by name.
         noise: whether the variances of Q and R are free, too.
-        use_all: hold out no run.
+        use_all: hold out no run, and of fewer than three runs not the last quarter of each.
         filter: ekf, or kf for affine models.
         predicted: a channel that the filter predicts but never sees, such as a load cell's thrust.
         degrees: degrees of freedom of Student-t errors, such as 20; of the predicted channels, if any.

@@ -23,6 +23,7 @@ from thruster_env.core.files import as_toml, read_toml, write_whole
 from thruster_env.logs.write import check_not_among
 from thruster_env.model.continuous import noise_for_dt, same_dt
 from thruster_env.model.state_space import StateSpaceModel
+from tuning.identification.clocks import CLOCK
 from tuning.identification.family import ModelFamily
 from tuning.identification.objective import Objective, lost_information
 from tuning.likelihood.ascent import Ascent, climb
@@ -438,6 +439,17 @@ def read_values(path: str | Path) -> dict[str, float]:
     return {name: finite(f"{name} in {path}", value) for name, value in values.items()}
 
 
+def clock_offsets_in(path: str | Path) -> dict[str, float]:
+    """Clock offsets [s] by channel among the values in a file."""
+    values = read_values(path).items()
+    return {name.removeprefix(CLOCK): seconds for name, seconds in values if name.startswith(CLOCK)}
+
+
+def values_in(path: str | Path) -> dict[str, float]:
+    """Values of a model among those in a file."""
+    return {name: value for name, value in read_values(path).items() if not name.startswith(CLOCK)}
+
+
 def with_values(make: Callable | StateSpaceModel, path: str | Path) -> Callable[[float], StateSpaceModel]:
     """A function of the sample time that makes a model with the values in a file.
 
@@ -452,7 +464,7 @@ def with_values(make: Callable | StateSpaceModel, path: str | Path) -> Callable[
         ValueError: if the file is damaged, or names a parameter that the model does not have; the function raises
             it for another sample time of a model that does not take one.
     """
-    values, of = read_values(path), _dt_of(path)
+    values, of = values_in(path), _dt_of(path)
     model_at = partial(_at_dt, make, values, of, str(path))
     try:
         model_at(1.0 if of is None else of)

@@ -21,9 +21,10 @@ from filters.tuned_file import check_preset_file, made_with, read_tuned_file, tu
 from thruster_env.core.checks import short_repr
 from thruster_env.env.record import read_for
 from thruster_env.logs.findings import has_outliers, remarks_on
-from thruster_env.logs.log import Log, cut_at_gaps, in_any_steps
+from thruster_env.logs.log import Log, cut_at_gaps, in_any_steps, piece_of
 from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
+from tuning.identification.clocks import CLOCK, clock_offsets, shifted
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification, write_values
 from tuning.logs.read import check_model, name_of, offer_of, read_named, texts
@@ -38,6 +39,8 @@ from tuning.series.named import Fitted, is_auto, maker_of, with_numbers
 OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid", "inputs_act", "stamps")
 CUTS = ("held_out", "blocks", "lead", "hold_gaps", "start", "outliers")
 EVERY_THIRD = 3
+LAST_PART = 4  # of a run the rows that are held out: one in so many, at its end
+SHORTEST_HELD_OUT = 50  # rows of that part
 SHORTEST_PIECE = 10  # rows of a run between gaps: fewer tell little beside how they begin
 OFFSET_SHARE = 4  # a clock offset may be at most the length of a log divided by this
 
@@ -257,6 +260,8 @@ def split_runs(
 ) -> tuple[list[Log], list[Log]]:
     """The training logs, and the held-out ones for validation: by default every third of three or more.
 
+    Of fewer the last quarter of each is held out, unless it is short, or the logs are on their own stamps.
+
     Args:
         logs: recorded runs, as `tuning.logs.read.read_named` takes them.
         held_out: the held-out runs, or their paths or names.
@@ -285,15 +290,33 @@ def split_runs(
     read = list(map(without_outliers, read)) if outliers == MISSING else read
     parts = [log for log in read if log.name not in validating], [log for log in read if log.name in validating]
     check_apart(*parts)
-    if hold_gaps or any(log.stamps is not None for log in read):
+    if any(log.stamps is not None for log in read):
         return parts
-    pieces = [[piece for log in logs_ for piece in cut_at_gaps(log, SHORTEST_PIECE)] for logs_ in parts]
+    if not validating and not use_all:
+        pieces = [[piece for log in read for piece in _part(log, late, hold_gaps)] for late in (False, True)]
+    elif hold_gaps:
+        return parts
+    else:
+        pieces = [[piece for log in logs_ for piece in cut_at_gaps(log, SHORTEST_PIECE)] for logs_ in parts]
     if not pieces[0]:
         raise ValueError(
             f"logs must have {SHORTEST_PIECE} rows without a gap (or give hold_gaps, --hold-gaps), but "
             f"{', '.join(log.name for log in parts[0])} do not"
         )
     return pieces[0], pieces[1]
+
+
+def _part(log: Log, late: bool, hold_gaps: bool) -> list[Log]:
+    """The last quarter of a log, or the rows before it, cut at gaps; of a short log all rows are early."""
+    end = log.steps + 1
+    cut = end - end // LAST_PART if end >= LAST_PART * SHORTEST_HELD_OUT else end
+    first, last = (cut, end) if late else (0, cut)
+    if first == last:
+        return []
+    bounds = [(0, end)] if hold_gaps else log.pieces
+    spans = [(max(begin, first), min(begin + rows, last)) for begin, rows in bounds]
+    long = [(begin, stop - begin) for begin, stop in spans if stop - begin >= SHORTEST_PIECE]
+    return [log if rows == end else piece_of(log, begin, rows) for begin, rows in long]
 
 
 def family_of(
@@ -341,16 +364,31 @@ def family_of(
 
 
 class LoggedFamily(ModelFamily):
-    """A model's family with the logs that it is identified on, as `ThrusterFamily` has them."""
+    """A model's family with the logs that it is identified on, whose channels may have free clock offsets."""
 
     def __init__(self, logs: Sequence[Log], make: Any, free: Sequence[str], **options: Any):
         """Keep the logs."""
+        self.logs, self.dt = tuple(logs), logs[0].dt
         super().__init__(make, free, **options)
-        self.data, self.dt = tuple(logs), logs[0].dt
 
-    def shifted(self, logs: Sequence[Log]) -> tuple[Log, ...]:
-        """Other logs for this family, unchanged."""
-        return tuple(logs)
+    @property
+    def channels(self) -> list[str]:
+        """Symbols of the measurements, then of the inputs of other symbols."""
+        return list(dict.fromkeys(q.symbol for q in (*self.logs[0].measured, *self.logs[0].input_quantities)))
+
+    @property
+    def known(self) -> dict[str, Parameter]:
+        """Every parameter that may be free, clock offsets last."""
+        return super().known | clock_offsets(self.channels, self.logs)
+
+    @property
+    def data(self) -> Any:
+        """The logs, or a function of the free clock offsets."""
+        return self.shifted(self.logs)
+
+    def shifted(self, logs: Sequence[Log]) -> Any:
+        """Some logs for this family: unchanged, or a function of the free clock offsets."""
+        return shifted(logs, self.free)
 
 
 class NamedFamily(LoggedFamily):
@@ -404,7 +442,7 @@ def remarks(runs: Sequence[Log], proving: Sequence[Log], result: Identification)
     """
     logs = (*runs, *proving)
     sentences = remarks_on(logs)
-    if any(log.uncut is not None for log in logs):
+    if any(log.uncut is not None and len(log.uncut.pieces) > 1 for log in logs):
         sentences.append(
             "Runs are cut at gaps: each piece is a separate run with its own initial state (--hold-gaps, "
             "hold_gaps=True, does not cut)."
@@ -428,7 +466,7 @@ def check_offsets(parameters: Sequence[Parameter], logs: Sequence[Log]) -> None:
     """Raise ValueError unless ranges of clock offsets are short: without common data any model would fit."""
     most = min(log.times[-1] for log in logs) / OFFSET_SHARE
     for parameter in parameters:
-        if parameter.name.startswith("clock_offset_") and max(-parameter.low, parameter.high) > most:
+        if parameter.name.startswith(CLOCK) and max(-parameter.low, parameter.high) > most:
             raise ValueError(
                 f"the range of {parameter.name} must be within a quarter of the shortest log, {most:g} s, but is "
                 f"from {parameter.low:g} to {parameter.high:g}"

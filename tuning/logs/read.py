@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from filters.models import NAMES
-from filters.named import is_model_name, model_named
+from filters.named import AUTO, is_model_name, model_named
 from filters.plants import PLANTS
 from filters.tuned_file import check_preset_file, read_tuned_file, tune_options
 from thruster_env.core.checks import finite, short_repr
@@ -26,7 +26,6 @@ from thruster_env.model.affine import LETTERS, AffineModel, affine_model
 from thruster_env.model.continuous import ContinuousModel, in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.find import logs_package
-from tuning.series.fit import AUTO
 from tuning.series.named import is_auto, maker_of, read_columns, with_values_of
 
 Named = Mapping[str, Any] | Sequence[str] | None  # a mapping, or texts NAME=VALUE as on a command line
@@ -84,21 +83,21 @@ def read_named(
             raise ValueError(f"{option} must come with a file or a table, but {path.name} is a Log already")
     elif name is not None:
         options["name"] = name
-    if maker is not None:
-        if preset is not None:
-            from tuning.identification.result import read_values
+    if model is not None and preset is not None:
+        from tuning.identification.result import clock_offsets_in, values_in, with_values
 
-            maker = with_values_of(maker, read_values(preset), preset)
+        if not isinstance(path, Log):  # a user's offsets have priority
+            options["clock_offset"] = clock_offsets_in(preset) | options["clock_offset"]
+        if maker is None:
+            offer = offer_of(model)
+            log, offer = read_for(path, offer, **options)[0], with_values(in_discrete_time(offer), preset)
+            offer(log.dt)  # or the values are of another sample time
+            return log, offer
+        maker = with_values_of(maker, values_in(preset), preset)
+    if maker is not None:
         return read_columns(maker, path, **options)
     if model is not None:
         offer = offer_of(model)
-        if preset is not None:
-            from tuning.identification.result import with_values
-
-            log = read_for(path, offer, **options)[0]
-            offer = with_values(in_discrete_time(offer), preset)
-            offer(log.dt)  # or the values are of another sample time
-            return log, offer
         return read_for(path, offer, **options)[0], offer
     room = logs_package()
     whose = room.DEFAULT_PRESET if preset is None else str(preset)
@@ -244,7 +243,7 @@ def model_of_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any
         )
     if not logs_package().is_preset(model):
         names = ", ".join((AUTO, *NAMES, *PLANTS))
-        rule = f"a model must be an object, 'module:object', a thruster's preset, or a name of {names}"
+        rule = f"a model must be an object, 'module:object', one of {names}, or a thruster's preset"
         raise ValueError(f"{rule}, but got {short_repr(model)}")
     return logs, None, model
 

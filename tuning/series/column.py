@@ -178,7 +178,7 @@ def log_of_columns(
             raise ValueError(f"{rule}, but got none for {source}: `thruster log {source}` lists them")
         headers, time = list(named), None
     else:
-        table = read_table(source) if is_file else table_of(source, "a table")
+        table = read_table(source) if is_file else table_of(source, options.get("name") or "a table")
         if named is not None and ",".join(named) in table.names:
             named = [",".join(named)]
         if named is None and source is not z and isinstance(source, Mapping):

@@ -34,7 +34,6 @@ from tuning.series.column import Column
 from tuning.series.likelihood import ColumnLikelihood
 from tuning.series.recursion import Beginning, StepTables, filtered_runs
 
-AUTO = "auto"
 CANDIDATES = (
     "constant",
     "constant-velocity",

@@ -13,14 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.models import named_model
-from filters.named import NamedMaker, model_named
+from filters.named import AUTO, NamedMaker, model_named
 from thruster_env.core.checks import listed, short_repr
 from thruster_env.logs.findings import Remark
 from thruster_env.logs.log import Log
 from tuning.problems.problem import Parameter
 from tuning.series.column import Column, log_of_columns
-from tuning.series.fit import AUTO, CANDIDATES, choose
-from tuning.series.likelihood import ColumnLikelihood
 
 MODEL = "model"  # kind of a finding
 
@@ -97,6 +95,9 @@ def with_numbers(maker: NamedMaker, log: Log, rows: np.ndarray | None = None) ->
     Raises:
         ValueError: for data without a likelihood.
     """
+    from tuning.series.fit import CANDIDATES, choose  # with what only a search needs
+    from tuning.series.likelihood import ColumnLikelihood
+
     if log.stamps is not None:
         raise ValueError(
             f"a model by name must be of a log on a grid, but {log.name} is on its own stamps: leave --no-grid "

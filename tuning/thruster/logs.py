@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, overload
@@ -11,13 +10,13 @@ from typing import Any, overload
 import numpy as np
 
 from thruster_env.core.checks import short_repr
-from thruster_env.logs.grid import NEIGHBOURS
-from thruster_env.logs.log import Log, at_offset
+from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.env import ModelledThruster
 from thruster_env.thruster.model import NO_BAND, Recorder, lag_weights, logged_plant, model_of_plant, with_recorder
 from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, checked, is_file, read_preset
 from thruster_env.thruster.plant import Plant
+from tuning.identification.clocks import clock_offsets, offsets_of, shifted
 from tuning.problems.problem import Parameter, Problem, squared
 from tuning.problems.scenario import FILE_SEQUENCES, PlantScenario
 from tuning.search.parameters import r_name
@@ -33,8 +32,6 @@ DEAD_START = 0.02
 BIAS_PART = 0.25  # largest bias, as a fraction of the channel's largest magnitude
 LONGEST_LAG = 100.0  # in sample times
 LAG_START = 3.0
-OFFSETS = 10.0  # largest clock offset, in sample times, but at least
-LEAST_OFFSET = 0.1  # [s]
 
 
 class Preset(ModelledThruster):
@@ -133,13 +130,7 @@ def preset_of(identification: Any, family: Any, logs: Sequence[str]):
     from thruster_env.thruster.parameters import PresetFile
 
     plant, recorder = family.plant_at(identification.values), family.recorder_at(identification.values)
-    offsets = {channel: _taken_off(family.logs, channel) for channel in plant.channels}
-    offsets |= {
-        name.removeprefix("clock_offset_"): value + offsets[name.removeprefix("clock_offset_")]
-        for name, value in identification.values.items()
-        if name.startswith("clock_offset_")
-    }
-    offsets = {channel: value for channel, value in offsets.items() if value}
+    offsets = offsets_of(family.logs, plant.channels, identification.values)
     variances = plant.measurement_noise_cov.diagonal().tolist()
     content: Mapping[str, Any] = {
         "dt": plant.dt,
@@ -160,12 +151,6 @@ def preset_of(identification: Any, family: Any, logs: Sequence[str]):
     }
     stored = {name: value for name, value in content.items() if value not in ({}, 0.0)}
     return PresetFile(plant.parameters, (recorder.dead_band_low, recorder.dead_band_high), stored, identified)
-
-
-def _taken_off(logs: Sequence[Log], channel: str) -> float:
-    """The clock offset with which all logs were read; 0 if they differ, since they then belong to the logs."""
-    offsets = {log.offsets.get(f"measurement:{channel}", 0.0) for log in logs}
-    return offsets.pop() if len(offsets) == 1 else 0.0
 
 
 def write_identified(path: str | Path, identification: Any, family: Any, logs: Sequence[str]) -> None:
@@ -250,7 +235,6 @@ class ThrusterFamily:
         parameters["dead_band_low"] = Parameter("dead_band_low", -reach, 0.0, "V", log=False, default=low)
         parameters["dead_band_high"] = Parameter("dead_band_high", 0.0, reach, "V", log=False, default=high)
         dt = plant.dt
-        offset = max(OFFSETS * dt, LEAST_OFFSET)
         model = model_of_plant(plant)
         for i, (channel, quantity) in enumerate(zip(plant.channels, model.measurements, strict=True)):
             largest = max(np.nanmax(np.abs(log.measurements[:, i]), initial=0.0) for log in self.logs)
@@ -261,8 +245,7 @@ class ThrusterFamily:
             )
             name, lag = f"lag_{channel}", dict(recorder.lag).get(channel, LAG_START * dt)
             parameters[name] = Parameter(name, 0.0, max(LONGEST_LAG * dt, lag), "s", log=False, default=lag)
-            name = f"clock_offset_{channel}"
-            parameters[name] = Parameter(name, -offset, offset, "s", log=False, default=0.0)
+        parameters |= clock_offsets(plant.channels, self.logs)
         q, r = np.diag(plant.process_noise_cov), np.diag(plant.measurement_noise_cov)
         units = [quantity.unit for quantity in (*model.states, *model.measurements)]
         for name, variance, unit in zip(self.noise_names, (*q, *r), units, strict=True):
@@ -278,8 +261,7 @@ class ThrusterFamily:
 
     def shifted(self, logs: Sequence[Log]):
         """Some logs for this family: unchanged, or a function of the free clock offsets."""
-        offsets = tuple(parameter.name for parameter in self.free if parameter.name.startswith("clock_offset_"))
-        return ShiftedLogs(logs, offsets) if offsets else tuple(logs)
+        return shifted(logs, self.free)
 
     def parameters(self, values: Mapping[str, float]) -> ThrusterParameters:
         """The thruster's own parameters."""
@@ -343,60 +325,6 @@ class ThrusterFamily:
             if channel in self._lagging:
                 lag[channel] = values.get(f"lag_{channel}", known[f"lag_{channel}"].start)
         return Recorder(low, high, tuple(bias.items()), tuple(lag.items()))
-
-
-class ShiftedLogs:
-    """Logs as a function of clock offsets of their channels [s].
-
-    Of a shifted channel only every other row is used. It is interpolated between two samples, so that the noise of
-    consecutive rows is correlated, and a likelihood of white noise would prefer a wrong offset. Every other row
-    shares no sample with the next one.
-    """
-
-    def __init__(self, logs: Sequence[Log], names: Sequence[str]):
-        """Take logs, and names such as clock_offset_CHANNEL."""
-        self.logs, self.parameters = tuple(logs), tuple(names)
-
-    def __call__(self, **offsets: float) -> list[Log]:
-        """The logs with shifted clocks of the channels."""
-        return [self._shifted(log, offsets) for log in self.logs]
-
-    def noise_factors(self, **offsets: float) -> dict[str, float]:
-        """Factors on the variance of white noise in each shifted channel, by symbol.
-
-        An interpolated sample has weights w and 1 - w of its neighbours, and its noise w^2 + (1 - w)^2 of their
-        variance. A likelihood without this factor would prefer offsets of half a sample.
-        """
-        factors = {}
-        for name, seconds in offsets.items():
-            channel = name.removeprefix("clock_offset_")
-            parts = [_left(log, f"measurement:{channel}", seconds) for log in self.logs]
-            factors[channel] = float(np.mean(np.concatenate(parts)))
-        return factors
-
-    def _shifted(self, log: Log, offsets: Mapping[str, float]) -> Log:
-        for name, seconds in offsets.items():
-            channel = f"measurement:{name.removeprefix('clock_offset_')}"
-            dense = np.median(np.diff(log.series(channel).times)) < NEIGHBOURS * log.dt
-            log = at_offset(log, channel, seconds)
-            if dense:
-                rows = log.measurements.copy()
-                rows[1::2, [quantity.symbol for quantity in log.measured].index(channel.partition(":")[2])] = (
-                    np.nan
-                )
-                log = replace(log, measurements=rows)
-        return log
-
-
-def _left(log: Log, channel: str, seconds: float) -> np.ndarray:
-    """w^2 + (1 - w)^2 of each row of a shifted channel that lies between two close samples."""
-    samples = log.series(channel).times
-    times = log.times + seconds
-    after = np.clip(np.searchsorted(samples, times), 1, len(samples) - 1)
-    gap = samples[after] - samples[after - 1]
-    w = (times - samples[after - 1]) / gap
-    between = (w >= 0) & (w <= 1) & (gap < NEIGHBOURS * log.dt)
-    return w[between] ** 2 + (1 - w[between]) ** 2 if between.any() else np.ones(1)
 
 
 def _about(name: str, value: float, unit: str) -> Parameter:
