@@ -169,7 +169,7 @@ def _trained(kind: str, problem: Problem, arguments: dict[str, Any]) -> str:
     """The file of an estimator trained on a problem; trained now if there is none."""
     file = FOLDER / f"{kind}-{problem.name}.safetensors"
     if not file.exists():
-        train_estimator(kind, problem, file=file, seeds=2, progress=True, **arguments)
+        train_estimator(kind, problem, out=file, seeds=2, progress=True, **arguments)
     return str(file)
 
 

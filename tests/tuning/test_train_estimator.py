@@ -154,7 +154,7 @@ def test_standings_pair_all_filters_on_the_same_runs(runs):
 def test_the_function_trains_stores_compares_and_continues(tmp_path, runs, as_python):
     path = tmp_path / "mine.safetensors"
     arguments = {"runs": 16, "batch": 8, "window": 10, "seeds": 6}
-    training = tuning.train_estimator("recursive-kalmannet", PROBLEM, steps=4, file=path, **arguments)
+    training = tuning.train_estimator("recursive-kalmannet", PROBLEM, steps=4, out=path, **arguments)
     assert training.file == path and read(path).about["training"]["problem"] == "plane"
     assert [one.label.split()[0] for one in training.standings] == ["ekf", "ekf", "recursive-kalmannet"]
     assert "recursive-kalmannet" in str(training) and "R x 4" in training._repr_html_()
@@ -169,21 +169,21 @@ def test_the_function_trains_stores_compares_and_continues(tmp_path, runs, as_py
     assert comparison.filters == ("ekf", "mine")
     score = comparison.boards[0].rows[1].evaluation.score
     assert score == training.standings[-1].evaluations[HELD_OUT].score
-    again = tuning.train_estimator("recursive-kalmannet", PROBLEM, steps=1, start=path, file=path, **arguments)
+    again = tuning.train_estimator("recursive-kalmannet", PROBLEM, steps=1, start=path, out=path, **arguments)
     assert again.checks[0].score == min(one.score for one in training.checks)
     with pytest.raises(ValueError, match="start must be a kalmannet's file"):
-        tuning.train_estimator("kalmannet", PROBLEM, steps=1, start=path, file=path, **arguments)
+        tuning.train_estimator("kalmannet", PROBLEM, steps=1, start=path, out=path, **arguments)
 
 
 def test_wrong_arguments_are_refused_before_any_training(tmp_path):
     for arguments, said in (
         ({"kind": "transformer"}, "an estimator must be one of"),
         ({"steps": 0}, "steps must be"),
-        ({"file": tmp_path / "mine.json"}, "must end in .safetensors"),
+        ({"out": tmp_path / "mine.json"}, "must end in .safetensors"),
         ({"problem": find_scenario("nominal"), "against": [tmp_path / "none.json"]}, "none.json"),
     ):
         with pytest.raises(ValueError, match=said):
-            tuning.train_estimator(**{"problem": PROBLEM, "file": tmp_path / "mine.safetensors", **arguments})
+            tuning.train_estimator(**{"problem": PROBLEM, "out": tmp_path / "mine.safetensors", **arguments})
 
 
 def test_the_command_trains_and_compare_takes_its_file(thruster, tmp_path):

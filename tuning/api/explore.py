@@ -87,7 +87,8 @@ def explore(
 
     Args:
         problem: name of a problem; outliers by default, or that of the tuned file. In Python also a `Problem`,
-            `tuning.read_logs(...)`, or a pair (model, data) of a model, or a thruster's preset, and recorded runs.
+            `tuning.read_logs(...)`, a pair (model, data) of a model, or a thruster's preset, and recorded runs; or
+            the tuned file or `Study` itself.
         filter: without a tuned file, the name of a filter, as `thruster filters` lists them; ekf by default. In
             Python also own numbers where one starts, as `make_filter("ekf", model)`.
         tuned: tuned file where one starts; it names filter and problem. In Python also a `Study`.
@@ -102,6 +103,10 @@ def explore(
     Raises:
         ValueError: states the rule and the value, also without the extra `explore` when the page is shown.
     """
+    if tuned is None and (
+        isinstance(problem, Study) or (isinstance(problem, str | Path) and Path(problem).suffix == ".json")
+    ):
+        problem, tuned = None, problem
     if tuned is not None and filter is not None:
         got = f"both, {short_repr(tuned)} and {short_repr(filter)}"
         raise ValueError(f"give either a tuned file or a filter (--filter NAME), but got {got}")

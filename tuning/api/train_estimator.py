@@ -231,7 +231,7 @@ def train_estimator(
     against: Annotated[Sequence[str | Path], Option(FILTER, metavar="FILE", type=list[Path], file=READ)] = (),
     seeds: Annotated[int, Option(markers.RUNS)] = HELD_OUT_SEEDS,
     seed: Seed = 0,
-    file: Annotated[str | Path | None, Option(OUTPUT, ("--out",), metavar="FILE", type=Path, file=WRITTEN)] = None,
+    out: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
     progress: markers.Progress = None,
 ) -> EstimatorTraining:
     """Train an estimator with a network on a problem's runs, and compare it with filters on held-out ones.
@@ -265,7 +265,7 @@ def train_estimator(
         against: also compare with this tuned file of `thruster tune`; may be repeated. In Python a list.
         seeds: number of held-out runs.
         seed: seed of all randomness; the same seed gives the same results.
-        file: the trained estimator, ending in .safetensors; by default in out/estimators.
+        out: the trained estimator, ending in .safetensors; by default in out/estimators.
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
@@ -288,9 +288,9 @@ def train_estimator(
         at_least("window", window, 1, MOST),
         positive("rate", rate),
     )
-    target = FOLDER / f"{kind}-{file_name(chosen.name)}{TRAINED}" if file is None else Path(file)
+    target = FOLDER / f"{kind}-{file_name(chosen.name)}{TRAINED}" if out is None else Path(out)
     if target.suffix != TRAINED:
-        raise ValueError(f"file must end in {TRAINED}, but got {target}")
+        raise ValueError(f"out must end in {TRAINED}, but got {target}")
     check_target(target)
     competitors = {Path(path).stem: read_choice(Path(path), chosen).filter(chosen) for path in against}
     chosen.held_out_seeds(seed, seeds)  # a clear error before the training

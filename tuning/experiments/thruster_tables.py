@@ -28,6 +28,7 @@ from tuning.cli.output import progress_of
 from tuning.experiments.thruster_papers import (
     EQUAL,
     MEMBERS,
+    MOST_RUNS,
     NOISE_LEVELS,
     RUNS,
     STEPS,
@@ -299,6 +300,7 @@ def reproduce(
     """
     if series is not None:
         check_picture(series, "--series")
+    runs = at_least("runs", runs, 2, MOST_RUNS)
     with progress_of(f"{runs} runs of each case and noise level") as progress:
         comparisons = compare_all(
             runs=runs, members=members, seed=seed, on_progress=lambda done, total: progress("", done, total)

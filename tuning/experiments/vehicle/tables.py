@@ -13,6 +13,7 @@ import numpy as np
 from filters import FuzzyKalmanFilter
 from filters.consistency.intervals import Interval
 from thruster_env.auv.parameters import SEGOROGENI, mass_matrix
+from thruster_env.core.checks import at_least
 from thruster_env.core.text_tables import Table, markdown_table
 from thruster_env.logs.write import check_picture
 from tuning.api.markers import OUTPUT, WRITTEN, Option, PythonOnly, Seed
@@ -22,6 +23,7 @@ from tuning.cli.output import progress_of
 from tuning.experiments.vehicle.estimators import MEASUREMENTS, level_model
 from tuning.experiments.vehicle.experiment import (
     MEASURED_PLACES,
+    MOST_RUNS,
     PAPERS,
     PathResult,
     Scores,
@@ -441,6 +443,7 @@ def reproduce(
     """
     if series is not None:
         check_picture(series, "--series")
+    runs = at_least("runs", runs, 2, MOST_RUNS)
     with progress_of(f"{runs} runs") as progress:
         results = run_tasks(
             tasks_of(name),

@@ -46,7 +46,7 @@ def test_own_numbers_are_where_one_starts(as_python):
     [
         (dict(problem="outliers", filter="open-loop"), "filter must be one that has a number to change"),
         (dict(problem="outliers", seeds=0), "seeds must be"),
-        (dict(tuned="tuned.json", filter="ekf"), "give either a tuned file or a filter"),
+        (dict(problem="tuned.json", filter="ekf"), "give either a tuned file or a filter"),
     ],
     ids=str,
 )
