@@ -17,10 +17,10 @@ from benchmarks.peers import EnsembleStep, KalmanStep, UnscentedStep, compiled_m
 from benchmarks.timing import Measure, Row, alone, seconds_a_call, side_by_side
 from filters.wrappers.envs import EstimateState
 from thruster_env.core.compiled import compiled, function_fingerprint
-from thruster_env.core.memory import WIDTH
 from thruster_env.core.sources import written_out
 from thruster_env.core.streams import ACTION_SPACE, derived_seed
 from thruster_env.core.threads import spread
+from thruster_env.env.copies import WIDTH
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.dynamics import Constants, substep
 from thruster_env.thruster.model import thruster_model

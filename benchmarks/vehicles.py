@@ -15,7 +15,7 @@ from benchmarks.timing import Measure, Row, alone, side_by_side
 from filters import make_filter, run
 from filters.filter import Filter
 from thruster_env.auv.dynamics import motion_substep
-from thruster_env.auv.forces import Constants
+from thruster_env.auv.parameters import Constants
 from thruster_env.auv.plant import make_plant
 from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import tuple_of, written_out

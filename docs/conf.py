@@ -24,7 +24,6 @@ extensions = [
     "sphinx_design",
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
-    "docs._ext.docstrings",
     "docs._ext.equations",
     "docs._ext.generated",
 ]

@@ -18,7 +18,7 @@ import numpy as np
 
 import thruster_env.auv
 from filters import EstimateState
-from thruster_env.auv.control import DepthAndCourse
+from thruster_env.auv.paths import DepthAndCourse
 
 STEPS = 600
 

@@ -26,9 +26,9 @@ from filters.algebra.operations import (
 )
 from filters.algebra.points import log_density, outer
 from filters.engine.belief import Belief
+from filters.filter import PageFilter
 from filters.gaussian.extended import add_process_noise, propagate
 from filters.pages.page import Page
-from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import at_least, finite, positive
 
 MOST_ITERATIONS = 50  # which programs repeat without a loop

@@ -16,8 +16,14 @@ from filters.ensembles.square_root import (
     SerialSquareRootFilter,
 )
 from filters.ensembles.stochastic import DeterministicEnsembleKalmanFilter, EnsembleKalmanFilter
-from filters.estimators.find import as_filter, estimator_named, is_filter_class, is_foreign, label_of
-from filters.estimators.foreign import ForeignFilter
+from filters.estimators.foreign import (
+    ForeignFilter,
+    as_filter,
+    estimator_named,
+    is_filter_class,
+    is_foreign,
+    label_of,
+)
 from filters.filter import Filter
 from filters.gaussian.extended import (
     ExtendedKalmanFilter,

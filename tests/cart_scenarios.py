@@ -9,9 +9,9 @@ import numpy as np
 from tests.small_plant import Q, cart_model, make_cart
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.model.simulate import simulate
-from tuning.problems.bound import average_bound
 from tuning.problems.data import Data
 from tuning.problems.excitation import Steps
+from tuning.problems.model_problem import average_bound
 from tuning.problems.scenario import PlantScenario
 
 

@@ -16,10 +16,9 @@ from thruster_env.core.checks import arguments_of, positive, takes_arguments_of
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS
 from thruster_env.effects.effects import Context, chain_of, dropping_channels, run_chain
 from thruster_env.effects.sensors import SENSOR_EFFECTS, Reading
-from thruster_env.env.copies import Channel, correlated, root_of
+from thruster_env.env.copies import Channel, Page, correlated, root_of
 from thruster_env.env.env import PlantEnv, PlantVectorEnv
 from thruster_env.env.model_env import ModelledEnv
-from thruster_env.env.page import Page
 from thruster_env.graphs.graphs import where
 from thruster_env.model.affine import affine_model
 from thruster_env.model.quantities import Quantity

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from thruster_env.core.files import new_figure, tidy, write_whole
 from thruster_env.core.text_tables import with_tables
 from tuning.experiments import EXPERIMENTS

@@ -14,12 +14,11 @@ from docs.scripts import by_name, digits
 from docs.scripts.ranking import leaderboard
 from filters import EstimateState
 from filters.augmented import Unknown
-from filters.consistency.intervals import Interval
-from thruster_env.auv.control import DepthAndCourse
-from thruster_env.auv.paths import MANOEUVRES
+from filters.consistency.nees import Interval
+from thruster_env.auv.paths import MANOEUVRES, DepthAndCourse
 from thruster_env.core.files import write_whole
 from thruster_env.core.text_tables import markdown_table
-from thruster_env.env.commands import ObserveStateVector
+from thruster_env.env.env import ObserveStateVector
 from tuning.auv.scenario import Scenario, find_scenario
 from tuning.evaluation.compare import Contender, Row, contender
 from tuning.problems.problem import Problem

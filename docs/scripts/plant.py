@@ -13,21 +13,21 @@ from docs.scripts import by_name, digits, label_grid, legend_below, subplots
 from thruster_env.core.files import BLUE, DARK, RUST, SKY, save_figure, write_whole
 from thruster_env.core.streams import episode_keys
 from thruster_env.core.text_tables import markdown_table
-from thruster_env.env.commands import ObserveStateVector
+from thruster_env.env.env import ObserveStateVector
 from thruster_env.thruster.analysis import jacobians, required_substeps, run_substeps, state_range, steady_state
 from thruster_env.thruster.controllers import LQRController, PIController
 from thruster_env.thruster.dynamics import rates
 from thruster_env.thruster.effects import AMPLIFIER_EFFECTS, FLOW_SIGNALS, REFERENCE_SIGNALS
-from thruster_env.thruster.equations import copies_of, simulate
+from thruster_env.thruster.env import copies_of, simulate
 from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, derive_constants
 from thruster_env.thruster.plant import (
     DEFAULT_DT,
     DEFAULT_MAX_VOLTAGE,
     DEFAULT_MEASUREMENT_NOISE,
     Plant,
+    Task,
     make_plant,
 )
-from thruster_env.thruster.task import Task
 
 FULL_VOLTAGE = dict.fromkeys(PRESETS, DEFAULT_MAX_VOLTAGE) | {"t200": 13.0}  # [V]
 SHARES = (0.25, 0.5, 1.0)  # of the full voltage

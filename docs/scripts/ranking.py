@@ -12,8 +12,7 @@ from scipy.stats import chi2
 
 from docs.scripts import about, by_name, digits
 from filters import StateSpaceModel, Unknown, make_filter, run
-from filters.consistency.intervals import Interval, rmse_intervals
-from filters.consistency.nees import whitened
+from filters.consistency.nees import Interval, rmse_intervals, whitened
 from filters.filter import Filter
 from filters.horizon.window import STUDENT
 from filters.logs.findings import colour_of

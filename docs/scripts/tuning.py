@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 from docs.scripts import about, by_name, log_ticks, subplots
 from filters.augmented import Unknown, augmented_model
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from filters.filter import Filter
 from filters.registry import make_filter
 from thruster_env.core.compiled import inlined
@@ -33,8 +33,8 @@ from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.problems.model_problem import ModelProblem
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, NIS_BAND, SCORE, nis_violation, penalised
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
-from tuning.search.samplers import make_sampler
 from tuning.search.space import Choice, distributions, oracle_choice, parameters_of, suggest, trial_parameters
+from tuning.search.trials import make_sampler
 from tuning.thruster.scenario import Scenario, find_scenario
 
 SEED, TRIALS = 0, 100

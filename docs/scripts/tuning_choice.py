@@ -11,7 +11,7 @@ from optuna.trial import TrialState
 from scipy.stats import t as student
 
 from docs.scripts import by_name
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.logs.log import Log
 from thruster_env.model.affine import affine_model

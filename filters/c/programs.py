@@ -16,11 +16,10 @@ from filters.algebra.points import dot
 from filters.engine.batch import run
 from filters.engine.belief import memory_offsets
 from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
-from filters.filter import Filter
+from filters.filter import Filter, FilterWithPage, with_page
 from filters.pages.kernels import MembersMemory, numbers_of, stages_of
 from filters.pages.kernels import member_stages_of as stages_of_members
 from filters.pages.page import Equations, RowMemory
-from filters.pages.page_filter import FilterWithPage, with_page
 from thruster_env.core.angles import difference, wrapped_where
 from thruster_env.core.streams import (
     FILTER_MEASUREMENT,

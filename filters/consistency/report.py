@@ -11,11 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.consistency.intervals import (
+from filters.consistency.nees import (
     FEWEST_RUNS,
+    LAGS,
     LEVELS,
     Interval,
+    SquaresCheck,
     Uniformity,
+    Whiteness,
+    check_whitened,
     covered,
     ensemble_crps,
     ensemble_ranks,
@@ -23,8 +27,9 @@ from filters.consistency.intervals import (
     gaussian_crps,
     mean_interval,
     uniformity,
+    whitened,
+    whiteness_of,
 )
-from filters.consistency.nees import LAGS, SquaresCheck, Whiteness, check_whitened, whitened, whiteness_of
 from filters.engine.batch import Estimates
 from filters.ensembles.square_root import Members
 from thruster_env.core.angles import difference, is_angle, wrapped
@@ -63,7 +68,7 @@ class ConsistencyReport(NamedTuple):
     nis: SquaresCheck
     whiteness: Whiteness
     coverage: tuple[Interval, ...]  # share of each state's errors within 1.96 standard deviations; 0.95 is right
-    coverage_by_level: np.ndarray  # (levels, n), of intervals of the levels `filters.consistency.intervals.LEVELS`
+    coverage_by_level: np.ndarray  # (levels, n), of intervals of the levels `filters.consistency.nees.LEVELS`
     crps: tuple[Interval, ...]  # mean CRPS of each state's Gaussian, in its unit
     crps_expected: np.ndarray  # (n,), what it would be if the covariances were right
     crps_ratio: np.ndarray  # (T, n), mean CRPS over runs in units of that expectation, step by step

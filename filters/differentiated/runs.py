@@ -11,7 +11,7 @@ import numpy as np
 from filters.adaptive import RobustExtendedKalmanFilter, SageHusaFilter, VariationalBayesFilter
 from filters.algebra.points import tail_of
 from filters.differentiated.recursion import Wanted, recursion_of
-from filters.filter import Filter
+from filters.filter import Filter, PageFilter
 from filters.gaussian.extended import (
     ExtendedKalmanFilter,
     FadingMemoryFilter,
@@ -22,7 +22,6 @@ from filters.gaussian.extended import (
 from filters.gaussian.kalman import KalmanFilter
 from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanFilter
 from filters.pages.page import Page
-from filters.pages.page_filter import PageFilter
 from filters.starts import Starts, as_the_prior_says
 from thruster_env.core.angles import wrapped_where
 from thruster_env.core.threads import spread

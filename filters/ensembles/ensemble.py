@@ -30,9 +30,9 @@ from filters.algebra.operations import (
 )
 from filters.algebra.points import dot, log_density, outer
 from filters.engine.belief import Belief, Kernels
+from filters.filter import FilterWithPage
 from filters.pages.kernels import members_kernels
 from filters.pages.page import Page
-from filters.pages.page_filter import FilterWithPage
 from thruster_env.core.checks import at_least, positive, short_repr, switch
 
 

@@ -19,8 +19,8 @@ from filters.algebra.matrices import input_matrix
 from filters.algebra.members import covariance, mean, on_branch
 from filters.algebra.operations import divide, geometric_mean, mask_missing, present, wrap
 from filters.engine.belief import Kernels, filter_offset, memory_offsets
-from filters.ensembles.by_parts import relax_row, row_moments, stretch_row
 from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, expect, propagate
+from filters.ensembles.stochastic import relax_row, row_moments, stretch_row
 from filters.pages.kernels import MembersMemory, Stage, stored
 from filters.pages.kernels import member_stages_of as stages_of
 from filters.pages.kernels import member_works_of as works_of

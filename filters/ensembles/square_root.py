@@ -30,9 +30,8 @@ from filters.algebra.operations import (
 from filters.algebra.points import dot, root
 from filters.algebra.roots import triangle_quotient
 from filters.engine.session import Session
-from filters.ensembles.by_parts import LocalisedByParts, gaussian_moves, look
 from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, propagate
-from filters.ensembles.stochastic import DeterministicUpdateFilter
+from filters.ensembles.stochastic import DeterministicUpdateFilter, LocalisedByParts, gaussian_moves, look
 from filters.filter import Filter
 from filters.pages.page import Page
 from thruster_env.core.checks import at_least as check_at_least

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from filters.estimators.estimator import Estimator, Output
+from filters.estimators.foreign import Estimator, Output
 from thruster_env.core.angles import difference, wrapped_where
 from thruster_env.core.sources import as_value
 from thruster_env.model.state_space import StateSpaceModel, refuse_feed

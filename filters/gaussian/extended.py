@@ -17,8 +17,8 @@ from filters.algebra.operations import divide, eye, joseph, mask_missing, presen
 from filters.algebra.points import density, log_density, root, square
 from filters.algebra.roots import factor_of, forward_quotient, hstack, part, triangle, vstack, zeros
 from filters.baselines import indices_of
+from filters.filter import PageFilter
 from filters.pages.page import Page
-from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import at_least, between, one_of, positive, vector
 
 MOST_ITERATIONS = 20

@@ -12,10 +12,10 @@ import numpy as np
 from filters.algebra.operations import divide, joseph, mask_missing, present, sym, uncorrelated, wrap
 from filters.algebra.points import hats, log_density
 from filters.algebra.roots import inverse_of, zeros
+from filters.filter import PageFilter
 from filters.gaussian import extended
 from filters.gaussian.extended import ExtendedKalmanFilter, add_process_noise, propagate
 from filters.pages.page import Page
-from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import at_least, covariance, one_of
 from thruster_env.model.affine import AffineModel, linearize
 

@@ -13,9 +13,9 @@ from filters.algebra.operations import divide, mask_missing, of_best_gain, prese
 from filters.algebra.points import first, log_density, on_circle, ones, outer, root, square, units, without_first
 from filters.algebra.roots import hstack, part, triangle, vstack, zeros
 from filters.baselines import index_of
+from filters.filter import PageFilter
 from filters.gaussian.extended import initial_root, root_result
 from filters.pages.page import Page
-from filters.pages.page_filter import PageFilter
 from thruster_env.core.checks import finite, one_of, positive, short_repr, vector
 from thruster_env.graphs.graphs import where
 from thruster_env.model.affine import AffineModel, linearize

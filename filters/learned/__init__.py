@@ -1,8 +1,8 @@
 """Estimators with a network in them, trained on runs whose states are known; this needs torch and safetensors.
 
 estimator   what all have in common, and a model's equations over whole steps, on batches of tensors
-filters     `kalmannet`, `recursive-kalmannet`, which learn a gain; `differentiable-enkf`, which learns its noise
-file        trained estimators as files of numbers
+filters     `kalmannet`, `recursive-kalmannet`, which learn a gain; `differentiable-enkf`, which learns its noise;
+            and their files
 
 `tuning.train_estimator` and `thruster train-estimator` train them.
 """
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from thruster_env.core.modules import to_install
 
 if TYPE_CHECKING:
-    from filters.learned.file import TrainedEstimator
+    from filters.learned.filters import TrainedEstimator
 
 NEEDED = ("torch", "safetensors")
 
@@ -44,6 +44,6 @@ def read_estimator(path: str | Path) -> TrainedEstimator:
     """
     check_file(path)
     check_installed()
-    from filters.learned.file import read  # torch takes seconds to import
+    from filters.learned.filters import read  # torch takes seconds to import
 
     return read(path)

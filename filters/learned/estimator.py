@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from filters.estimators.estimator import Output
+from filters.estimators.foreign import Output
 from filters.tensors.stages import wrapped_where
 from thruster_env.core.checks import as_floats, at_least, one_of
 from thruster_env.core.compiled import function_fingerprint, is_interpreting

@@ -10,8 +10,7 @@ import numpy as np
 
 from filters.engine.batch import Estimates, estimates_of, run
 from filters.engine.session import Session
-from filters.estimators.estimator import Estimator
-from filters.estimators.foreign import ForeignFilter
+from filters.estimators.foreign import Estimator, ForeignFilter
 from filters.filter import Filter
 from filters.live import Live
 from filters.smoothers.smooth import smoothed

@@ -1,7 +1,6 @@
 """Filters as pages of a textbook, pure functions of small matrices, and what runs them.
 
 page         a page, its parameters, its matrices in memory, and the model that it gets: f, F, h, H, Q, R
-page_filter  a filter that has a page
 kernels      the stages of a page, also of an ensemble's members, as programs or calls: kernels of the engine
 
 From a page to machine code, in steps:

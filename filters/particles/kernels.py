@@ -44,10 +44,10 @@ from filters.algebra.points import (
 )
 from filters.engine.belief import Belief, Kernels, filter_offset, memory_offsets
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
+from filters.filter import FilterWithPage
 from filters.pages.kernels import MembersMemory, Stage, anything_measured, predictor, stored, with_extras
 from filters.pages.kernels import member_works_of as works_of
 from filters.pages.page import Page, PagedModel, acting_places
-from filters.pages.page_filter import FilterWithPage
 from thruster_env.core.checks import at_least as check_at_least
 from thruster_env.core.checks import finite, positive
 from thruster_env.core.compiled import inlined, not_inlined

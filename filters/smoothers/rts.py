@@ -28,14 +28,13 @@ from filters.algebra.points import root, square, units, without_first
 from filters.algebra.roots import careful
 from filters.engine.batch import Estimates
 from filters.engine.belief import memory_offsets
-from filters.filter import Filter
+from filters.filter import Filter, PageFilter
 from filters.gaussian import sigma_points
 from filters.gaussian.extended import ExtendedKalmanFilter, IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter, constants_at
 from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanFilter, propagate_points, scatter
 from filters.pages.kernels import Stage, as_tuple, programs_of, stored
 from filters.pages.page import Equations, Page, RowMemory
-from filters.pages.page_filter import PageFilter
 from thruster_env.core.angles import difference
 from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
 from thruster_env.core.threads import spread

@@ -1,8 +1,7 @@
 """Filters on batches of tensors, for models with a network in them and for other devices; this alone needs torch.
 
-equations   a model's functions and their Jacobians, of tensors
+equations   a model's functions and their Jacobians, of tensors; a filter's steps for one set of numbers
 stages      a page as functions of tensors (..., rows, columns), and random numbers on the device
-recursion   a filter's steps for one set of numbers, as they stand or compiled
 filter      `TensorFilter`: init, predict, update, run, and the likelihood by the compiled recursion
 """
 

@@ -12,11 +12,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
-from filters.filter import Filter
-from filters.pages.page_filter import with_page
+from filters.filter import Filter, with_page
 from filters.sensitivity import likelihood
-from filters.tensors.equations import OfGraph, equation_of
-from filters.tensors.recursion import CompiledRecursion, Estimate, Numbers, Recursion
+from filters.tensors.equations import CompiledRecursion, Estimate, Numbers, OfGraph, Recursion, equation_of
 from filters.tensors.stages import EnsembleStages, Stages, root, round_keys, wrapped_where
 from thruster_env.core.checks import as_floats, one_of, short_repr, switch
 from thruster_env.core.sources import lower_pairs

@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 
 from filters.augmented import Unknown, augmented_model
-from filters.estimators.find import is_foreign
+from filters.estimators.foreign import is_foreign
 from filters.filter import Filter
 from filters.named import model_for_step
 from filters.registry import filter_type, make_filter

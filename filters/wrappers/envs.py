@@ -17,8 +17,7 @@ from numpy.ma import MaskedArray
 
 from filters.engine.batch import Beliefs
 from filters.engine.belief import checked_actions
-from filters.estimators.estimator import Estimator
-from filters.estimators.foreign import EstimatorBeliefs, ForeignFilter
+from filters.estimators.foreign import Estimator, EstimatorBeliefs, ForeignFilter
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of, watch_of
 from filters.smoothers.smooth import WithSmoother
@@ -70,7 +69,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         env: any env with Box actions and observations.
         filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None. Or a filter
             object with its model, such as `tuning.tune(...).filter`; or an estimator of
-            another package, as `filters.estimators.estimator.Estimator`, a function that makes one
+            another package, as `filters.estimators.foreign.Estimator`, a function that makes one
             from a model, or "module:object" for either; a covariance that it does not return is zero,
             an innovation NaN.
         observation: one of the three forms above.

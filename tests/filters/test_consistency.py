@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest, norm
 
-from filters.consistency.intervals import mean_interval, rmse_intervals, rmse_ratios, uniformity
-from filters.consistency.nees import check_squares, whiteness
+from filters.consistency.nees import (
+    check_squares,
+    mean_interval,
+    rmse_intervals,
+    rmse_ratios,
+    uniformity,
+    whiteness,
+)
 from filters.consistency.report import whiteness_sentence
 
 COV = np.array([[2.0, 0.6], [0.6, 0.5]])

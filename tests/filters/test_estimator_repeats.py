@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filters import run
-from filters.estimators.estimator import Estimator
+from filters.estimators.foreign import Estimator
 from filters.registry import make_filter
 from tests.models import random_affine
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from filters import EstimateState, make_filter, run
-from filters.estimators.estimator import Estimator
+from filters.estimators.foreign import Estimator
 from filters.wrappers.envs import EstimateStates
 from tests.models import random_affine, simulated
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture

@@ -8,7 +8,7 @@ import pytest
 from filters import make_filter, run
 from filters.consistency.nees import whiteness, whiteness_of
 from filters.consistency.report import is_white, whiteness_sentence
-from filters.estimators.estimator import Estimator
+from filters.estimators.foreign import Estimator
 from filters.estimators.libraries import FilterPyEstimator, StoneSoupEstimator
 from filters.logs.estimate import estimate
 from filters.logs.findings import findings, verdict

@@ -11,10 +11,9 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 from filters import EstimateState, make_filter, run, thruster_model
-from filters.estimators.find import is_foreign, label_of
+from filters.estimators.foreign import is_foreign, label_of
 from filters.learned.estimator import Equations, unit_scales
-from filters.learned.file import LEARNED, read, write_estimator
-from filters.learned.filters import GainNetwork, KalmanNet
+from filters.learned.filters import LEARNED, GainNetwork, KalmanNet, read, write_estimator
 from filters.wrappers.envs import EstimateStates
 from tests.models import KEY, pendulum, plane_model, random_affine, simulated
 from thruster_env.model.affine import affine_model

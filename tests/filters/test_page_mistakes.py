@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from filters import thruster_model
+from filters.filter import PageFilter
 from filters.gaussian import extended
 from filters.pages.page import Page
-from filters.pages.page_filter import PageFilter
 
 
 def without_innovation(model, x, P, z):

@@ -8,7 +8,7 @@ import pytest
 
 from filters import FILTERS, ExtendedKalmanFilter, KalmanFilter, make_filter, run, thruster_model
 from filters.differentiated.runs import KINDS, ModelSlopes, differentiable
-from filters.pages.page_filter import PageFilter
+from filters.filter import PageFilter
 from filters.sensitivity import information, likelihood, sensitivity, state_score
 from tests.filters.of_arrays import run_page
 from tests.filters.test_differentiated import units

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from filters.consistency.intervals import (
+from filters.consistency.nees import (
     covered,
     ensemble_crps,
     ensemble_ranks,

@@ -14,8 +14,7 @@ from filters import (
     UnscentedKalmanFilter,
     run,
 )
-from filters.consistency.intervals import mean_interval, rmse_ratios
-from filters.consistency.nees import normalized_squares
+from filters.consistency.nees import mean_interval, normalized_squares, rmse_ratios
 from filters.smoothers.smooth import smooth
 from tests.filters.test_differentiated import swing_if
 from tests.models import KEY, held_voltages, pendulum, scalar_model, simulated, swing, wide_model

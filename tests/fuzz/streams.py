@@ -14,7 +14,7 @@ import numpy as np
 
 from filters import StateSpaceModel
 from filters.engine.batch import run
-from filters.estimators.estimator import Estimator
+from filters.estimators.foreign import Estimator
 from filters.registry import make_filter
 from tests.fuzz.python_interface import _until
 from thruster_env.core.streams import SPAWN_KEYS, derived_generator, derived_seed

@@ -21,11 +21,10 @@ from filters.gaussian import extended
 from filters.registry import FILTERS
 from filters.wrappers.arguments import OBSERVATIONS
 from thruster_env.effects.sensors import SENSOR_EFFECTS
-from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.effects import AMPLIFIER_EFFECTS, DISTRIBUTIONS, FLOW_SIGNALS, REFERENCE_SIGNALS
 from thruster_env.thruster.env import BowThrusterEnv, BowThrusterLinearEnv, BowThrusterVectorEnv
 from thruster_env.thruster.model import thruster_model
-from thruster_env.thruster.parameters import PRESETS
+from thruster_env.thruster.parameters import CHANNELS, PRESETS
 
 ROOT = Path(__file__).parents[2]
 
@@ -205,7 +204,7 @@ def test_the_page_on_design_has_the_update_of_the_ekf_as_it_is():
 
 def test_the_chart_of_filters_names_filters_that_there_are():
     from docs.scripts.ranking import FILE, OTHERWISE, STEPS, as_text
-    from filters.learned.file import LEARNED
+    from filters.learned.filters import LEARNED
 
     assert {name for step in (*STEPS, OTHERWISE) for name in step.filters} <= {*FILTERS, *LEARNED}
     page = with_appendix("ranking")

@@ -15,7 +15,7 @@ import pytest
 
 from tests.repository.test_house import FLOORS
 from thruster_env import __version__
-from tuning.search.samplers import NEEDS
+from tuning.search.trials import NEEDS
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

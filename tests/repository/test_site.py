@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from docs._ext.docstrings import readable
-from docs._ext.equations import inline, latex_of
+from docs._ext.equations import inline, latex_of, readable
 from docs._ext.generated import ORDER, commands
 from filters.registry import FILTERS
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filters import make_filter, run
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
 from tests.models import wide_model
@@ -39,7 +39,7 @@ from tuning.experiments import lorenz63
 from tuning.experiments.benchmark import noise_free_problem
 from tuning.problems.problem import Parameter
 from tuning.reporting.choice_words import consistency_sentence, gains
-from tuning.search.relations import correlations_of, full_covariance
+from tuning.search.parameters import correlations_of, full_covariance
 
 
 def test_what_the_model_of_a_user_came_with_is_a_baseline_and_comes_first():

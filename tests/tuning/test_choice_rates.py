@@ -14,7 +14,7 @@ from docs.scripts.tuning_choice import (
     measured_of,
     plan_of,
 )
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.baselines import RULE

@@ -6,7 +6,7 @@ import numpy as np
 import optuna
 import pytest
 
-from tuning.search.samplers import NEEDS, make_sampler, read_state
+from tuning.search.trials import NEEDS, make_sampler, read_state
 
 
 class Attack:

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run
-from filters.consistency.intervals import Interval, gaussian_crps, mean_interval, rmse_ratios
-from filters.consistency.nees import normalized_squares
+from filters.consistency.nees import Interval, gaussian_crps, mean_interval, normalized_squares, rmse_ratios
 from filters.consistency.report import (
     comparison_sentence,
     confidence,

@@ -9,7 +9,7 @@ import pytest
 import tuning
 from filters import affine_model, make_filter, run
 from filters.augmented import Unknown
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.text_tables import plain_text
@@ -25,10 +25,9 @@ from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.leaderboard import report as leaderboard_report
 from tuning.reporting.subject import _plan
 from tuning.reporting.tuning_report import as_json, report, way_out
-from tuning.search.forgetting import forgetting, time_constants_on, with_oracle_and_advice
 from tuning.search.measures import measured, over
 from tuning.search.plan import Plan
-from tuning.search.space import Choice, untuned_choice
+from tuning.search.space import Choice, forgetting, time_constants_on, untuned_choice, with_oracle_and_advice
 from tuning.search.study import open_study, run_study
 from tuning.search.validation import as_data as as_data_of_choice
 from tuning.search.validation import choice_from

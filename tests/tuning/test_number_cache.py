@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from tuning.problems import bound
-from tuning.problems.bound import cached_numbers
+from tuning.problems import model_problem
+from tuning.problems.model_problem import cached_numbers
 
 
 class Code:
@@ -20,11 +20,11 @@ class Code:
 @pytest.fixture
 def ask(monkeypatch, tmp_path):
     """Ask for two numbers in a fresh process, so to speak; `ask.computed` counts."""
-    monkeypatch.setattr(bound, "_known", {})
+    monkeypatch.setattr(model_problem, "_known", {})
 
     def ask(follows_from=b"it", value=(0.1, 1e-300), folder=tmp_path / "cache", fresh=True):
         if fresh:
-            bound._known.clear()
+            model_problem._known.clear()
 
         def compute():
             ask.computed += 1

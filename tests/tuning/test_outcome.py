@@ -7,7 +7,7 @@ import sys
 import optuna
 import pytest
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from tuning.cli.main import main
 from tuning.evaluation.baselines import SCALED
 from tuning.evaluation.sizes import SizeRow, sufficient_size

@@ -10,9 +10,8 @@ from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import goal_of, tune_by_gradient
 from tuning.methods.registry import find_method
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE
-from tuning.search.parameters import model_parameters
+from tuning.search.parameters import model_parameters, relation_of
 from tuning.search.plan import Plan
-from tuning.search.relations import relation_of
 from tuning.search.space import parameters_of
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_study

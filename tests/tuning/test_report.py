@@ -9,7 +9,7 @@ import numpy as np
 import optuna
 import pytest
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from tuning.api.report import write_report
 from tuning.cli.main import main
 from tuning.evaluation.evaluate import evaluate, score_ratio

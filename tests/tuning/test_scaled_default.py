@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from tuning.evaluation.baselines import (
     GIVEN,
     NOISE,

@@ -188,9 +188,9 @@ def test_a_model_of_another_q_and_r_is_the_one_that_is_made_of_them(name):
 
 
 def test_a_bound_is_computed_once_for_the_same_inputs(monkeypatch):
-    import tuning.problems.bound as module
+    import tuning.problems.model_problem as module
 
-    monkeypatch.setattr("tuning.problems.bound._known", {})
+    monkeypatch.setattr("tuning.problems.model_problem._known", {})
     monkeypatch.setattr("thruster_env.graphs.loops.Loops.folder", None)  # nothing on the disk
     asked, computed = [], module.posterior_variances
     monkeypatch.setattr(

@@ -16,10 +16,9 @@ from tuning.search import trials
 from tuning.search.among_types import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED
 from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
 from tuning.search.plan import Plan
-from tuning.search.samplers import SAMPLERS, box, make_sampler
 from tuning.search.space import choice_of, distributions, oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.search.trials import BLOCK, best_trial, enqueue_new, measure, violation
+from tuning.search.trials import BLOCK, SAMPLERS, best_trial, box, enqueue_new, make_sampler, measure, violation
 from tuning.thruster.scenario import find_scenario
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))

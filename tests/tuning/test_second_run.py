@@ -46,7 +46,7 @@ problem = ModelProblem(model(2.092), model(2.0), inputs=[[290.0]] * 120, dt=0.02
 COUNTING = """
 import json, sys
 from numba.core import event
-import tuning.problems.bound as bound
+import tuning.problems.model_problem as bound
 
 found = {"compiled": 0, "bounds": 0}
 class Count(event.Listener):

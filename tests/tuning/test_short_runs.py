@@ -8,8 +8,8 @@ from filters import affine_model, bounds, make_filter
 from filters.bounds import posterior_variances
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.evaluate import check_consistency
-from tuning.problems.bound import average_bound
 from tuning.problems.data import Data, mask_of
+from tuning.problems.model_problem import average_bound
 
 
 @pytest.mark.parametrize(("scored", "lags"), [(40, 20), (21, 20), (11, 10), (2, 1), (1, 1)])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from tuning.evaluation import sizes
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, left_out, sufficient_size

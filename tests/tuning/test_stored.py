@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from filters.tuned_file import read_tuned_file
 from tests.tuned_files import rewrite, write_untuned
 from tuning.api import report

@@ -11,7 +11,7 @@ import tuning
 from filters.engine.batch import run
 from filters.estimators.foreign import ForeignFilter
 from filters.learned.estimator import Track, unit_scales
-from filters.learned.file import LEARNED, read
+from filters.learned.filters import LEARNED, read
 from tests.models import plane_model
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.evaluate import values_of

@@ -17,7 +17,7 @@ from filters.tuned_file import made_with
 from tests.tuned_files import of_version, rewrite, write_untuned
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from thruster_env.core.compiled import interpreted
-from thruster_env.effects.signals import Gusts
+from thruster_env.effects.effects import Gusts
 from thruster_env.thruster.parameters import PRESETS, PresetFile, write_preset
 from thruster_env.thruster.plant import differences, make_plant, plant_data
 from tuning.api.tune import name_of

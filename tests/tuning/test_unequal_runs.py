@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from filters import make_filter, run
-from filters.consistency.intervals import RESAMPLES
-from filters.consistency.nees import normalized_squares, whitened
+from filters.consistency.nees import RESAMPLES, normalized_squares, whitened
 from filters.consistency.report import consistency_report
 from tests.linear_problem import LinearProblem
 from thruster_env.model.affine import affine_model

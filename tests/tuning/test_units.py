@@ -4,7 +4,7 @@ from math import nan
 
 import pytest
 
-from filters.consistency.intervals import Interval, span
+from filters.consistency.nees import Interval, span
 from thruster_env.core.text_tables import Table, typeset
 from tuning.reporting.leaderboard import about, limit_cell, unless_blank
 from tuning.reporting.page import Words

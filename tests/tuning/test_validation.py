@@ -10,7 +10,7 @@ from optuna.distributions import FloatDistribution, IntDistribution
 
 import tuning
 from filters import make_filter
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from filters.tuned_file import read_tuned_file
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
@@ -48,9 +48,9 @@ from tuning.search.plan import (
     range_warning,
     range_words,
 )
-from tuning.search.samplers import is_local, near
 from tuning.search.space import Choice, untuned_choice
 from tuning.search.study import StudyResult, answered_by, open_study, run_study
+from tuning.search.trials import is_local, near
 from tuning.search.validation import (
     Failure,
     Met,

@@ -20,8 +20,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from thruster_env.auv.forces import accelerated, forces, forces_tangent
-from thruster_env.auv.parameters import VehicleParameters, derive_constants
+from thruster_env.auv.parameters import VehicleParameters, accelerated, derive_constants, forces, forces_tangent
 from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import runge_kutta
 from thruster_env.core.streams import cosine_and_sine

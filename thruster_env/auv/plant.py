@@ -22,13 +22,20 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.auv.dynamics import required_substeps
-from thruster_env.auv.forces import Constants
-from thruster_env.auv.parameters import PRESETS, VehicleParameters, derive_constants, preset_parameters
+from thruster_env.auv.parameters import PRESETS, Constants, VehicleParameters, derive_constants, preset_parameters
 from thruster_env.core.checks import at_least, between, finite, one_of, positive, short_repr, within
 from thruster_env.core.sources import tuple_of, written_out
-from thruster_env.effects.effects import Effect, Registry, dropping_channels
+from thruster_env.effects.effects import (
+    ConstantSignal,
+    Effect,
+    GaussMarkov,
+    Gusts,
+    RecordedSignal,
+    Registry,
+    Sinusoid,
+    dropping_channels,
+)
 from thruster_env.effects.sensors import SENSOR_EFFECTS, SampleEvery, hold_missing
-from thruster_env.effects.signals import ConstantSignal, GaussMarkov, Gusts, RecordedSignal, Sinusoid
 from thruster_env.env.copies import Channel
 from thruster_env.env.plant_data import (
     Entries,

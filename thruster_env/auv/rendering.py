@@ -41,7 +41,7 @@ from thruster_env.render.renderer import PlantRenderer
 # The contents of a picture: moments, and a filter's estimates of them.
 
 
-class Moment(NamedTuple):
+class ChartEntry(NamedTuple):
     """The truth at the end of a step, one entry of the strip charts."""
 
     time: float  # since the start of the episode [s]
@@ -89,7 +89,7 @@ class Renderer(PlantRenderer):
     """
 
     caption = "Underwater vehicle"
-    moment, overlay = Moment, Overlay
+    moment, overlay = ChartEntry, Overlay
     positive = ("max_thrust",)
 
     def _make_pictures(self) -> None:
@@ -105,7 +105,7 @@ class Renderer(PlantRenderer):
 
     def _draw(self, columns: dict[str, np.ndarray], count: int, label: str) -> None:
         path = self.arguments["path"]
-        moment = Moment(*(float(columns[name][-1]) for name in Moment._fields))
+        moment = ChartEntry(*(float(columns[name][-1]) for name in ChartEntry._fields))
         offset = moment.reference_depth - float(path[0, 2]) if len(path) == 2 else 0.0
         self._view.draw(columns, moment, offset)
         self._dials.draw(columns, moment)
@@ -153,7 +153,7 @@ class View:
         self._canvas, self._path = canvas, path
         canvas.box(0, 0, WIDTH, HEIGHT, WATER)
 
-    def draw(self, columns: dict[str, np.ndarray], moment: Moment, offset: float) -> None:
+    def draw(self, columns: dict[str, np.ndarray], moment: ChartEntry, offset: float) -> None:
         """Draw the newest moment; the path to follow is `offset` [m] deeper than its points."""
         trail = _points(columns, "")
         visited = trail[np.isfinite(trail).all(axis=1)]
@@ -221,7 +221,7 @@ class View:
         radii = np.maximum(SIGMAS * self._scale * np.sqrt(np.maximum(variances, 0.0)), 3.0)
         self._canvas.polygon(self._at(mean) + (axes @ (radii[:, None] * circle)).T, BAND)
 
-    def _draw_vehicle(self, position: np.ndarray, moment: Moment) -> None:
+    def _draw_vehicle(self, position: np.ndarray, moment: ChartEntry) -> None:
         axes = attitude(moment.phi, moment.theta, moment.psi)
         if not np.isfinite(axes).all():
             return
@@ -241,7 +241,7 @@ class View:
         canvas.polygon(outline, HULL)
         canvas.lines(np.concatenate([outline, outline[:1]]), FIN, 1.0)
 
-    def _write(self, moment: Moment) -> None:
+    def _write(self, moment: ChartEntry) -> None:
         write = self._canvas.text
         write(f"{number(moment.time, 2)} s", (12, 14), 13, INK)
         where = ", ".join(number(value, 1) for value in (moment.x, moment.y, moment.depth))
@@ -310,7 +310,7 @@ class Dials:
         for y in self._middles[:2]:
             canvas.box(DIAL - RADIUS, y - 0.4, 2 * RADIUS, 0.8, FAINT)
 
-    def draw(self, columns: dict[str, np.ndarray], moment: Moment) -> None:
+    def draw(self, columns: dict[str, np.ndarray], moment: ChartEntry) -> None:
         """Draw the newest attitude."""
         pitch, roll, yaw = self._middles
         # Directions of the nose in the picture: from port it points left, so that pitching up turns it clockwise.
@@ -376,7 +376,7 @@ class Gauges:
         }
         draw_gauge_frames(canvas, self._axes, TOP, GAUGE_HEIGHT)
 
-    def draw(self, moment: Moment) -> None:
+    def draw(self, moment: ChartEntry) -> None:
         """Draw thrust and planes at a moment."""
         values = {THRUST: moment.thrust, STERN: math.degrees(moment.stern), RUDDER: math.degrees(moment.rudder)}
         for (x, axis), title in zip(self._axes.items(), ("thrust", "stern", "rudder"), strict=True):

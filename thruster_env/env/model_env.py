@@ -15,13 +15,24 @@ from thruster_env.core.checks import one_of, positive, short_repr
 from thruster_env.core.compiled import function_fingerprint
 from thruster_env.core.sources import is_array, tuple_of, written_out
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS
-from thruster_env.effects.effects import SPACING, Context, Effect, Moment, Registry, chain_of, chain_runner
+from thruster_env.effects.effects import (
+    SPACING,
+    ConstantSignal,
+    Context,
+    Effect,
+    GaussMarkov,
+    Gusts,
+    Moment,
+    RecordedSignal,
+    Registry,
+    Sinusoid,
+    chain_of,
+    chain_runner,
+)
 from thruster_env.effects.effects import dropping_channels as losing
 from thruster_env.effects.sensors import SENSOR_EFFECTS, Reading
-from thruster_env.effects.signals import ConstantSignal, GaussMarkov, Gusts, RecordedSignal, Sinusoid
-from thruster_env.env.copies import clipped, correlated, root_of
+from thruster_env.env.copies import Page, clipped, correlated, root_of
 from thruster_env.env.env import PlantEnv, PlantVectorEnv
-from thruster_env.env.page import Page
 from thruster_env.graphs.values import traceable
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import Functions, Shape, constants_are_array

@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy import ndarray
 
-from thruster_env.core.checks import covariance, one_of, positive, short_repr, vector, within
+from thruster_env.core.checks import as_floats, covariance, one_of, positive, short_repr, vector, within
 from thruster_env.effects.effects import Registry
+from thruster_env.model.quantities import Quantity
 
 LARGEST_WEIGHT = 1e9
 LARGEST_STATE = 1e50  # in SI units: beyond it floating point may overflow; its square of a variance
@@ -189,3 +191,76 @@ def _alike(first, other) -> bool:
     if isinstance(first, int | float) and isinstance(other, int | float):
         return math.isclose(first, other, rel_tol=1e-9)
     return first == other
+
+
+# Actions of an env as the commands of a plant, checked before the step.
+
+
+def one_number(action, quantity: Quantity) -> float:
+    """The command of a plant with one input; ValueError unless an action is one number and not NaN."""
+    if type(action) is ndarray and action.size == 1:  # the frequent case has to be quick
+        number = action.item()
+        if type(number) is float and number == number:
+            return number
+    try:
+        item = action.item if hasattr(action, "item") else np.asarray(action).item
+        entry = item()
+        number = math.nan if isinstance(entry, (str, bytes)) else float(entry)
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a torch tensor of several numbers
+        number = math.nan
+    if number != number:
+        raise ValueError(f"an action must be one {quantity.label} and not NaN, but got {short_repr(action)}")
+    return number
+
+
+def some_numbers(action, quantities: tuple[Quantity, ...]) -> np.ndarray:
+    """The commands (p,) of a plant with p inputs; ValueError unless an action is p numbers, none of them NaN."""
+    try:
+        numbers = as_floats(action)
+    except ValueError:
+        numbers = np.empty(0)
+    if numbers.shape != (len(quantities),) or np.isnan(numbers).any():
+        rule = f"{len(quantities)} numbers and not NaN ({_labels(quantities)})"
+        raise ValueError(f"an action must be {rule}, but got {short_repr(action)}")
+    return numbers
+
+
+def of_copies(actions, copies: int, quantities: tuple[Quantity, ...], ignored: np.ndarray | None) -> np.ndarray:
+    """Commands (copies, p) of many copies, or (copies,) if p is 1.
+
+    Args:
+        actions: (copies, p), or (copies,) if p is 1.
+        copies: their number.
+        quantities: the p inputs.
+        ignored: copies (copies,) whose actions are not used, and may be NaN; None if there are none.
+
+    Raises:
+        ValueError: for another shape, and for NaN.
+    """
+    p = len(quantities)
+    try:
+        commands = as_floats(actions)
+    except ValueError:
+        commands = np.empty(0)
+    if commands.shape != (copies, p) and (p > 1 or commands.shape != (copies,)):
+        raise ValueError(f"actions must be {copies} {_rows(quantities)}, but got {short_repr(actions)}")
+    wrong = np.isnan(commands)
+    if wrong.any():
+        lost = wrong.reshape(copies, -1).any(axis=1)
+        lost_copies = np.flatnonzero(lost if ignored is None else lost & ~ignored)
+        if len(lost_copies):
+            raise ValueError(
+                f"actions must be {_rows(quantities)} and not NaN, but got NaN in copy {lost_copies[0]}"
+            )
+    return commands.reshape(-1) if p == 1 else commands
+
+
+def _rows(quantities: tuple[Quantity, ...]) -> str:
+    """The words for one row of actions in messages."""
+    if len(quantities) == 1:
+        return f"{quantities[0].name}s [{quantities[0].unit}]"
+    return f"rows of {len(quantities)} numbers ({_labels(quantities)})"
+
+
+def _labels(quantities: tuple[Quantity, ...]) -> str:
+    return ", ".join(quantity.label for quantity in quantities)

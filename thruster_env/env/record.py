@@ -15,9 +15,9 @@ import numpy as np
 from thruster_env.core.checks import as_floats, short_repr
 from thruster_env.core.checks import seed as checked_seed
 from thruster_env.core.modules import error_line, object_named
-from thruster_env.env.commands import some_numbers
 from thruster_env.env.copies import PlantCopies
 from thruster_env.env.model_env import with_noise
+from thruster_env.env.plant_data import some_numbers
 from thruster_env.logs.log import Log, seen_by
 from thruster_env.logs.read import read_log
 from thruster_env.model.continuous import ContinuousModel, continuous_of, in_discrete_time

@@ -24,8 +24,7 @@ from thruster_env.core.modules import to_install
 from thruster_env.logs.findings import Remark
 from thruster_env.logs.grid import MISSING as MISSING_TEXT
 from thruster_env.logs.grid import seconds_of, since_first
-from thruster_env.logs.recorders.process import opened
-from thruster_env.logs.recorders.topics import Refused, check_bytes
+from thruster_env.logs.recorders.topics import Refused, check_bytes, opened
 
 # What stands for a missing number, in any case of letters.
 MISSING = ("", "nan", "na", "n/a", "null", "none", "<na>", "nat")

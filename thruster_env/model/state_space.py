@@ -23,7 +23,6 @@ from thruster_env.core.modules import error_line
 from thruster_env.core.sources import as_value, is_array
 from thruster_env.core.user_functions import as_function, as_made
 from thruster_env.graphs.python_floats import with_floats
-from thruster_env.model.called import called_function
 from thruster_env.model.quantities import (
     Positions,
     Quantities,
@@ -34,6 +33,7 @@ from thruster_env.model.quantities import (
     scales_of,
 )
 from thruster_env.model.shape import Functions, Shape, constants_are_array, constants_form
+from thruster_env.model.traced import called_function
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,7 +52,7 @@ class StateSpaceModel:
     The functions are `transition(x, u, c)`, `observe(x, c)` or `observe(x, u, c)` and, if known, their Jacobians,
     which take the same. They take and return tuples of components, Jacobians as tuples of rows (n rows of n, m
     rows of n), and may use the parameters of the model, `constants` c. They are plain Python: loops, arrays,
-    dataclasses and a few branches become machine code wherever the model is used (`thruster_env.model.called`).
+    dataclasses and a few branches become machine code wherever the model is used (`thruster_env.model.traced`).
     What cannot runs as Python, and a warning says why.
 
     Above 36 states or inputs, or 96 constants in a plain tuple, x, u or c is an array of float64 and not a tuple;

@@ -15,15 +15,20 @@ import numpy as np
 
 from thruster_env.core.checks import finite, one_of, positive, short_repr, vector
 from thruster_env.core.streams import PARAMETERS, REFERENCE_SIGNAL
-from thruster_env.effects.effects import LONGEST, Context, Effect, Registry, not_negative, set_field
-from thruster_env.effects.signals import (
+from thruster_env.effects.effects import (
+    LONGEST,
     ConstantSignal,
+    Context,
+    Effect,
     GaussMarkov,
     Gusts,
     RecordedSeries,
     RecordedSignal,
+    Registry,
     Sinusoid,
+    not_negative,
     recorded_value,
+    set_field,
 )
 from thruster_env.graphs.draws import Draws
 from thruster_env.graphs.graphs import where

@@ -33,7 +33,6 @@ from thruster_env.model.continuous import ContinuousModel, noise_for_dt, same_dt
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.analysis import LinearModel, steady_state
-from thruster_env.thruster.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.thruster.dynamics import (
     Constants,
     rates,
@@ -45,7 +44,9 @@ from thruster_env.thruster.dynamics import (
 from thruster_env.thruster.effects import outside
 from thruster_env.thruster.parameters import (
     BY_CHANNEL,
+    CHANNELS,
     INPUTS,
+    MAX_CHANNELS,
     STATES,
     THRUST,
     ThrusterParameters,

@@ -16,16 +16,30 @@ from thruster_env.core.checks import (
     short_repr,
     within,
 )
+from thruster_env.core.compiled import inlined
 from thruster_env.effects.effects import Effect, dropping_channels
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 from thruster_env.env import plant_data as data_of_plants
-from thruster_env.env.plant_data import Entries, checked_noise, data_of, initial_distribution, sensor_effects
-from thruster_env.thruster.analysis import LinearModel, required_substeps_of_all, steady_state
-from thruster_env.thruster.channels import CHANNELS, MAX_CHANNELS
+from thruster_env.env.plant_data import (
+    Entries,
+    checked_noise,
+    checked_weights,
+    data_of,
+    initial_distribution,
+    sensor_effects,
+)
+from thruster_env.thruster.analysis import (
+    LinearModel,
+    equilibrium,
+    required_substeps_of_all,
+    state_range,
+    steady_state,
+)
 from thruster_env.thruster.dynamics import Constants
 from thruster_env.thruster.effects import (
     AMPLIFIER_EFFECTS,
     FLOW_SIGNALS,
+    REFERENCE_SIGNALS,
     LogNormal,
     Uniform,
     dead_band_of,
@@ -33,7 +47,9 @@ from thruster_env.thruster.effects import (
     make_uncertainty,
 )
 from thruster_env.thruster.parameters import (
+    CHANNELS,
     LARGEST_VOLTAGE,
+    MAX_CHANNELS,
     PRESETS,
     ThrusterParameters,
     derive_constants,
@@ -121,10 +137,10 @@ def make_plant(
         ambient_velocity: flow U_0 along the thruster's axis [m/s].
         process_noise_cov: Q, covariance (2, 2) or two variances per step [(rad/s)^2, (m/s)^2]; zero allowed.
         measurement_noise_cov: R, covariance (m, m) or m variances, in the channels' units squared; zero allowed.
-            None for the defaults of `channels.CHANNELS`.
+            None for the defaults of `parameters.CHANNELS`.
         initial_state: None for N(0, diag(1, 0.01)), a fixed state [omega_m, U_a], or a mapping:
             {"voltage": V} for the steady state of V volts, {"mean": [..], "cov": [..]} for a distribution.
-        sensors: None for the thrust alone, a list of channels of `channels.CHANNELS`, or a mapping from
+        sensors: None for the thrust alone, a list of channels of `parameters.CHANNELS`, or a mapping from
             channels to lists of effects, {"thrust": [{"name": "dropout", "probability": 0.1}]}.
         flow: signals of `effects.FLOW_SIGNALS` that add to ambient_velocity.
         amplifier: effects of `effects.AMPLIFIER_EFFECTS` between the commanded voltage and the motor.
@@ -225,3 +241,74 @@ def check_same_plant(tuned_for: Mapping, plant: Plant, file: str | Path) -> list
 def differences(then: Mapping, now: Mapping) -> tuple[list[str], list[str]]:
     """What two plants' data differ in: what makes them other plants, and what does not; ValueError for others."""
     return data_of_plants.differences(ENTRIES, then, now)
+
+
+# The task of an env: a reference thrust, and the weights of the reward's terms.
+
+
+DEFAULT_WEIGHTS = (1.0, 0.0, 0.01)  # tracking, energy, voltage rate
+ABSURD = 100.0  # a state this many times its range away from rest ends the episode
+
+
+class Task(NamedTuple):
+    """A reference, and a reward from the true thrust T after the step, independent of the sensors.
+
+    -(tracking ((T - r)/T_max)^2 + energy (V_s/V_max)^2 + voltage_rate (change of V_s/V_max)^2), see `step_cost`
+    """
+
+    reference: tuple[Effect, ...] = ()
+    weights: tuple[float, ...] = DEFAULT_WEIGHTS
+
+
+@inlined
+def step_cost(error, voltage, change, tracking, energy, rate):
+    """Cost of a step, minus its reward: of a thrust error [T_max], a voltage and its change [V_max]."""
+    return tracking * error * error + energy * voltage * voltage + rate * change * change
+
+
+def make_task(
+    reference=None,
+    tracking_weight: float = DEFAULT_WEIGHTS[0],
+    energy_weight: float = DEFAULT_WEIGHTS[1],
+    voltage_rate_weight: float = DEFAULT_WEIGHTS[2],
+) -> Task:
+    """Make a task from plain arguments, the same ones that the env takes.
+
+    Args:
+        reference: signals of `effects.REFERENCE_SIGNALS`, which are added; none if None. (Each env has its own
+            default; `BowThruster-v0` takes a thrust [N].)
+        tracking_weight: of the squared thrust error over T_max.
+        energy_weight: of the squared voltage over max_voltage.
+        voltage_rate_weight: of the squared change of voltage over max_voltage.
+
+    Raises:
+        ValueError: if an argument is wrong; the message states the rule and the value.
+    """
+    weights = checked_weights(tracking=tracking_weight, energy=energy_weight, voltage_rate=voltage_rate_weight)
+    return Task(REFERENCE_SIGNALS.make(reference), weights)
+
+
+def thrust_scale(plant: Plant) -> float:
+    """Steady thrust at max_voltage, T_max [N]."""
+    if plant.linear is None:
+        return steady_state(plant.parameters, plant.max_voltage).thrust
+    return float(abs(equilibrium(plant.linear, (plant.max_voltage, 0.0))[2]))
+
+
+def half_thrust(plant: Plant) -> float:
+    """Steady thrust at half of max_voltage [N]: the reference where no other one is given."""
+    if plant.linear is None:
+        return steady_state(plant.parameters, plant.max_voltage / 2).thrust
+    return float(equilibrium(plant.linear, (plant.max_voltage / 2, 0.0))[2])
+
+
+def state_limits(plant: Plant) -> np.ndarray:
+    """Magnitudes (2,) of omega_m [rad/s] and U_a [m/s] at which an episode ends."""
+    if plant.linear is not None:
+        speed, flow, _ = equilibrium(plant.linear, (plant.max_voltage, plant.ambient_velocity))
+        # The open-bladed system hardly answers to the voltage: its noise is larger than its range.
+        spread = np.sqrt(np.diag(plant.initial_cov)) + np.sqrt(np.diag(plant.process_noise_cov))
+        return ABSURD * (2 * np.abs([speed, flow]) + np.abs(plant.initial_mean) + spread)
+    flow = abs(plant.ambient_velocity)
+    turned_by_flow = np.array([flow / plant.constants.blade_speed, flow])
+    return ABSURD * (state_range(plant.parameters, plant.max_voltage) + turned_by_flow)

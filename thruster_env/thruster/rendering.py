@@ -46,7 +46,7 @@ from thruster_env.render.renderer import PlantRenderer
 # Contents of a picture: the truth at each step, and the estimate of a filter.
 
 
-class Moment(NamedTuple):
+class ChartEntry(NamedTuple):
     """The truth at the end of a step, one entry of the strip charts."""
 
     time: float  # since the start of the episode [s]
@@ -81,7 +81,7 @@ class Renderer(PlantRenderer):
     """
 
     caption = "Bow thruster"
-    moment, overlay = Moment, Overlay
+    moment, overlay = ChartEntry, Overlay
     positive = "gear_ratio", "diameter", "max_voltage", "thrust_scale", "speed_scale", "flow_scale"
     remembered = "_angle", "_angle_of_frame", "_angle_of_last_frame", "_count_of_frame", "_omega_m"
 
@@ -109,7 +109,7 @@ class Renderer(PlantRenderer):
         self._count_of_frame = 0
         self._omega_m = 0.0
 
-    def add(self, moment: Moment, overlay: Overlay | None = None) -> None:
+    def add(self, moment: ChartEntry, overlay: Overlay | None = None) -> None:
         """Note a moment, dt after the one before; the first of an episode is that of the reset.
 
         Where the truth is not known, NaN, the propeller turns and the water flows as the filter believes.
@@ -128,7 +128,7 @@ class Renderer(PlantRenderer):
         if count > self._count_of_frame:
             self._count_of_frame = count
             self._angle_of_last_frame, self._angle_of_frame = self._angle_of_frame, self._angle
-        moment = Moment(*(float(columns[name][-1]) for name in Moment._fields))
+        moment = ChartEntry(*(float(columns[name][-1]) for name in ChartEntry._fields))
         believed = {name: newest(columns, f"estimated_{name}") for name in ("omega_m", "U_a", "thrust")}
         moment = moment._replace(**{name: b for name, b in believed.items() if math.isnan(getattr(moment, name))})
         self._scene.draw(moment, self._angle_of_last_frame, self._angle_of_frame)
@@ -167,7 +167,7 @@ class Scene:
         self._gear_ratio = gear_ratio
         self._thrust_scale = thrust_scale
         self._flow_scale = flow_scale
-        from thruster_env.thruster.propeller import end_view, side_view
+        from thruster_env.thruster.dynamics import end_view, side_view
 
         self._side = side_view(PROPELLER_RADIUS)
         self._end = end_view(PORTHOLE_RADIUS - 4)
@@ -176,7 +176,7 @@ class Scene:
         self._draw_machinery()
         self._draw_porthole()
 
-    def draw(self, moment: Moment, start: float, end: float) -> None:
+    def draw(self, moment: ChartEntry, start: float, end: float) -> None:
         """Draw what moves at a moment, the propeller blurred from one angle [rad] to another."""
         part = _limited(moment.U_a / self._flow_scale)
         ambient = _limited(moment.ambient_velocity / self._flow_scale)
@@ -194,7 +194,7 @@ class Scene:
         self._canvas.picture(self._end.mean(start, end), PORTHOLE)
         self._write(moment)
 
-    def _write(self, moment: Moment) -> None:
+    def _write(self, moment: ChartEntry) -> None:
         write, (x, y) = self._canvas.text, PORTHOLE
         write("propeller from port", (x, 15), 11, SOFT_INK, 0.5)
         write(number(moment.omega_m / self._gear_ratio * 30 / math.pi, 0) + " rpm", (x, y + 74), 15, INK, 0.5)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from filters.consistency.intervals import Interval, slightly
-from filters.estimators.find import label_of
+from filters.consistency.nees import Interval, slightly
+from filters.estimators.foreign import label_of
 from filters.filter import Filter
 from filters.logs.findings import colour_of
 from filters.registry import FILTERS, filter_type

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.console import Console
 
-from filters.consistency.intervals import Interval, rmse_ratios
-from filters.consistency.nees import SquaresCheck
+from filters.consistency.nees import Interval, SquaresCheck, rmse_ratios
 from filters.consistency.report import MOST_STATES, ConsistencyReport, comparison_sentence, sentences
-from filters.estimators.find import label_of
+from filters.estimators.foreign import label_of
 from filters.filter import Filter
 from thruster_env.core.checks import at_least
 from thruster_env.core.text_tables import Table

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from filters.estimators.find import is_foreign, is_trained
+from filters.estimators.foreign import is_foreign, is_trained
 from filters.registry import FILTERS, filter_type
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import short_repr

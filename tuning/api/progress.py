@@ -20,7 +20,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from filters.estimators.find import label_of
+from filters.estimators.foreign import label_of
 from thruster_env.core.checks import listening, short_repr
 
 if TYPE_CHECKING:

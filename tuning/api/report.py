@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple
 import optuna
 from optuna.study import StudyDirection
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from filters.consistency.report import rounded
 from filters.registry import filter_type
 from thruster_env.core.checks import short_repr

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
 
-    from filters.consistency.intervals import Interval
+    from filters.consistency.nees import Interval
 
 PAGE = ".html"  # the end of a page's name
 
@@ -160,7 +160,7 @@ def _png(figure: Figure) -> bytes:
 
 def about(value: Interval, digits: int = 3) -> str:
     """A value with its 95 % interval in brackets; a dash where there is none."""
-    from filters.consistency.intervals import span
+    from filters.consistency.nees import span
 
     return span(value, digits) if isfinite(value.value) else "-"
 

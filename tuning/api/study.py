@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from optuna.trial import FrozenTrial, TrialState
 
-from filters.estimators.find import label_of
+from filters.estimators.foreign import label_of
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor
 from filters.registry import filter_type

@@ -13,9 +13,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from filters.consistency.intervals import Interval
-from filters.estimators.find import TRAINED
-from filters.estimators.foreign import ForeignFilter
+from filters.consistency.nees import Interval
+from filters.estimators.foreign import TRAINED, ForeignFilter
 from filters.filter import Filter
 from filters.learned import check_installed
 from filters.logs.findings import colour_of
@@ -275,7 +274,7 @@ def train_estimator(
         ValueError: states the rule and the value.
     """
     check_installed()
-    from filters.learned.file import LEARNED  # torch takes seconds to import
+    from filters.learned.filters import LEARNED  # torch takes seconds to import
     from tuning.learning.training import Settings, new_estimator, standings, starting_filter
 
     one_of("an estimator", kind, tuple(LEARNED))
@@ -327,7 +326,7 @@ def _trained(
     console: Console,
 ) -> list[Check]:
     """The checks of a training, of which the best one is always on disk."""
-    from filters.learned.file import write_estimator
+    from filters.learned.filters import write_estimator
     from tuning.learning.training import train
 
     validation = data_of(problem, problem.validation_seeds(seed, VALIDATION_SEEDS))

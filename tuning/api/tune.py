@@ -19,7 +19,7 @@ import optuna
 from optuna.trial import FrozenTrial
 from rich.console import Console
 
-from filters.estimators.find import label_of
+from filters.estimators.foreign import label_of
 from filters.registry import filter_type
 from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.files import check_target

@@ -23,7 +23,7 @@ from thruster_env.logs.log import Log
 from thruster_env.render.renderer import OnStep, Played, check_drawing, steps_a_frame, write_video
 from thruster_env.thruster.controllers import PIController
 from thruster_env.thruster.env import renderer_of
-from thruster_env.thruster.rendering import Moment, Overlay
+from thruster_env.thruster.rendering import ChartEntry, Overlay
 from tuning.api.markers import (
     FILTER,
     INPUT,
@@ -39,7 +39,8 @@ from tuning.api.markers import (
 from tuning.api.result import Printed
 from tuning.cli.output import check_targets, progress_console, warn_beyond
 from tuning.problems.data import held_out_seeds
-from tuning.problems.excitation import EXCITATIONS, excitation_of
+from tuning.problems.excitation import EXCITATIONS
+from tuning.problems.scenario import excitation_of
 from tuning.thruster.scenario import voltages_of
 
 STEPS = 500
@@ -354,7 +355,7 @@ def play_log(
     return Played(log.steps, 0.0, log.steps * log.dt)
 
 
-def moments(log: Log) -> Iterator[Moment]:
+def moments(log: Log) -> Iterator[ChartEntry]:
     """The recorded values, row by row; NaN where there are none."""
     columns: Mapping[str, np.ndarray] = {
         **{quantity.symbol: log.measurements[:, i] for i, quantity in enumerate(log.measured)},
@@ -365,7 +366,7 @@ def moments(log: Log) -> Iterator[Moment]:
     measured = columns.get("thrust", nowhere)
     voltages = np.append(log.inputs[:, 0], log.inputs[-1, 0])
     for k in range(log.steps + 1):
-        yield Moment(k * log.dt, omega[k], flow[k], thrust[k], measured[k], None, voltages[k])
+        yield ChartEntry(k * log.dt, omega[k], flow[k], thrust[k], measured[k], None, voltages[k])
 
 
 def overlays(estimates: LogEstimate) -> Iterator[Overlay]:

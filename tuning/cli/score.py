@@ -10,17 +10,15 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 from rich.console import RenderableType
 from rich.text import Text
 
-from filters.consistency.intervals import mean_interval
+from filters.consistency.nees import mean_interval
 from thruster_env.core.checks import one_of
 from thruster_env.core.text_tables import Table
 from tuning.api.markers import INPUT, RUNS, Argument, Option, PresetOption, Seed
 from tuning.api.result import Printed
 from tuning.cli.output import progress_console
 from tuning.cli.train import LEARNABLE
-from tuning.policies.algorithms import check_installed
-from tuning.policies.observations import find_observation_set
-from tuning.policies.plants import plant_of
-from tuning.policies.setup import TrainingConfiguration, in_scenario
+from tuning.policies.algorithms import check_installed, find_observation_set
+from tuning.policies.setup import TrainingConfiguration, in_scenario, plant_of
 from tuning.problems.data import held_out_seeds
 from tuning.problems.scenario import PlantScenario
 from tuning.reporting.leaderboard import about, unless_blank

@@ -20,10 +20,8 @@ from tuning.api.result import Printed
 from tuning.api.study import INTERRUPTED
 from tuning.api.tune import file_name
 from tuning.cli.output import progress_console
-from tuning.policies.algorithms import ALGORITHMS, check_installed
-from tuning.policies.observations import OBSERVATION_SETS
-from tuning.policies.plants import PLANTS, TASKS, plant_of
-from tuning.policies.setup import TrainingConfiguration, make_configuration
+from tuning.policies.algorithms import ALGORITHMS, OBSERVATION_SETS, check_installed
+from tuning.policies.setup import PLANTS, TASKS, TrainingConfiguration, make_configuration, plant_of
 from tuning.problems.scenario import plain
 from tuning.thruster.logs import of_preset
 

@@ -64,7 +64,7 @@ def names_in(choices: str) -> tuple[Sequence[str], str]:
 
         return [*PRESETS], f"{', '.join(PRESETS)}, or a FILE.toml of `thruster new preset` or `thruster identify`."
     if choices == "sensors":
-        from thruster_env.thruster.channels import CHANNELS
+        from thruster_env.thruster.parameters import CHANNELS
 
         return [*CHANNELS], f"{', '.join(CHANNELS)}."
     if choices == "objectives":

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.consistency.intervals import Interval, mean_interval
+from filters.consistency.nees import Interval, mean_interval
 from filters.registry import filter_type
 from thruster_env.core.angles import is_angle
 from thruster_env.model.state_space import StateSpaceModel

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.augmented import Unknown, augmented_model
-from filters.consistency.intervals import Interval, rmse_ratios, slightly
+from filters.consistency.nees import Interval, rmse_ratios, slightly
 from filters.engine.batch import run
-from filters.estimators.find import label_of
+from filters.estimators.foreign import label_of
 from filters.filter import Filter
 from filters.particles.kernels import WeightedFilter
 from filters.registry import FILTERS, filter_type, make_filter
@@ -46,12 +46,11 @@ from tuning.problems.assumed import beliefs_of
 from tuning.problems.check import data_of
 from tuning.problems.data import Data, estimates_in_parts
 from tuning.problems.problem import Problem
-from tuning.search.forgetting import time_constants_on
 from tuning.search.measures import measured
 from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.parameters import ensemble_sizes_of
 from tuning.search.plan import Plan
-from tuning.search.space import Choice, has_search_space
+from tuning.search.space import Choice, has_search_space, time_constants_on
 from tuning.search.storage import quiet_optuna
 from tuning.search.study import open_study, run_trials, stop_on_interrupt
 from tuning.search.trials import best_trial

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from filters.consistency.intervals import (
+from filters.consistency.nees import (
     Interval,
+    blow_up_sentence,
     interval,
     mean_interval,
     pooled_mean,
@@ -20,7 +21,6 @@ from filters.consistency.intervals import (
     rmse_intervals,
     without_interval,
 )
-from filters.consistency.nees import blow_up_sentence
 from filters.consistency.report import ConsistencyReport, findings, joined, report_of
 from filters.consistency.time_constants import TimeConstants
 from filters.engine.batch import Estimates

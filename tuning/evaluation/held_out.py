@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from filters.consistency.time_constants import TimeConstants
 from filters.starts import Restarts
 from thruster_env.core.checks import with_progress
@@ -50,10 +50,9 @@ from tuning.evaluation.residuals import UnevenNis, uneven_nis
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
-from tuning.search.forgetting import time_constants_on, with_oracle_and_advice
 from tuning.search.parameters import size_ladder
 from tuning.search.plan import HELD_OUT_SEEDS, SIZE_SEEDS, TRAINING_SEEDS, Plan
-from tuning.search.space import Choice
+from tuning.search.space import Choice, time_constants_on, with_oracle_and_advice
 
 PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
 ROLES = ("untuned", "tuned", "true", "scaled", "given", "noise")  # evaluations of a `Comparison`

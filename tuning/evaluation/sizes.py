@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.bounds import ALL_UP_TO
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from thruster_env.core.checks import with_progress
 from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, score_ratio, values_of
 from tuning.problems.data import Data, estimates_in_parts

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filters.estimators.find import is_foreign, label_of
+from filters.estimators.foreign import is_foreign, label_of
 from filters.monitoring.monitor import monitor_data, monitor_for
 from filters.tuned_file import (
     AUGMENTED,

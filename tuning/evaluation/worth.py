@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import inf, isfinite, isnan
 
-from filters.consistency.intervals import Interval, slightly, span
+from filters.consistency.nees import Interval, slightly, span
 from filters.consistency.report import rounded
 from filters.consistency.time_constants import TimeConstants
 from tuning.evaluation.baselines import GIVEN, NO_RANGES, NOISE, ORACLE, RULE, SCALED, called
@@ -13,7 +13,7 @@ from tuning.evaluation.evaluate import Evaluation, farthest, is_beyond
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.residuals import uneven_sentence
 from tuning.problems.problem import Problem
-from tuning.search.forgetting import TOLERANCE
+from tuning.search.space import TOLERANCE
 
 ALIKE = 1.5  # ratio to the oracle's time constant up to which a filter is as slow as the oracle
 LARGEST_RATIO = 10.0  # of scores, up or down, that sentences give in percent

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import numpy as np
 
 from filters import StateSpaceModel, make_filter
-from filters.consistency.intervals import Interval, mean_interval
+from filters.consistency.nees import Interval, mean_interval
 from filters.engine.batch import run
 from filters.filter import Filter
 from thruster_env.core.checks import at_least, one_of

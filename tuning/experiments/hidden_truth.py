@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.logs.log import Log
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio

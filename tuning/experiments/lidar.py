@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters import affine_model
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from thruster_env.core.text_tables import markdown_table
 from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.evaluate import Evaluation, evaluate, mse

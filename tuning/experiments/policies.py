@@ -24,15 +24,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import t as student
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from thruster_env.core.files import write_whole
 from thruster_env.core.modules import safe_paths
 from thruster_env.core.threads import cores, one_thread
 from tuning.policies.environments import make_environments
 from tuning.policies.learn import train
-from tuning.policies.plants import Part
 from tuning.policies.saved import FINAL, Policy, Scores, classical_policy, load, score
-from tuning.policies.setup import TrainingConfiguration, make_configuration
+from tuning.policies.setup import Part, TrainingConfiguration, make_configuration
 from tuning.problems.data import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.storage import quiet_optuna

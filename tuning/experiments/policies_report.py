@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from filters.logs.findings import colour_of
 from thruster_env.core.files import DARK, check_target, new_figure, save_figure, tidy, write_whole
 from thruster_env.core.text_tables import Table, markdown_table, with_tables

@@ -23,7 +23,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from filters import StateSpaceModel, make_filter
-from filters.consistency.intervals import rmse_intervals
+from filters.consistency.nees import rmse_intervals
 from filters.engine.batch import run
 from thruster_env.model.quantities import Quantity
 from tuning.experiments.benchmark import Benchmark, OnRow, Row, run_in_memory

@@ -20,7 +20,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 import tuning
-from filters.consistency.intervals import Interval, pooled_mean, slightly
+from filters.consistency.nees import Interval, pooled_mean, slightly
 from thruster_env.core.files import check_target, write_whole
 from thruster_env.core.text_tables import Table, markdown_table
 from tuning.api.markers import INPUT, OUTPUT, RUNS, Option

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from filters.engine.batch import run
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.learned import read_estimator
 from filters.learned.estimator import Equations, LearnedEstimator, Scales, Track
-from filters.learned.file import LEARNED
+from filters.learned.filters import LEARNED
 from filters.tensors.stages import density, factor
 from thruster_env.core.angles import wrapped_where
 from thruster_env.core.threads import one_thread

@@ -9,8 +9,8 @@ import numpy as np
 
 from filters.differentiated.recursion import LIKELIHOOD, Wanted
 from filters.differentiated.runs import KINDS, ModelSlopes, Truth, derivatives, has_derivatives
-from filters.estimators.find import is_foreign
-from filters.pages.page_filter import PageFilter
+from filters.estimators.foreign import is_foreign
+from filters.filter import PageFilter
 from filters.registry import filter_type, make_filter
 from thruster_env.core.checks import one_of
 from thruster_env.model.state_space import StateSpaceModel
@@ -24,9 +24,12 @@ from tuning.search.parameters import (
     ProcessVariance,
     Q,
     R,
+    correlation_slopes,
+    correlations_of,
+    full_covariance,
     model_parameters,
+    obeying,
 )
-from tuning.search.relations import correlation_slopes, correlations_of, full_covariance, obeying
 from tuning.search.space import Choice
 
 LEAST_NUMBERS = 8  # number of parameters from which the information is faster than differences

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.consistency.intervals import pooled_mean
+from filters.consistency.nees import pooled_mean
 from filters.differentiated import recursion
 from filters.differentiated.runs import ModelSlopes, Truth
 from thruster_env.core.checks import one_of

@@ -23,9 +23,9 @@ from tuning.methods.task import Task
 from tuning.problems.data import estimates_in_parts
 from tuning.problems.problem import Coordinates
 from tuning.search.parameters import FILTER_PARAMETERS
-from tuning.search.samplers import make_sampler
 from tuning.search.space import Choice
 from tuning.search.storage import quiet_optuna
+from tuning.search.trials import make_sampler
 
 HIDDEN_PART = 0.5  # of the times, at which `masked` hides all channels
 INFLATION = "inflation"  # the parameter of a filter with an ensemble

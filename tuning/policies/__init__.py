@@ -3,8 +3,7 @@
 Stable-Baselines3 takes a `NativeVecEnv`: a vector env of this package, all copies stepped in one call. Wrappers of
 VecEnvs add the views of the state and the corrections of a controller, so they serve native and single envs alike.
 Learnt and classical policies share `predict`, run on the same envs and are scored by the same code (`score`).
-Controllers plan with the plant's own code (`thruster_env.thruster.planning`), so their cost cannot drift from the
-reward.
+Controllers plan with the plant's own code (`thruster_env.thruster.controllers`): their cost is the reward's.
 
 Infos are empty except at the end of an episode: a dictionary per copy and step costs more than the plant. Torch is
 set up for small networks (`learn`): fused optimizers and minibatches as views take a step from 36 to 28 us and

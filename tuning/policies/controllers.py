@@ -1,6 +1,6 @@
 """Classical controllers as policies, PI, LQR, LQG and predictive ones, and policies that correct them.
 
-They use the observation sets of `tuning.policies.observations`, so they can be compared with learnt policies.
+They use the observation sets of `tuning.policies.algorithms`, so they can be compared with learnt policies.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from thruster_env.core.checks import one_of
-from thruster_env.thruster.controllers import LQRController, PIController
+from thruster_env.thruster.controllers import HORIZONS, LQRController, PIController, PredictiveController
 from thruster_env.thruster.dynamics import Constants
-from thruster_env.thruster.planning import HORIZONS, PredictiveController
-from tuning.policies.observations import TrainingReturns, size_of
+from tuning.policies.algorithms import TrainingReturns, size_of
 
 # Factors on the gains of `gains.lambda_gains`, tried for each observation set.
 GAINS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0)

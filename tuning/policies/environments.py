@@ -18,12 +18,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper,
 from filters import EstimateState, EstimateStates
 from filters.registry import filter_type
 from thruster_env.core.checks import short_repr
-from thruster_env.env.commands import ObserveState, ObserveStateVector
+from thruster_env.env.env import ObserveState, ObserveStateVector
 from thruster_env.model.state_space import StateSpaceModel
+from tuning.policies.algorithms import box_of, find_observation_set, size_of
 from tuning.policies.controllers import CorrectController
-from tuning.policies.observations import box_of, find_observation_set, size_of
-from tuning.policies.plants import plant_of
-from tuning.policies.setup import TrainingConfiguration
+from tuning.policies.setup import TrainingConfiguration, plant_of
 
 RULE = "env must be a vector env, of gym.make_vec(..., autoreset_mode='SameStep')"
 

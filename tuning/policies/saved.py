@@ -27,12 +27,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from thruster_env.core.checks import one_of
 from thruster_env.render.renderer import OnStep, Played, check_drawing, steps_a_frame, write_video
-from tuning.policies.algorithms import find_algorithm
+from tuning.policies.algorithms import box_of, find_algorithm
 from tuning.policies.controllers import ClassicalPolicy
 from tuning.policies.environments import episode_steps, make_environments, make_single, native_of
-from tuning.policies.observations import box_of
-from tuning.policies.plants import Part, TrainingPlant, plant_of
-from tuning.policies.setup import TrainingConfiguration, configuration_from_json
+from tuning.policies.setup import Part, TrainingConfiguration, TrainingPlant, configuration_from_json, plant_of
 from tuning.problems.data import training_seeds
 
 SETUP, POLICY, NORMALISATION, REPLAY = "setup.json", "policy.zip", "normalisation.pkl", "replay.pkl"

@@ -16,9 +16,7 @@ from typing import TYPE_CHECKING
 from filters.registry import filter_type
 from filters.tuned_file import AUGMENTED, read_tuned_file
 from thruster_env.core.checks import at_least, one_of, positive, short_repr
-from tuning.policies.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm
-from tuning.policies.observations import find_observation_set
-from tuning.policies.plants import plant_of
+from tuning.policies.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm, find_observation_set
 from tuning.problems.scenario import PlantScenario, plain
 
 # Checks of a training configuration: known names, and known arguments of env, filter and algorithm, all data.
@@ -26,6 +24,335 @@ from tuning.problems.scenario import PlantScenario, plain
 
 if TYPE_CHECKING:
     pass
+import inspect
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from thruster_env.auv.env import SegorogeniAUVDepthEnv, SegorogeniAUVPathEnv
+from thruster_env.auv.model import MODEL_ARGUMENTS as AUV_MODEL_ARGUMENTS
+from thruster_env.auv.model import auv_model
+from thruster_env.auv.paths import DepthAndCourse
+from thruster_env.auv.plant import CRUISE_SPEED, STATES
+from thruster_env.auv.plant import Plant as VehiclePlant
+from thruster_env.auv.plant import make_plant as make_vehicle
+from thruster_env.env.env import ObserveState
+from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.thruster.controllers import HORIZONS
+from thruster_env.thruster.env import BowThrusterEnv
+from thruster_env.thruster.model import MODEL_ARGUMENTS, thruster_model
+from thruster_env.thruster.plant import Plant, make_plant, thrust_scale
+from tuning.auv.scenario import SCENARIOS as VEHICLE_SCENARIOS
+from tuning.auv.scenario import Scenario as VehicleScenario
+from tuning.auv.scenario import find_scenario as find_vehicle_scenario
+from tuning.policies.algorithms import (
+    LAYERS,
+    TrainingReturns,
+)
+from tuning.thruster.scenario import SCENARIOS, Scenario, find_scenario
+
+if TYPE_CHECKING:
+    from tuning.policies.controllers import ClassicalPolicy
+
+
+# Plants on which policies learn: their tasks, envs, models and controllers.
+#
+# The thruster's thrust follows a reference; the underwater vehicle follows a path, or steps of the depth.
+
+
+TRANSIENT = 0.15  # [s] after a step of the reference; later steps are steady tracking
+STEP_OF_REFERENCE = 0.02  # least change within one sample time that is a step [T_max]
+FIRST_SCORED_STEP = 50  # of the RMSE of the observed thrust, as for all estimates
+SHORTEST_STEP = 0.01  # [s]; with a shorter sample time the vehicle would hardly move in an episode
+PD = "pd"
+
+
+class Task(NamedTuple):
+    """An env with its reference or path."""
+
+    about: str
+    env_id: str
+    arguments: dict
+
+
+class Part(NamedTuple):
+    """Squared errors of episodes, summed over some of their steps."""
+
+    squares: np.ndarray  # (B,), in the unit of the error, squared
+    steps: np.ndarray  # (B,)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square error, pooled over episodes; NaN without any step."""
+        steps = self.steps.sum()
+        return float(np.sqrt(self.squares.sum() / steps)) if steps else float("nan")
+
+
+def part_of(errors: np.ndarray, chosen: np.ndarray) -> Part:
+    """Errors (B, K) over the chosen steps (B, K)."""
+    return Part((np.where(chosen, errors, 0.0) ** 2).sum(axis=1), chosen.sum(axis=1))
+
+
+class TrainingPlant(ABC):
+    """A plant on which policies learn; `tuning.policies.setup` has the sets for all.
+
+    Attributes:
+        tasks: tasks by name; no two plants share a name.
+        scenario: name of the default scenario.
+        scenarios: names of the scenarios in which policies may learn.
+        env_arguments: names of the envs' arguments, without `render_mode`.
+        plant_arguments: names of the arguments of the plant, without those of the task.
+        model_arguments: names of arguments in which a filter's model may differ from the plant.
+        output: symbol of the output that precedes an observed state; None for none.
+        controllers: names of the classical policies.
+        of_states: names of those that must observe a state.
+        correctable: names of those that a policy may correct.
+        hyperparameters: hyperparameters by algorithm, where they differ from those of
+            `tuning.policies.algorithms`.
+        parts: names and units of the errors of `parts_of`.
+        errors: description of these errors.
+    """
+
+    tasks: ClassVar[Mapping[str, Task]]
+    scenario: ClassVar[str]
+    scenarios: ClassVar[tuple[str, ...]]
+    env_arguments: ClassVar[tuple[str, ...]]
+    plant_arguments: ClassVar[tuple[str, ...]]
+    model_arguments: ClassVar[tuple[str, ...]]
+    output: ClassVar[str | None] = None
+    controllers: ClassVar[tuple[str, ...]]
+    of_states: ClassVar[tuple[str, ...]]
+    correctable: ClassVar[tuple[str, ...]] = ()
+    hyperparameters: ClassVar[Mapping[str, Mapping]] = {}
+    parts: ClassVar[Mapping[str, str]]
+    errors: ClassVar[str]
+
+    @abstractmethod
+    def find_scenario(self, name: str) -> PlantScenario:
+        """A scenario by its name or file; ValueError for one of another plant."""
+
+    @abstractmethod
+    def check_scenario(self, scenario: PlantScenario) -> None:
+        """Raise ValueError for a scenario in which no policy can learn, or of another plant."""
+
+    @abstractmethod
+    def model(self, **arguments) -> StateSpaceModel:
+        """The model that a filter assumes, from arguments of the plant and of the model."""
+
+    def check_observes(self, name: str, observe: str) -> None:
+        """Raise ValueError unless a classical policy can act on an observation set."""
+        if name in self.of_states and not find_observation_set(observe).shows_state:
+            raise ValueError(f"{name} must observe a state, but got observe={observe!r}")
+
+    @abstractmethod
+    def classical(self, name: str, env: gym.Wrapper, training_returns: TrainingReturns) -> ClassicalPolicy:
+        """A classical policy for the observations of an env, from `make_single`; its gains may be tried out."""
+
+    def corrected(self, name: str, env: gym.Env) -> ClassicalPolicy:
+        """The controller that a policy corrects, by one of the names `correctable`."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def recorded(self, arrays: Mapping[str, np.ndarray], observations: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The values of a step for `parts_of`, from infos of B copies and the observations after it (B, d)."""
+
+    @abstractmethod
+    def parts_of(self, recorded: np.ndarray, alive: np.ndarray, plant: Any) -> dict[str, Part]:
+        """Errors of episodes by name, from recorded values (q, B, K) and whether an episode continues (B, K)."""
+
+
+class Thruster(TrainingPlant):
+    """The bow thruster."""
+
+    tasks = {
+        "tracking": Task("steps of thrust ahead, as the env has them", "BowThrusterTracking-v0", {}),
+        "reversal": Task("ramps of thrust through zero, as the env has them", "BowThrusterReversal-v0", {}),
+        "manoeuvre": Task(
+            "steps of thrust ahead and astern, every half second",
+            "BowThrusterTracking-v0",
+            {"reference": [{"name": "steps", "low": -0.6, "high": 0.6, "hold_time": 0.5}]},
+        ),
+    }
+    scenario = "medium_noise"
+    scenarios = tuple(name for name, scenario in SCENARIOS.items() if scenario.system is None)
+    env_arguments = tuple(
+        name
+        for name in inspect.signature(BowThrusterEnv.__init__).parameters
+        if name not in ("self", "render_mode")
+    )
+    plant_arguments = tuple(inspect.signature(make_plant).parameters)
+    model_arguments = MODEL_ARGUMENTS
+    output = "T"
+    controllers = ("pi", "lqr", *HORIZONS)
+    of_states = controllers[1:]
+    correctable = tuple(HORIZONS)
+    parts = dict.fromkeys(("all", "transient", "steady", "reversal", "observed"), "N")
+    errors = "of thrust; seen: of the thrust that the policy observes"
+
+    def find_scenario(self, name: str) -> Scenario:
+        """A scenario of the thruster by its name or file."""
+        return find_scenario(name)
+
+    def check_scenario(self, scenario: PlantScenario) -> None:
+        """Raise ValueError unless a scenario is one of the thruster's equations."""
+        if not isinstance(scenario, Scenario) or scenario.system is not None:
+            kind = "linear" if isinstance(scenario, Scenario) else "of another plant"
+            raise ValueError(f"scenario must be one of the thruster's equations, but {scenario.name!r} is {kind}")
+
+    def model(self, **arguments) -> StateSpaceModel:
+        """What a filter assumes: `thruster_env.thruster.model.thruster_model`."""
+        return thruster_model(**arguments)
+
+    def classical(self, name: str, env, training_returns):
+        """PI, LQR, or a predictive controller."""
+        from tuning.policies.controllers import controller_of
+
+        return controller_of(name, env, training_returns)
+
+    def corrected(self, name: str, env):
+        """A predictive controller."""
+        from tuning.policies.controllers import predictive
+
+        return predictive(name, env)
+
+    def recorded(self, arrays: Mapping[str, np.ndarray], observations: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The true thrust, the reference, and the thrust that the policy observes [N]."""
+        return arrays["thrust"].copy(), arrays["reference"].copy(), observations[:, 0].astype(np.float64)
+
+    def parts_of(self, recorded: np.ndarray, alive: np.ndarray, plant: Plant) -> dict[str, Part]:
+        """Errors of thrust [N]: over all steps, soon after steps of the reference, elsewhere, at reversals.
+
+        "observed" is the error of the thrust that the policy observes.
+        """
+        thrusts, references, observed = recorded
+        transient, reversal = _windows(
+            references, STEP_OF_REFERENCE * thrust_scale(plant), round(TRANSIENT / plant.dt)
+        )
+        errors, late = thrusts - references, np.arange(alive.shape[1]) >= FIRST_SCORED_STEP
+        return {
+            "all": part_of(errors, alive),
+            "transient": part_of(errors, alive & transient),
+            "steady": part_of(errors, alive & ~transient),
+            "reversal": part_of(errors, alive & reversal),
+            "observed": part_of(observed - thrusts, alive & late),
+        }
+
+
+def _windows(references: np.ndarray, least: float, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Steps (B, K) soon after the reference steps, and soon after its sign changes."""
+    before = np.concatenate([np.zeros_like(references[:, :1]), references[:, :-1]], axis=1)
+    stepped = np.abs(references - before) > least
+    crossed = references * before < 0
+    return _soon_after(stepped, length), _soon_after(crossed, length)
+
+
+def _soon_after(events: np.ndarray, length: int) -> np.ndarray:
+    """Whether one of the last `length` steps, this one included, had an event."""
+    count = np.cumsum(events, axis=1)
+    past = np.pad(count, ((0, 0), (length, 0)))[:, : events.shape[1]]
+    return count > past
+
+
+THRUSTER = Thruster()
+
+
+def _may_learn(scenario: VehicleScenario) -> bool:
+    return scenario.dt >= SHORTEST_STEP and scenario.states != "velocities"
+
+
+class Vehicle(TrainingPlant):
+    """The underwater vehicle."""
+
+    tasks = {
+        "path": Task("the papers' path IV, a climbing turn", "SegorogeniAUVPath-v0", {"path": "IV"}),
+        "depth": Task("steps of 2 m up and down on a straight course", "SegorogeniAUVDepth-v0", {}),
+    }
+    scenario = "auv:navigation"
+    scenarios = tuple(name for name, scenario_ in VEHICLE_SCENARIOS.items() if _may_learn(scenario_))
+    env_arguments = tuple(
+        dict.fromkeys(
+            name
+            for env in (SegorogeniAUVPathEnv, SegorogeniAUVDepthEnv)
+            for name in inspect.signature(env.__init__).parameters
+            if name not in ("self", "render_mode")
+        )
+    )
+    plant_arguments = tuple(inspect.signature(make_vehicle).parameters)
+    model_arguments = AUV_MODEL_ARGUMENTS
+    controllers = (PD,)
+    of_states = ()
+    correctable = (PD,)
+    # A turn takes seconds, so the horizon is 5 s; with large random actions the vehicle would tumble.
+    hyperparameters = {
+        "ppo": {"gamma": 0.99, "gae_lambda": 0.95, "policy_kwargs": {**LAYERS, "log_std_init": -2.0}},
+        "sac": {"gamma": 0.98},
+        "td3": {"gamma": 0.98},
+        "recurrent-ppo": {"gamma": 0.99, "gae_lambda": 0.95},
+    }
+    parts = {"cross-track": "m", "vertical": "m", "speed": "m/s"}
+    errors = "of the true place beside and above the path, and of the speed"
+
+    def find_scenario(self, name: str) -> VehicleScenario:
+        """A scenario of the vehicle by its name or file."""
+        return find_vehicle_scenario(name)
+
+    def check_scenario(self, scenario: PlantScenario) -> None:
+        """Raise ValueError unless a scenario is one of the vehicle, with attitude in its model."""
+        if not isinstance(scenario, VehicleScenario) or not _may_learn(scenario):
+            rule = f"scenario must be the vehicle's, with roll and pitch as states and dt from {SHORTEST_STEP} s"
+            raise ValueError(f"{rule}, but got {scenario.name!r}")
+
+    def model(self, **arguments) -> StateSpaceModel:
+        """What a filter assumes: `thruster_env.auv.model.auv_model`."""
+        return auv_model(**arguments)
+
+    def check_observes(self, name: str, observe: str) -> None:
+        """Raise ValueError for a history, or a belief with standard deviations."""
+        observed = find_observation_set(observe)
+        if observed.pairs or observed.form != "estimate":
+            raise ValueError(f"{name} must observe measurements or a state, but got observe={observe!r}")
+
+    def classical(self, name: str, env, training_returns):
+        """PD control of depth and course, from measurements, from an estimate or from the true state."""
+        return self.corrected(name, env.env)
+
+    def corrected(self, name: str, env):
+        """The same for an env with a filter, or `ObserveState`, as its outermost wrapper, if it has one."""
+        from tuning.policies.controllers import ClassicalPolicy
+
+        source = "navigation" if isinstance(env, ObserveState) else "measurement"
+        if (filter_ := getattr(env, "filter", None)) is not None:
+            source = "navigation" if filter_.model.n == len(STATES) else "motion"
+        low, high = env.unwrapped.plant.input_limits
+        return ClassicalPolicy(DepthAndCourse.for_env(env, source), 0, (high - low) / 2, (high + low) / 2)
+
+    def recorded(self, arrays: Mapping[str, np.ndarray], observations: np.ndarray) -> tuple[np.ndarray, ...]:
+        """True errors beside the path and below it [m], and the speed u [m/s]."""
+        return *arrays["path_errors"].T.copy(), arrays["state"][:, 0].copy()
+
+    def parts_of(self, recorded: np.ndarray, alive: np.ndarray, plant: VehiclePlant) -> dict[str, Part]:
+        """Errors beside the path, below it, and of the speed against that of the cruise."""
+        across, below, speed = recorded
+        return {
+            "cross-track": part_of(across, alive),
+            "vertical": part_of(below, alive),
+            "speed": part_of(speed - CRUISE_SPEED, alive),
+        }
+
+
+AUV = Vehicle()
+
+PLANTS: dict[str, TrainingPlant] = {"thruster": THRUSTER, "vehicle": AUV}
+TASKS = {name: task for plant in PLANTS.values() for name, task in plant.tasks.items()}
+
+
+def plant_of(task: str) -> TrainingPlant:
+    """The plant of a task's name; ValueError for an unknown one."""
+    one_of("task", task, tuple(TASKS))
+    return next(plant for plant in PLANTS.values() if task in plant.tasks)
+
 
 VERSION = 1
 MOST_ENVS = 100_000  # 100 steps of each take a gigabyte
@@ -89,7 +416,7 @@ class TrainingConfiguration:
     """Observations, algorithm, task, plant and numbers of a training.
 
     Attributes:
-        observe: name of an observation set, see `tuning.policies.plants`.
+        observe: name of an observation set, see `tuning.policies.setup`.
         algo: name of an algorithm, see `tuning.policies.algorithms`.
         task: name of the task.
         scenario: name of the scenario, with the plant and its noise.

@@ -30,9 +30,9 @@ from thruster_env.core.streams import (
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data
-from tuning.problems.excitation import Excitation, excitation_of
 from tuning.problems.model_problem import NamedArguments
 from tuning.problems.problem import Parameter
+from tuning.problems.scenario import Excitation, excitation_of
 
 # `Episodes`: the env of an `EnvProblem`, which offers the problem's model and shows what its data hold.
 

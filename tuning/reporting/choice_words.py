@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from filters.consistency.intervals import Interval, slightly, span
+from filters.consistency.nees import Interval, slightly, span
 from filters.consistency.report import confidence, mean_sentence, rounded
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import FULL_Q, FULL_QR, TUNED, called, is_far_below

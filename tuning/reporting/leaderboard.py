@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.consistency.intervals import Interval, slightly
+from filters.consistency.nees import Interval, slightly
 from thruster_env.core.text_tables import Table
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.compare import Leaderboard, Row, belief_sentences, noise_sentence, winners

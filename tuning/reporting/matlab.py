@@ -16,10 +16,9 @@ import numpy as np
 
 from thruster_env.graphs.graphs import COMPARISONS, UNARY, Graph, Number, needed_by
 from thruster_env.model.affine import AffineModel
-from thruster_env.model.called import why_not_traced
 from thruster_env.model.shape import constants_form
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.traced import traced_function
+from thruster_env.model.traced import traced_function, why_not_traced
 from tuning.search.space import Choice
 
 EXPRESSIONS = {

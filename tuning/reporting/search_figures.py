@@ -17,8 +17,7 @@ import optuna
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 
-from filters.consistency.intervals import LEVELS, Interval
-from filters.consistency.nees import SquaresCheck
+from filters.consistency.nees import LEVELS, Interval, SquaresCheck
 from filters.consistency.report import ConsistencyReport, probability_text, rounded
 from filters.logs.findings import colour_of
 from thruster_env.core.files import (

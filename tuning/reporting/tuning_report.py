@@ -6,7 +6,7 @@ from math import isfinite
 from shlex import quote
 from typing import TYPE_CHECKING
 
-from filters.consistency.intervals import slightly, span
+from filters.consistency.nees import slightly, span
 from thruster_env.core.modules import is_code
 from thruster_env.core.text_tables import Table
 from tuning.evaluation.baselines import (

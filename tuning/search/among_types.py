@@ -27,9 +27,18 @@ from tuning.problems.data import Data
 from tuning.search.objectives import LIKELIHOOD, SCORE, reported
 from tuning.search.parameters import R, model_parameters
 from tuning.search.plan import Plan
-from tuning.search.samplers import is_local, near
 from tuning.search.space import FILTER_TYPE, Choice, ends_of, trial_parameters, untuned_choice, within_ranges
-from tuning.search.trials import COST, NIS, best_trial, enqueue_new, is_consistent, is_near, is_over_budget
+from tuning.search.trials import (
+    COST,
+    NIS,
+    best_trial,
+    enqueue_new,
+    is_consistent,
+    is_local,
+    is_near,
+    is_over_budget,
+    near,
+)
 
 # Attributes of studies and trials, whose texts must not change: they are in journals and databases.
 MAXIMUM_LIKELIHOOD = "likeliest noise"  # Q and R have maximum likelihood; of a study what they are

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from tuning.evaluation.evaluate import Evaluation, compute_metrics, farthest, mse, score
 from tuning.evaluation.runs import RunMetrics, metrics_of_all
 from tuning.problems.data import Data

@@ -21,18 +21,21 @@ from tuning.problems.check import checked_problem, data_of
 from tuning.problems.data import Data, estimates_on
 from tuning.problems.digest import digest_of
 from tuning.problems.problem import Argument, Parameter, Problem
-from tuning.search.forgetting import TOLERANCE, forgetting, raised_noise, reachable
 from tuning.search.objectives import COVARIANCE, LOG_SCORE, Objective, check_objectives, find_objective
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, filter_parameters, index_pairs
 from tuning.search.space import (
     AUTO,
     AUTO_FILTER_TYPES,
+    TOLERANCE,
     Choice,
     choice_of,
     fits,
+    forgetting,
     has_search_space,
     joint_distributions,
     joint_parameters,
+    raised_noise,
+    reachable,
     untuned_choice,
 )
 

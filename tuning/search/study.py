@@ -30,10 +30,19 @@ from tuning.search.among_types import (
 from tuning.search.measures import measured
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import Plan
-from tuning.search.samplers import give_sampler, make_sampler
 from tuning.search.space import Choice, trial_parameters
 from tuning.search.storage import PROCESS, drop_waiting, retry_orphans, this_process
-from tuning.search.trials import COST, best_trial, cost_of, is_consistent, make_pruner, measure, run_trial
+from tuning.search.trials import (
+    COST,
+    best_trial,
+    cost_of,
+    give_sampler,
+    is_consistent,
+    make_pruner,
+    make_sampler,
+    measure,
+    run_trial,
+)
 from tuning.search.validation import Validation, as_data, finalists_of, validate
 
 STOPPING = "stopping after the running task; Ctrl-C again stops at once"

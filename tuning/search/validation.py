@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from optuna.trial import FrozenTrial, TrialState
 
-from filters.consistency.intervals import Interval, slightly
+from filters.consistency.nees import Interval, slightly
 from filters.registry import filter_type
 from filters.tuned_file import NOISE as NOISE_ARGUMENTS
 from tuning.evaluation.baselines import (
@@ -38,9 +38,8 @@ from tuning.search.measures import (
     signed_rank,
 )
 from tuning.search.objectives import LARGEST, MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER, SCORE
-from tuning.search.parameters import ensemble_sizes_of, model_parameters
+from tuning.search.parameters import ensemble_sizes_of, model_parameters, obeying
 from tuning.search.plan import Plan
-from tuning.search.relations import obeying
 from tuning.search.space import Choice
 from tuning.search.trials import best_trial, cost_of, is_consistent
 

@@ -25,24 +25,23 @@ from thruster_env.effects.effects import Effect, set_field
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster import plant as plants
 from thruster_env.thruster.analysis import equilibrium, jacobians, state_range, steady_state
-from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.controllers import PIController, lambda_gains
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
-from thruster_env.thruster.equations import copies_of, simulate
+from thruster_env.thruster.env import copies_of, simulate
 from thruster_env.thruster.linear import make_linear_plant, operating_points
 from thruster_env.thruster.model import model_of_plant
-from thruster_env.thruster.parameters import is_file, preset_mapping
+from thruster_env.thruster.parameters import CHANNELS, is_file, preset_mapping
 from thruster_env.thruster.plant import (
     DEFAULT_DT,
     DEFAULT_MAX_VOLTAGE,
     DEFAULT_PROCESS_NOISE,
     Plant,
+    Task,
 )
-from thruster_env.thruster.task import Task
-from tuning.problems.bound import average_bound
 from tuning.problems.data import Data
 from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, Excitation, MultiSine
 from tuning.problems.find import find_in
+from tuning.problems.model_problem import average_bound
 from tuning.problems.problem import BOUND, OPEN_LOOP
 from tuning.problems.scenario import PlantScenario, print_scales
 

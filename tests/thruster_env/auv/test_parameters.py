@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from tests.thruster_env.auv.textbook import random_states, without_drag_and_lift
-from thruster_env.auv.forces import forces
 from thruster_env.auv.parameters import (
     LAUV,
     PRESETS,
@@ -15,6 +14,7 @@ from thruster_env.auv.parameters import (
     VehicleParameters,
     checked,
     derive_constants,
+    forces,
     lamb_factors,
     mass_matrix,
     preset_parameters,

@@ -6,9 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from thruster_env.auv.control import DepthAndCourse
-from thruster_env.auv.paths import MANOEUVRES, make_path, run
-from thruster_env.env.commands import ObserveState, ObserveStateVector
+from thruster_env.auv.paths import MANOEUVRES, DepthAndCourse, make_path, run
+from thruster_env.env.env import ObserveState, ObserveStateVector
 
 PATH, DEPTH = "SegorogeniAUVPath-v0", "SegorogeniAUVDepth-v0"
 SQUARE = [[0, 0, 1], [10, 0, 1], [10, 10, 3], [0, 10, 3]]

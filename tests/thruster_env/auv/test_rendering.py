@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from filters import EstimateState
-from thruster_env.auv.control import DepthAndCourse
-from thruster_env.auv.paths import STRAIGHT_AHEAD, make_path
-from thruster_env.auv.rendering import Moment, Overlay, Renderer
+from thruster_env.auv.paths import STRAIGHT_AHEAD, DepthAndCourse, make_path
+from thruster_env.auv.rendering import ChartEntry, Overlay, Renderer
 
 pytest.importorskip("pygame")
 
@@ -27,7 +26,7 @@ ARGUMENTS = {
     "dt": 0.05,
     "frames_per_second": 20.0,
 }
-START = Moment(0.0, 0, 0, 0, 0, 0, 0, 1.0, 0.02, 1.0, 0.0, 1.0, 2.8, 0.0, 0.0)
+START = ChartEntry(0.0, 0, 0, 0, 0, 0, 0, 1.0, 0.02, 1.0, 0.0, 1.0, 2.8, 0.0, 0.0)
 BELIEF = Overlay("EKF", 0.5, 0.4, 0.2, 0.4, 0.1, 0.3, 0.0, 0.0, 0.1, 0.9, 0.05)
 LATER = START._replace(time=0.05, x=1.0, y=0.3, depth=0.5, theta=-0.2, psi=0.3, u=0.9)
 

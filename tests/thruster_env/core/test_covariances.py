@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters import make_filter
-from filters.estimators.estimator import Checks
+from filters.estimators.foreign import Checks
 from tests.models import plane_model, random_affine
 from thruster_env.core.checks import correlation_flaws, covariance
 from thruster_env.model.continuous import densities_of, noise_of_densities

@@ -5,8 +5,8 @@ import pytest
 
 from thruster_env.core.compiled import CompiledOrPython, function_fingerprint
 from thruster_env.core.derivatives import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
-from thruster_env.core.results import array_valued
 from thruster_env.core.streams import nearest_whole
+from thruster_env.model.traced import array_valued
 
 
 class Step:

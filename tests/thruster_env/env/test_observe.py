@@ -5,7 +5,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import thruster_env  # noqa: F401 - registers the envs
-from thruster_env.env.commands import ObserveState, ObserveStateVector
+from thruster_env.env.env import ObserveState, ObserveStateVector
 
 DROPPING = {"thrust": [{"name": "dropout", "probability": 0.5}], "speed": []}
 

@@ -17,8 +17,8 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.core.derivatives import runge_kutta
 from thruster_env.core.streams import episode_keys
 from thruster_env.env.model_env import ModelEnv
-from thruster_env.model.called import _machine_code
 from thruster_env.model.simulate import simulate
+from thruster_env.model.traced import _machine_code
 
 # Loops: a chain of masses between springs, of which each may be slack.
 

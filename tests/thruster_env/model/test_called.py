@@ -13,10 +13,9 @@ from thruster_env.core.compiled import CompiledOrPython
 from thruster_env.graphs.branches import on_every_side
 from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.tracing import traced
-from thruster_env.model import called
-from thruster_env.model.called import called_function
 from thruster_env.model.simulate import seconds_as_python
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.traced import TABLES, _machine_code, called_function
 from tuning.problems import check
 from tuning.problems.model_problem import ModelProblem
 
@@ -89,7 +88,7 @@ POINT = (0.7, -1.3), (0.4,), Constants(0.05, 0.2)
 
 def machine_code(function, arguments="x, u, c", sizes=(2, 1, 2), form=Constants, shape=(2,)):
     """What compiled functions have in place of a function."""
-    return called._machine_code(function, arguments, sizes, form, shape)
+    return _machine_code(function, arguments, sizes, form, shape)
 
 
 @pytest.mark.parametrize("function", ODD, ids=lambda one: one.__name__)
@@ -187,7 +186,7 @@ def test_the_line_is_that_of_the_helper_which_fails():
     assert reason.startswith(
         f"helper (test_called.py, line {helper.__code__.co_firstlineno + 2}) cannot be traced"
     )
-    assert reason.endswith(called.TABLES)
+    assert reason.endswith(TABLES)
 
 
 def model_of(transition, **changes):

@@ -7,11 +7,16 @@ import numpy as np
 import pytest
 
 from thruster_env import PRESETS
-from thruster_env.env.commands import ObserveState, ObserveStateVector
+from thruster_env.env.env import ObserveState, ObserveStateVector
 from thruster_env.thruster.analysis import steady_state
-from thruster_env.thruster.controllers import LQRController, PIController, lambda_gains, quadratic_gain
-from thruster_env.thruster.planning import PredictiveController
-from thruster_env.thruster.task import make_task, thrust_scale
+from thruster_env.thruster.controllers import (
+    LQRController,
+    PIController,
+    PredictiveController,
+    lambda_gains,
+    quadratic_gain,
+)
+from thruster_env.thruster.plant import make_task, thrust_scale
 
 NOISE_FREE = {"process_noise_cov": (0.0, 0.0), "measurement_noise_cov": 0.0, "initial_state": (0.0, 0.0)}
 # `open_bladed` is left out where a thrust is held: its propeller hardly turns, and the flow on which its thrust of

@@ -9,13 +9,12 @@ from scipy import stats
 
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.streams import episode_keys
-from thruster_env.effects.signals import RecordedSeries
+from thruster_env.effects.effects import RecordedSeries
 from thruster_env.thruster.analysis import run_substeps, state_range
 from thruster_env.thruster.effects import FLOW_SIGNALS
-from thruster_env.thruster.equations import copies_of
+from thruster_env.thruster.env import copies_of
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
-from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.task import Task
+from thruster_env.thruster.plant import Task, make_plant
 
 DT = 0.01
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds

@@ -7,8 +7,7 @@ from thruster_env import PRESETS
 from thruster_env.thruster.analysis import equilibrium, steady_state
 from thruster_env.thruster.controllers import LQRController, lambda_gains, quadratic_gain, quadratic_problem
 from thruster_env.thruster.linear import make_linear_plant, operating_points, sampled_plant
-from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.task import make_task, thrust_scale
+from thruster_env.thruster.plant import make_plant, make_task, thrust_scale
 
 TURNING = [name for name in PRESETS if name != "open_bladed"]  # whose propeller hardly turns
 TASK = make_task([{"name": "constant", "level": 0.5}], 1.0, 0.0, 0.01)

@@ -9,9 +9,9 @@ from scipy.optimize import minimize
 
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.compiled import interpreted
-from thruster_env.thruster import planning
+from thruster_env.thruster import controllers
+from thruster_env.thruster.controllers import HORIZONS, PredictiveController, Problem, best_voltages, improve_plans
 from thruster_env.thruster.parameters import preset_parameters
-from thruster_env.thruster.planning import HORIZONS, PredictiveController, Problem, best_voltages, improve_plans
 from thruster_env.thruster.plant import make_plant
 
 WEIGHTS = {"tracking_weight": 1.0, "energy_weight": 0.05, "voltage_rate_weight": 0.1}  # so that each one counts
@@ -42,7 +42,7 @@ def rewards(voltages):
 
 def cost(plan, i, problem):
     with interpreted():
-        return planning._cost_of_plan(tuple(STATES[i]), plan, LAST[i], REFERENCES[i], problem)
+        return controllers._cost_of_plan(tuple(STATES[i]), plan, LAST[i], REFERENCES[i], problem)
 
 
 def test_one_step_pays_least_by_the_envs_own_reward():
@@ -64,7 +64,7 @@ def test_gradient_and_hessian_are_those_of_the_plans_cost(horizon):
     for i in range(4):
         plan = np.random.default_rng(i).uniform(-20.0, 20.0, horizon)
         with interpreted():
-            planning._expand(tuple(STATES[i]), plan, LAST[i], REFERENCES[i], problem, *room)
+            controllers._expand(tuple(STATES[i]), plan, LAST[i], REFERENCES[i], problem, *room)
         _, _, gradient, hessian = room
         steps = 1e-4 * np.eye(horizon)
         slopes = [(cost(plan + s, i, problem) - cost(plan - s, i, problem)) / 2e-4 / 2 for s in steps]

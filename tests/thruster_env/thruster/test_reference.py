@@ -13,11 +13,9 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.effects.effects import Effect
 from thruster_env.thruster.analysis import steady_state
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
-from thruster_env.thruster.env import BowThrusterReversalEnv, BowThrusterTrackingEnv
-from thruster_env.thruster.equations import copies_of
+from thruster_env.thruster.env import BowThrusterReversalEnv, BowThrusterTrackingEnv, copies_of
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
-from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.task import Task, make_task
+from thruster_env.thruster.plant import Task, make_plant, make_task
 
 T_MAX = steady_state(TUNNEL, 24.0).thrust
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds

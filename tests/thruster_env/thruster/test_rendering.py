@@ -9,13 +9,13 @@ import pytest
 from gymnasium.error import DependencyNotInstalled
 from gymnasium.wrappers import RecordVideo
 
-from thruster_env.thruster.rendering import Moment, Overlay, Renderer
+from thruster_env.thruster.rendering import ChartEntry, Overlay, Renderer
 
 pygame = pytest.importorskip("pygame")
 
 from thruster_env.render.canvas import BAND, fitting_axis  # noqa: E402
 from thruster_env.render.renderer import Window  # noqa: E402
-from thruster_env.thruster.propeller import BLADES, end_view  # noqa: E402
+from thruster_env.thruster.dynamics import BLADES, end_view  # noqa: E402
 from thruster_env.thruster.rendering import (  # noqa: E402
     AXIS,
     FLOW,
@@ -39,9 +39,9 @@ ARGUMENTS = {
     "dt": DT,
     "frames_per_second": 100.0,
 }
-REST = Moment(0.0, 0.0, 0.0, 0.0, 0.0, 12.3, 0.0, 0.0)
-FORWARD = Moment(1.0, 193.8, 3.674, 12.29, 12.5, 12.3, 12.0, 0.0)
-REVERSE = Moment(1.0, -193.8, -3.674, -12.29, -12.5, 12.3, -12.0, 0.0)
+REST = ChartEntry(0.0, 0.0, 0.0, 0.0, 0.0, 12.3, 0.0, 0.0)
+FORWARD = ChartEntry(1.0, 193.8, 3.674, 12.29, 12.5, 12.3, 12.0, 0.0)
+REVERSE = ChartEntry(1.0, -193.8, -3.674, -12.29, -12.5, 12.3, -12.0, 0.0)
 BELIEF = Overlay("EKF", 11.0, 0.5, 190.0, 5.0, 3.5, 0.1)
 
 
@@ -142,7 +142,7 @@ def test_what_happens_is_seen(other):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
 def test_no_number_is_too_wild_to_draw(value):
-    wild = Moment(1.0, *[value] * 7)
+    wild = ChartEntry(1.0, *[value] * 7)
     belief = Overlay("EKF", *[value] * 6)
     assert frame(REST, wild, wild, overlay=belief).shape == (400, 640, 3)
     assert frame(wild, REST, overlay=belief).shape == (400, 640, 3)

@@ -14,10 +14,9 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.effects.effects import Effect
 from thruster_env.effects.sensors import SENSOR_EFFECTS, Bias, Quantisation
-from thruster_env.thruster.channels import CHANNELS
 from thruster_env.thruster.dynamics import thrust_and_torque
-from thruster_env.thruster.equations import simulate
-from thruster_env.thruster.parameters import PRESETS, TUNNEL_PHYSICAL, derive_constants
+from thruster_env.thruster.env import simulate
+from thruster_env.thruster.parameters import CHANNELS, PRESETS, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.thruster.plant import make_plant
 
 NOTHING = {"name": "bias"}  # adds zero

@@ -27,11 +27,9 @@ from thruster_env.thruster.effects import (
     extreme_parameters,
     make_uncertainty,
 )
-from thruster_env.thruster.env import BowThrusterVectorEnv
-from thruster_env.thruster.equations import copies_of, simulate
+from thruster_env.thruster.env import BowThrusterVectorEnv, copies_of, simulate
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
-from thruster_env.thruster.plant import make_plant
-from thruster_env.thruster.task import Task
+from thruster_env.thruster.plant import Task, make_plant
 
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds
 UNIFORM, LOG_NORMAL = {"name": "uniform", "low": 0.8, "high": 1.3}, {"name": "log-normal", "std": 0.1}

@@ -10,7 +10,7 @@ from PIL import Image
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.render import renderer
 from thruster_env.thruster.model import thruster_model
-from thruster_env.thruster.rendering import Moment, Overlay
+from thruster_env.thruster.rendering import ChartEntry, Overlay
 from tuning.cli import play
 
 
@@ -69,7 +69,7 @@ def test_a_log_is_shown_as_it_was_recorded(thruster, as_json, frames, monkeypatc
     table = np.genfromtxt("run.csv", delimiter=",", names=True)
     moment, overlay = shown[20]
     assert moment == pytest.approx(
-        Moment(0.2, *(table[name][20] for name in table.dtype.names[2:6]), None, 9.0), nan_ok=True
+        ChartEntry(0.2, *(table[name][20] for name in table.dtype.names[2:6]), None, 9.0), nan_ok=True
     )
     assert isinstance(overlay, Overlay) and abs(overlay.omega_m - moment.omega_m) < 5 * overlay.omega_m_std
     assert overlay.thrust == pytest.approx(

@@ -14,7 +14,7 @@ from optuna.trial import create_trial
 from rich.console import Console
 
 from docs.scripts import DOCS, PAGES, made_by
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from filters.registry import FILTERS
 from tests.linear_problem import LinearProblem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures

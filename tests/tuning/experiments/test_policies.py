@@ -28,9 +28,8 @@ from tuning.experiments.policies import (
 )
 from tuning.experiments.policies_report import HEADER, answers, rows_of, summary_rows
 from tuning.policies.environments import make_environments
-from tuning.policies.plants import FIRST_SCORED_STEP, THRUSTER, Part
 from tuning.policies.saved import Scores, classical_policy, run_episodes, score
-from tuning.policies.setup import make_configuration
+from tuning.policies.setup import FIRST_SCORED_STEP, THRUSTER, Part, make_configuration
 from tuning.problems.data import held_out_seeds
 from tuning.thruster.scenario import find_scenario
 

@@ -9,10 +9,9 @@ pytest.importorskip("stable_baselines3")
 
 from tuning.experiments.policies import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
 from tuning.experiments.policies_report import GOAL, HEADER, NOT_ON_PAGE, name_of
-from tuning.policies.observations import OBSERVATION_SETS
-from tuning.policies.plants import TASKS
+from tuning.policies.algorithms import OBSERVATION_SETS
 from tuning.policies.saved import classical_policy, score
-from tuning.policies.setup import make_configuration
+from tuning.policies.setup import TASKS, make_configuration
 from tuning.problems.data import held_out_seeds
 from tuning.thruster.scenario import find_scenario
 

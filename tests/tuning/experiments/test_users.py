@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from tests.linear_problem import LinearProblem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.evaluation.evaluate import score, score_ratio

@@ -11,10 +11,9 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures
-from tuning.policies.algorithms import ALGORITHMS
+from tuning.policies.algorithms import ALGORITHMS, OBSERVATION_SETS
 from tuning.policies.environments import make_environments
 from tuning.policies.learn import VALIDATION_EPISODES, _episodes_after
-from tuning.policies.observations import OBSERVATION_SETS
 from tuning.policies.saved import CHECKPOINTS, FINAL, find_saved, load, read_configuration, score
 from tuning.policies.setup import configuration_from_json
 from tuning.problems.data import held_out_seeds

@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormal
 import thruster_env  # noqa: F401 - registers the envs
 from tests.slow import slow_but
 from thruster_env.thruster.env import BowThrusterTrackingVectorEnv
+from tuning.policies.algorithms import OBSERVATION_SETS, STACKED
 from tuning.policies.environments import NativeVecEnv, make_environments, make_single
-from tuning.policies.observations import OBSERVATION_SETS, STACKED
 from tuning.policies.setup import in_scenario, make_configuration
 from tuning.thruster.scenario import find_scenario
 
@@ -152,7 +152,7 @@ def test_native_envs_are_single_envs_over_several_episodes(observe):
 def test_the_reward_is_that_of_the_true_thrust_in_all_arms(observe):
     venv, plain = make_environments(setup_of(observe), SEEDS), make_environments(setup_of("raw"), SEEDS)
     venv.reset(), plain.reset()
-    scale, last = thruster_env.thruster.task.thrust_scale(venv.get_attr("plant")[0]), np.zeros(COPIES)
+    scale, last = thruster_env.thruster.plant.thrust_scale(venv.get_attr("plant")[0]), np.zeros(COPIES)
     for actions in actions_of(LIMIT - 1):
         rewards = venv.step(actions)[1]
         np.testing.assert_array_equal(rewards, plain.step(actions)[1])

@@ -12,14 +12,15 @@ import numpy as np
 
 from thruster_env.logs.columns import TIME_NAMES, parted
 from thruster_env.logs.grid import in_seconds
-from thruster_env.logs.recorders.process import Opened, opened
 from thruster_env.logs.recorders.topics import (
     MOST_COLUMNS,
+    Opened,
     Refused,
     Topic,
     Wanted,
     check_bytes,
     columns_of,
+    opened,
     package,
     reading,
 )

@@ -24,9 +24,9 @@ from filters.algebra.operations import (
 )
 from filters.algebra.points import log_density, root
 from filters.algebra.roots import forward_quotient
+from filters.filter import PageFilter
 from filters.gaussian.extended import add_process_noise, propagate
 from filters.pages.page import Page
-from filters.pages.page_filter import PageFilter
 
 
 def update(model, x, P, z):

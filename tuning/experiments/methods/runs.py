@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from thruster_env.core.files import write_whole
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.evaluate import compute_metrics

@@ -15,8 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.bounds import path_bound, wrapped_variances
-from filters.consistency.intervals import Interval, interval, mean_interval, resampled_means, rmse_intervals
-from filters.consistency.nees import normalized_squares
+from filters.consistency.nees import (
+    Interval,
+    interval,
+    mean_interval,
+    normalized_squares,
+    resampled_means,
+    rmse_intervals,
+)
 from filters.engine.batch import run
 from filters.filter import Filter
 from filters.logs.findings import TRUTH as TRUTH_LOOK

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from filters import FuzzyKalmanFilter
-from filters.consistency.intervals import Interval
+from filters.consistency.nees import Interval
 from thruster_env.auv.parameters import SEGOROGENI, mass_matrix
 from thruster_env.core.checks import at_least
 from thruster_env.core.text_tables import Table, markdown_table

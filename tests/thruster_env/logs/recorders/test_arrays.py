@@ -11,7 +11,7 @@ from tests.thruster_env.logs.recorders.files import h5py
 from tests.thruster_env.logs.recorders.test_bad_recordings import refused
 from tests.thruster_env.logs.test_logs import MODEL
 from thruster_env.logs.read import read_log
-from thruster_env.logs.recorders import process
+from thruster_env.logs.recorders import topics
 from thruster_env.logs.recorders.registry import contents, read
 
 RNG = np.random.default_rng(0)
@@ -133,12 +133,12 @@ def test_where_the_library_ends_its_process_the_file_is_refused(tmp_path, when, 
     """A script that ends as the library does stands for it."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["t"] = np.arange(9.0)
-    text = process.SCRIPT.read_text()
+    text = topics.SCRIPT.read_text()
     place = "    request = json" if when == "at once" else "    for line in sys.stdin:\n"
     end = "os.kill(os.getpid(), 11)\n"
     changed = text.replace(place, f"    {end}{place}" if when == "at once" else f"{place}        {end}")
     (tmp_path / "script.py").write_text(changed)
-    monkeypatch.setattr(process, "SCRIPT", tmp_path / "script.py")
+    monkeypatch.setattr(topics, "SCRIPT", tmp_path / "script.py")
     if when == "at once":
         refused(tmp_path / "a.h5", r"must be one, but .* is not: the library that reads it breaks off \(SIGSEGV\)")
     else:
@@ -314,7 +314,7 @@ def test_numbers_come_from_the_reading_process_in_their_own_kind(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name, values in sent.items():
             file[name] = values
-    with process.opened("hdf5", tmp_path / "a.h5") as file:
+    with topics.opened("hdf5", tmp_path / "a.h5") as file:
         received = [file.read(i) for i in range(len(sent))]
     for values, expected in zip(received, sent.values(), strict=True):
         assert values.dtype == expected.dtype
