@@ -29,7 +29,6 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
 from tuning.problems.check import check_quantities
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step, estimates_in_parts
-from tuning.problems.digest import digest_of
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import BOUND, OPEN_LOOP, Parameter
 from tuning.problems.scenario import Excitation, excitation_of
@@ -57,7 +56,7 @@ def average_bound(model: StateSpaceModel, data: Data, truths: int = 100) -> np.n
     """
     inputs = np.ascontiguousarray(data.seen.inputs, dtype=np.float64)
     code, sources = gathering_code(model)
-    parts = sources, digest_of(model, *model.functions), data.first_scored, truths, inputs.shape
+    parts = sources, model.digest, data.first_scored, truths, inputs.shape
     counted = b"" if data.counted is None else np.ascontiguousarray(data.counted).tobytes()
     follows_from = repr(parts).encode() + model.numbers.tobytes() + inputs.tobytes() + counted
 
