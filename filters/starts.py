@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from functools import wraps
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.engine import batch
-from filters.engine.batch import Estimates, trajectories
+from filters.engine.batch import trajectories
 from filters.engine.session import Session
 from filters.filter import Filter
 from filters.gaussian.multiple_models import MultipleModelFilter
@@ -67,14 +65,6 @@ class Restarts(NamedTuple):
             f"The filter restarted from the prior {times}{among}, first at step {self.step}{run}{states}: "
             f"{self.cause}."
         )
-
-
-@wraps(batch.run)
-def run(filter_: Filter, keys=None, inputs=None, measurements=None, **noise) -> Estimates:
-    """`filters.engine.batch.run`, with a `RestartWarning` if the filter restarted."""
-    estimates = batch.run(filter_, keys, inputs, measurements, **noise)
-    warn_of_restarts(filter_, estimates.divergences, keys, inputs, measurements, **noise)
-    return estimates
 
 
 def warn_of_restarts(filter_: Filter, divergences: np.ndarray, keys, inputs, measurements, **noise) -> None:

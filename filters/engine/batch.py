@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -26,6 +27,9 @@ from thruster_env.core.checks import as_floats, covariance, short_repr
 from thruster_env.core.compiled import inlined, is_interpreting
 from thruster_env.core.streams import filter_keys
 from thruster_env.core.threads import spread
+from thruster_env.logs.grid import count_steps, resolution_of
+from thruster_env.logs.log import in_any_steps, sample_time_place
+from thruster_env.model.continuous import same_dt
 from thruster_env.model.shape import LANES, with_root
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -73,26 +77,7 @@ def run(
     process_noise_covs: np.ndarray | None = None,
     measurement_noise_covs: np.ndarray | None = None,
 ) -> Estimates:
-    """Filter many trajectories in one compiled call that uses all cores.
-
-    `run(filter_, z)` filters measurements alone, `run(filter_, inputs=u, measurements=z)` with inputs. A single
-    trajectory may have the shapes (K + 1,) or (K + 1, m), and (K,) or (K, p), as a list or from pandas,
-    too; its results then have no axis B. An input of the last row moves nothing and is left out.
-
-    Args:
-        filter_: any filter, or an estimator of another package in its place.
-        keys: random keys (B, 2), two whole numbers below 2^32 for each trajectory; those of seeds 0, 1, ..., B - 1
-            if None. Filters without random draws ignore them: run(filter_, inputs=u, measurements=z).
-        inputs: u, (B, K, p), in the units of the model's inputs; None for a model without inputs. The filter
-            predicts step k + 1 with u[:, k], which a measurement h(x, u, c) at its end depends on, too.
-        measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing; z[:, 0]
-            updates the prior, and z[:, k + 1] the prediction with u[:, k].
-        process_noise_covs: Q of every step, (K, n, n), in place of the model's. Covariances are per step and do
-            not scale with dt.
-        measurement_noise_covs: R of every measurement, (K + 1, m, m), in place of the model's.
-
-    Returns:
-        `Estimates`, which do not depend on the number of cores.
+    """Filter many trajectories, or one, in one compiled call that uses all cores: `filters.run` on steps of dt.
 
     Raises:
         ValueError: if shapes do not fit or an input is not finite; errors of `ForeignFilter.fill` for estimators.
@@ -239,6 +224,113 @@ def _noise_rows(name: str, covs, count: int, size: int) -> np.ndarray:
         raise ValueError(f"{name} must have shape {(count, size, size)}, but got {covs.shape}")
     definite = name.startswith("measurement")
     return np.array([with_root(covariance(name, cov, size, positive_definite=definite)) for cov in covs])
+
+
+# Steps of any length, as the arguments of a batch.
+
+
+class Prepared(NamedTuple):
+    """The arguments of a batch: long steps are divided into rows without a measurement."""
+
+    filter: Filter
+    keys: np.ndarray
+    inputs: np.ndarray
+    measurements: np.ndarray
+    process_noise_covs: np.ndarray | None
+    measurement_noise_covs: np.ndarray | None
+    rows: np.ndarray  # those of the user's measurements
+    times: np.ndarray  # of these rows [s]
+    is_single: bool = False  # whether the user's trajectory has no axis of a batch
+
+    @property
+    def noise(self) -> dict[str, Any]:
+        """Q of the steps and R of the measurements, by the names of `run`."""
+        names = "process_noise_covs", "measurement_noise_covs"
+        return {name: getattr(self, name) for name in names}
+
+
+def prepared(
+    filter_: Filter,
+    keys: Any,
+    inputs: Any,
+    measurements: Any,
+    process_noise_covs: Any = None,
+    measurement_noise_covs: Any = None,
+    *,
+    dt: Any = None,
+    noise: Callable[[float], Any] | None = None,
+    update_first: bool = True,
+) -> Prepared:
+    """The arguments of `run` as those of a batch, whose last input is the step ratio where steps differ."""
+    if measurements is None and inputs is None:
+        keys, measurements = None, keys
+    if not update_first:  # a row without a measurement before the first one
+        z = as_floats(measurements)
+        measurements = np.insert(z, 0, np.nan, axis=1 if z.ndim == 3 else 0)
+        if measurement_noise_covs is not None:
+            measurement_noise_covs = np.concatenate([measurement_noise_covs[:1], measurement_noise_covs])
+    single = is_single(None, inputs, measurements)
+    keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
+    rows = np.arange(0 if update_first else 1, z.shape[1])
+    model_dt, steps = _sample_time(filter_.model), inputs.shape[1]
+    lengths = _lengths(dt, steps, 1.0 if model_dt is None else model_dt)
+    times = np.append(0.0, np.cumsum(lengths))
+    plain = Prepared(
+        filter_, keys, inputs, z, process_noise_covs, measurement_noise_covs, rows, times[rows], single
+    )
+    if dt is None and noise is not None:
+        raise ValueError("noise must come with dt, the lengths of the steps, but got noise alone")
+    unlike = [
+        length
+        for length in np.unique(lengths).tolist()
+        if not same_dt(length, lengths[0] if model_dt is None else model_dt)
+    ]
+    if not unlike and (model_dt is None or noise is None):
+        return plain
+    same_model = filter_.kernel_model is filter_.model and not isinstance(filter_, ForeignFilter)
+    if model_dt is None or not (same_model and type(filter_).any_step):
+        raise ValueError(
+            "steps of different lengths must be for a model whose sample time is a constant, and a filter that "
+            f"evaluates f(x, u) at each step, but got {filter_.name!r}: make_filter('ekf', plant.at(dt))"
+        )
+    exact = resolution_of(float(times[-1]), 0.0)
+    counts = np.array([count_steps(length, model_dt, exact) for length in lengths.tolist()], dtype=int)
+    parts = np.repeat(lengths / counts, counts)
+    ratios = np.broadcast_to((parts / model_dt)[None, :, None], (len(z), len(parts), 1))
+    user_rows = np.append(0, np.cumsum(counts))
+    long_z = np.full((len(z), len(parts) + 1, z.shape[2]), np.nan)
+    long_z[:, user_rows] = z
+    q, r = process_noise_covs, measurement_noise_covs
+    if noise is not None:
+        by_length = {
+            length: as_floats(noise(length)) * (model_dt / length) for length in np.unique(parts).tolist()
+        }
+        q = np.array([by_length[length] for length in parts.tolist()])
+    elif q is not None:  # of a whole step, of which each part has its share
+        q = np.repeat(as_floats(q) * (model_dt / lengths)[:, None, None], counts, axis=0)
+    if r is not None:
+        r = as_floats(r)[np.minimum(np.searchsorted(user_rows, np.arange(len(parts) + 1)), len(r) - 1)]
+    long_u = np.concatenate([np.repeat(inputs, counts, axis=1), ratios], axis=2)
+    any_step = replace(filter_, model=in_any_steps(filter_.model))
+    return Prepared(any_step, keys, long_u, long_z, q, r, user_rows[rows], times[rows], single)
+
+
+def _sample_time(model: StateSpaceModel) -> float | None:
+    """The sample time of a model in which it is a constant [s], else None."""
+    try:
+        index, parts = sample_time_place(model, "steps of different lengths")
+    except ValueError:
+        return None
+    return float(model.constants[index]) * parts
+
+
+def _lengths(dt: Any, steps: int, default: float) -> np.ndarray:
+    """The lengths of all steps [s], (steps,)."""
+    lengths = as_floats(default if dt is None else dt)
+    if lengths.shape not in ((), (steps,)) or not (np.isfinite(lengths) & (lengths > 0.0)).all():
+        rule = f"dt must be the length of each step, or of {steps} steps, positive and finite"
+        raise ValueError(f"{rule}, but got {short_repr(dt)}")
+    return np.broadcast_to(lengths, steps).copy()
 
 
 # Batch session: one belief for each copy of a vector env, all advanced in place by one compiled call.

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.engine.batch import Beliefs, is_single, noise_rows, run, trajectories
+from filters.engine.batch import Beliefs, noise_rows, prepared, run, trajectories
 from filters.engine.belief import Kernels, constrained, memory_offsets, restart_if_lost
 from filters.engine.compile import new_memory
 from filters.engine.session import Session
@@ -25,7 +25,7 @@ from filters.pages.kernels import analysis_of
 from filters.smoothers.rts import passes, relation_of, smooth_backwards
 from filters.starts import warn_of_restarts
 from thruster_env.core.angles import difference, wrapped_where
-from thruster_env.core.checks import at_least
+from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
 from thruster_env.core.sources import joiner, vector_part, written_out
 from thruster_env.core.threads import spread
@@ -401,6 +401,9 @@ def smooth(
     measurements: np.ndarray | None = None,
     lag: int | None = None,
     *,
+    dt: Any = None,
+    noise: Callable[[float], Any] | None = None,
+    update_first: bool = True,
     process_noise_covs: np.ndarray | None = None,
     measurement_noise_covs: np.ndarray | None = None,
 ) -> Smoothed:
@@ -431,6 +434,9 @@ def smooth(
         inputs: u, (B, K, p), in the units of the model's inputs; None for a model without inputs.
         measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing.
         lag: number of later measurements that each estimate uses (fixed-lag smoothing); all of them if None.
+        dt: lengths of the steps [s], as `filters.run` takes them.
+        noise: Q by the length of a step [s], likewise.
+        update_first: whether the first measurement updates the prior itself, likewise.
         process_noise_covs: Q of every step, (K, n, n), in place of the model's, as `filters.run` takes it.
         measurement_noise_covs: R of every measurement, (K + 1, m, m), likewise.
 
@@ -444,11 +450,17 @@ def smooth(
     "Unscented Rauch-Tung-Striebel smoother"; Evensen, van Leeuwen (2000), "An ensemble Kalman smoother for
     nonlinear dynamics"; fixed lag: Anderson, Moore (1979), Optimal Filtering, chapter 7.
     """
-    covs = {"process_noise_covs": process_noise_covs, "measurement_noise_covs": measurement_noise_covs}
-    single = is_single(keys, inputs, measurements)
-    estimates, divergences = smoothed(filter_, keys, inputs, measurements, lag, **covs)
-    warn_of_restarts(filter_, divergences, keys, inputs, measurements, **covs)
-    return Smoothed(*(part[0] for part in estimates)) if single else estimates
+    covs = process_noise_covs, measurement_noise_covs
+    data = prepared(filter_, keys, inputs, measurements, *covs, dt=dt, noise=noise, update_first=update_first)
+    if lag is not None and len(data.rows) < data.measurements.shape[1] - (not update_first):
+        raise ValueError(
+            f"lag must be left out where steps are longer than the model's, but got {short_repr(lag)}"
+        )
+    arguments = data.keys, data.inputs, data.measurements
+    estimates, divergences = smoothed(data.filter, *arguments, lag, **data.noise)
+    warn_of_restarts(data.filter, divergences, *arguments, **data.noise)
+    estimates = Smoothed(*(part[:, data.rows] for part in estimates))
+    return Smoothed(*(part[0] for part in estimates)) if data.is_single else estimates
 
 
 def smoothed(

@@ -1,0 +1,142 @@
+"""`filters.run`: plain arrays and tables in, steps of any length; estimates with tables and pictures out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from filters.engine import batch
+from filters.engine.batch import Estimates, Prepared, prepared
+from filters.filter import Filter
+from filters.starts import warn_of_restarts
+from thruster_env.core.checks import at_least
+from thruster_env.core.modules import to_install
+from thruster_env.logs.log import Log
+from thruster_env.model.continuous import same_dt
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+    from filters.logs.estimate import LogEstimate
+
+
+class FilteredRuns(Estimates):
+    """`Estimates` that know their filter and data, for tables and pictures."""
+
+    data: Prepared
+
+    def to_frame(self, run: int = 0) -> pandas.DataFrame:
+        """A table by time: inputs, measurements, estimates with standard deviations, and innovations, with units.
+
+        Args:
+            run: number of the trajectory in a batch.
+
+        Raises:
+            ValueError: if pandas is not installed, or for an unknown number.
+        """
+        from filters.logs.findings import columns_of
+
+        try:
+            import pandas
+        except ImportError:
+            raise ValueError(
+                f"to_frame must have pandas, which is not installed: {to_install('frames')}"
+            ) from None
+        return pandas.DataFrame(columns_of(self._of_log(run))).set_index("time_s")
+
+    def plot(self, run: int = 0) -> Figure:
+        """States and innovations of a trajectory over time, each in its 95 % band."""
+        from filters.logs.findings import draw_log
+
+        return draw_log(self._of_log(run), self.data.filter.name)
+
+    def _of_log(self, run: int) -> LogEstimate:
+        """A trajectory as the estimate of a log."""
+        from filters.logs.estimate import LogEstimate
+
+        data, model = self.data, self.data.filter.model
+        run = at_least("run", run, 0, len(data.keys) - 1)
+        steps, z = np.diff(data.times), data.measurements[run, data.rows]
+        stamps = None if same_dt(float(steps.min()), float(steps.max())) else data.times - data.times[0]
+        plain = getattr(model, "plain", model)
+        inputs = data.inputs[run][data.rows[1:] - 1, : plain.inputs]
+        log = Log(
+            "run", float(np.median(steps)), inputs, z, plain.input_quantities, plain.measurements, stamps=stamps
+        )
+        log = replace(log, start=float(data.times[0]))
+        means, covs, innovations, innovation_covs, likelihoods = (
+            part if data.is_single else part[run] for part in self[:5]
+        )
+        filter_ = data.filter if plain is model else replace(data.filter, model=plain)
+        return LogEstimate(
+            log,
+            filter_,
+            means,
+            covs,
+            np.where(np.isnan(z), np.nan, innovations),
+            innovation_covs,
+            likelihoods,
+            int(np.max(self.divergences)),
+            smoothed=False,
+        )
+
+
+def run(
+    filter_: Filter,
+    keys: Any = None,
+    inputs: Any = None,
+    measurements: Any = None,
+    *,
+    dt: Any = None,
+    noise: Callable[[float], Any] | None = None,
+    update_first: bool = True,
+    process_noise_covs: np.ndarray | None = None,
+    measurement_noise_covs: np.ndarray | None = None,
+) -> FilteredRuns:
+    """Filter one trajectory or many in one compiled call that uses all cores.
+
+        estimates = filters.run(filter_, z)
+        estimates = filters.run(filter_, inputs=u, measurements=z, dt=0.1)
+        estimates.means, estimates.stds, estimates.to_frame(), estimates.plot()
+
+    A single trajectory may have the shapes (K + 1,) or (K + 1, m), and (K,) or (K, p), as an array, a list or
+    from pandas; its results then have no axis B. An input of the last row moves nothing and is left out.
+
+    The first measurement updates the prior, as in pykalman, statsmodels and MATLAB. With `update_first=False` the
+    filter predicts before it, as FilterPy does: then there are as many inputs as measurements, and `dt` begins
+    with the step to the first one.
+
+    Args:
+        filter_: any filter, or an estimator of another package in its place.
+        keys: random keys (B, 2), two whole numbers below 2^32 for each trajectory; those of seeds 0, 1, ..., B - 1
+            if None. Filters without random draws ignore them: run(filter_, inputs=u, measurements=z).
+        inputs: u, (B, K, p), in the units of the model's inputs; None for a model without inputs. The filter
+            predicts step k + 1 with u[:, k], which a measurement h(x, u, c) at its end depends on.
+        measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing.
+        dt: lengths of the steps [s], one or (K,), the same for all trajectories. Of a model in continuous time
+            they may differ; a longer step than the model's is divided. For others it is the time axis.
+        noise: Q (n, n) of a step by its length [s], as `ContinuousModel.noise`; in proportion to it if None.
+        update_first: whether the first measurement updates the prior itself.
+        process_noise_covs: Q of every step, (K, n, n), in place of the model's.
+        measurement_noise_covs: R of every measurement, (K + 1, m, m), in place of the model's.
+
+    Returns:
+        `Estimates`, which do not depend on the number of cores; a `RestartWarning` if the filter restarted.
+
+    Raises:
+        ValueError: if shapes do not fit, an input is not finite, or steps differ for a model or filter of one
+            sample time; errors of `ForeignFilter.fill` for estimators.
+    """
+    covs = process_noise_covs, measurement_noise_covs
+    data = prepared(filter_, keys, inputs, measurements, *covs, dt=dt, noise=noise, update_first=update_first)
+    arguments = data.keys, data.inputs, data.measurements
+    estimates = batch.run(data.filter, *arguments, **data.noise)
+    warn_of_restarts(data.filter, estimates.divergences, *arguments, **data.noise)
+    parts = [*(part[:, data.rows] for part in estimates[:5]), estimates.divergences]
+    runs = FilteredRuns(*(part[0] for part in parts) if data.is_single else parts)
+    runs.data = data
+    return runs
