@@ -23,14 +23,26 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.gaussian.kalman import KalmanFilter
-from thruster_env.core.checks import at_least, one_of, positive, short_repr
+from filters.signals import (
+    Signal,
+    added,
+    autoregression,
+    constant,
+    constant_acceleration,
+    constant_velocity,
+    harmonics,
+    local_trend,
+    ornstein_uhlenbeck,
+    oscillator,
+    seasonal,
+    singer,
+)
+from thruster_env.core.checks import at_least, finite, one_of, positive, short_repr
 from thruster_env.model.affine import AffineModel, affine_model
 from thruster_env.model.quantities import Quantity
 
-MOST_HARMONICS = 6
+MOST_HARMONICS, MOST_SEASONS, MOST_ORDER = 6, 24, 8
 UNDAMPED = 1e-6  # share of decay in a rate, below which it is that of a harmonic
-TERMS, LARGEST_TERM = 14, 0.5  # of the series of e^(A h), and the norm of A h from which on h is halved
-WIDE = 100.0  # spreads of the data in the prior's deviation: a start that knows nothing
 
 
 class Scales(NamedTuple):
@@ -52,6 +64,8 @@ class Free(NamedTuple):
     range: Callable[[Scales], tuple[float, float]]
     starts: int = 1  # how many values of the range a search begins from, at equal ratios
     start: Callable[[Scales], Sequence[float]] | None = None  # these values, in place of equal ratios
+    log: bool = True  # whether it is positive, and searched on a logarithmic scale
+    is_searched: bool = False  # whether the start is the highest of many peaks, which may be noise
 
     def values(self, scales: Scales) -> list[float]:
         """Values from which a search begins."""
@@ -59,102 +73,6 @@ class Free(NamedTuple):
         if self.start is not None:
             return [min(max(value, low), high) for value in self.start(scales)]
         return np.geomspace(low, high, self.starts + 2)[1:-1].tolist()
-
-
-class Signal(NamedTuple):
-    """A linear signal in continuous time: A, S, C, and the symbols of its states with their units."""
-
-    slope: np.ndarray  # A, (n, n)
-    densities: np.ndarray  # S, (n, n), diagonal
-    output: np.ndarray  # C, (n,)
-    states: tuple[tuple[str, str], ...]  # symbol, and unit with U for the data's
-    orders: tuple[int, ...]  # how often each state is differentiated by time: U/s^order
-    variances: np.ndarray  # (n,), stationary ones; infinite for states that start anywhere
-
-    def transition(self, dt: float) -> np.ndarray:
-        """F = e^(A dt), (n, n)."""
-        return self.step(dt)[0]
-
-    def noise(self, dt: float) -> np.ndarray:
-        """Q of a step of dt [s], (n, n)."""
-        return self.step(dt)[1]
-
-    def step(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """F and Q of a step of dt [s]."""
-        transitions, noises = steps(self.slope, self.driven, self.orders, np.array([dt]))
-        return transitions[0], np.tensordot(np.diag(self.densities)[list(self.driven)], noises[:, 0], 1)
-
-    def start(self, spread: float, dt: float) -> np.ndarray:
-        """Variances of the first state, (n,): stationary ones, or else those of a hundred spreads of the data."""
-        wide = (WIDE * spread / dt ** np.array(self.orders)) ** 2
-        return np.where(np.isfinite(self.variances), self.variances, wide)
-
-    @property
-    def driven(self) -> tuple[int, ...]:
-        """Indices of the states that white noise drives."""
-        return tuple(np.flatnonzero(np.diag(self.densities)).tolist())
-
-
-def steps(
-    slope: np.ndarray, driven: Sequence[int], orders: Sequence[int], dts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """F of steps of different lengths, and Q of white noise of density 1 on each of some states.
-
-        F(h) = sum_k A^k h^k/k!,  Q(h) = sum_k L^k(S) h^(k+1)/(k+1)!,  L(X) = A X + X A'
-        F(2h) = F(h)^2,  Q(2h) = Q(h) + F(h) Q(h) F(h)'
-
-    No term cancels another in Q, and only products of matrices are computed, for all lengths at once.
-
-    Args:
-        slope: A, (..., n, n).
-        driven: indices of d states.
-        orders: how often each state is differentiated by time, (n,): units in which A is well scaled.
-        dts: lengths h [s], (u,).
-
-    Returns:
-        F, (..., u, n, n), and Q, (..., d, u, n, n).
-
-    Source: van Loan (1978), "Computing integrals involving the matrix exponential", IEEE Transactions on Automatic
-    Control 23(3); Moler, van Loan (2003), SIAM Review 45(1), method 3, for scaling and doubling.
-    """
-    n, unit = slope.shape[-1], float(dts.max())
-    scale = unit ** np.asarray(orders, dtype=np.float64)  # of x in units of the data
-    a = (slope * scale[:, None] / scale * unit)[..., None, :, :]  # an axis for what is driven
-    terms = [np.broadcast_to(np.eye(n), a.shape)]
-    while len(terms) < n and terms[-1].any():
-        terms.append(a @ terms[-1] / len(terms))
-    is_polynomial = not (a @ terms[-1]).any()
-    count = 2 * n - 1 if is_polynomial else TERMS
-    noise = np.zeros((len(driven), n, n))
-    noise[range(len(driven)), driven, driven] = 1.0
-    noises = [np.broadcast_to(noise, (*a.shape[:-3], *noise.shape))]
-    for k in range(1, count):
-        rate = a @ noises[-1]
-        noises.append((rate + np.swapaxes(rate, -1, -2)) / (k + 1))
-        if not is_polynomial and k >= len(terms):
-            terms.append(a @ terms[-1] / k)
-    doublings = np.zeros(len(dts), dtype=np.int64)
-    if not is_polynomial:
-        reach = float(np.abs(a).sum(axis=-1).max()) / LARGEST_TERM
-        doublings = np.maximum(np.ceil(np.log2(np.maximum(reach * dts / unit, 1e-300))), 0.0).astype(np.int64)
-    lengths = dts / unit * 0.5**doublings
-    f = _polynomials(np.concatenate(terms, axis=-3), lengths)
-    q = _polynomials(np.stack(noises, axis=-3), lengths) * lengths[:, None, None]
-    for turn in range(int(doublings.max(initial=0))):
-        now = doublings > turn
-        part, of_noise = f[..., now, :, :], q[..., now, :, :]
-        wide = part[..., None, :, :, :]
-        q[..., now, :, :] = of_noise + wide @ of_noise @ np.swapaxes(wide, -1, -2)
-        f[..., now, :, :] = part @ part
-    q *= (unit ** (1.0 + 2.0 * np.asarray(orders, dtype=np.float64)))[list(driven), None, None, None]
-    return f / scale[:, None] * scale, q / np.outer(scale, scale)
-
-
-def _polynomials(terms: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """sum_k terms_k h^k of matrices (..., k, n, n), for each length h (u,): (..., u, n, n)."""
-    *leading, count, n, _ = terms.shape
-    powers = lengths[:, None] ** np.arange(count)
-    return (powers @ terms.reshape(*leading, count, n * n)).reshape(*leading, len(lengths), n, n)
 
 
 class NamedModel(NamedTuple):
@@ -181,7 +99,7 @@ def _density(name: str, meaning: str, power: int) -> Free:
 
 
 def _std(name: str, meaning: str) -> Free:
-    return Free(name, meaning, "U", lambda s: (1e-4 * s.spread, 1e3 * s.spread), start=lambda s: [s.spread])
+    return Free(name, meaning, "U", lambda s: (1e-4 * s.spread, 1e2 * s.spread), start=lambda s: [s.spread])
 
 
 TIME_CONSTANT = Free(
@@ -197,116 +115,9 @@ FREQUENCY = Free(
     "Hz",
     lambda s: (0.5 / s.duration, 0.5 / s.dt),
     start=lambda s: s.frequencies,
+    is_searched=True,
 )
 DAMPING = Free("damping", "damping ratio", "", lambda s: (1e-4, 2.0), starts=3)
-
-
-def _integrators(count: int, densities: tuple[float, ...], symbols: tuple[str, ...]) -> Signal:
-    """A chain x_1' = x_2, x_2' = x_3, ..., of which the first is measured."""
-    units = ("U", "U/s", "U/s^2")
-    states = tuple(zip(symbols, units[:count], strict=True))
-    anywhere = np.full(count, np.inf)
-    return Signal(np.eye(count, k=1), np.diag(densities), np.eye(count)[0], states, tuple(range(count)), anywhere)
-
-
-def constant(drift: float) -> Signal:
-    """A level that drifts as a random walk: the local level model.
-
-        dx/dt = w,  Q = drift dt
-
-    Args:
-        drift: density of the white noise [U^2/s].
-    """
-    return _integrators(1, (drift,), ("level",))
-
-
-def constant_velocity(acceleration: float) -> Signal:
-    """A position whose velocity changes by white-noise acceleration.
-
-        Q = acceleration [[dt^3/3, dt^2/2], [dt^2/2, dt]]
-
-    Args:
-        acceleration: density of the white acceleration [U^2/s^3].
-    """
-    return _integrators(2, (0.0, acceleration), ("position", "velocity"))
-
-
-def constant_acceleration(jerk: float) -> Signal:
-    """A position whose acceleration changes by white-noise jerk.
-
-    Args:
-        jerk: density of the white jerk [U^2/s^5].
-    """
-    return _integrators(3, (0.0, 0.0, jerk), ("position", "velocity", "acceleration"))
-
-
-def local_trend(drift: float, trend_drift: float) -> Signal:
-    """A level and its trend, each with noise: the local linear trend.
-
-    Args:
-        drift: density of the level's noise [U^2/s].
-        trend_drift: density of the trend's noise [U^2/s^3].
-    """
-    return _integrators(2, (drift, trend_drift), ("level", "trend"))
-
-
-def ornstein_uhlenbeck(time_constant: float, std: float) -> Signal:
-    """A deviation that returns to the mean: exponentially correlated noise.
-
-        dx/dt = -x/T + w,  S = 2 std^2/T
-
-    Args:
-        time_constant: T [s].
-        std: stationary standard deviation [U].
-    """
-    return Signal(
-        np.array([[-1.0 / time_constant]]),
-        np.array([[2.0 * std**2 / time_constant]]),
-        np.ones(1),
-        (("deviation", "U"),),
-        (0,),
-        np.array([std**2]),
-    )
-
-
-def singer(time_constant: float, acceleration_std: float) -> Signal:
-    """A position whose acceleration is exponentially correlated: a target that manoeuvres.
-
-        da/dt = -a/T + w,  S = 2 std^2/T
-
-    Args:
-        time_constant: T of a manoeuvre [s].
-        acceleration_std: stationary standard deviation of the acceleration [U/s^2].
-    """
-    slope = np.eye(3, k=1)
-    slope[2, 2] = -1.0 / time_constant
-    chain = _integrators(
-        3, (0.0, 0.0, 2.0 * acceleration_std**2 / time_constant), ("position", "velocity", "acceleration")
-    )
-    return chain._replace(slope=slope, variances=np.array([np.inf, np.inf, acceleration_std**2]))
-
-
-def oscillator(frequency: float, damping: float, std: float) -> Signal:
-    """A damped oscillation about the mean that white noise excites.
-
-        x'' = -2 zeta w_0 x' - w_0^2 x + w,  w_0 = 2 pi frequency,  S = 4 zeta w_0^3 std^2
-
-    The second state is x'/w_0, so both have the unit of the data.
-
-    Args:
-        frequency: natural frequency [Hz].
-        damping: zeta.
-        std: stationary standard deviation [U].
-    """
-    w = 2.0 * math.pi * frequency
-    return Signal(
-        np.array([[0.0, w], [-w, -2.0 * damping * w]]),
-        np.diag([0.0, 4.0 * damping * w * std**2]),
-        np.array([1.0, 0.0]),
-        (("oscillation", "U"), ("quadrature", "U")),
-        (0, 0),
-        np.array([std**2, std**2]),
-    )
 
 
 NAMED = {
@@ -369,43 +180,86 @@ NAMED = {
 }
 
 
-HARMONIC = "harmonic"
-NAMES = (*NAMED, HARMONIC)
-
-
-def harmonics(drift: float, period: float, count: int) -> Signal:
-    """A periodic signal about the mean whose shape drifts: a daily or yearly course.
-
-        x_k'' = -(2 pi k/period)^2 x_k,  k = 1 ... count;  cosine and sine of each drift as random walks
-
-    Args:
-        drift: density of the noise on each cosine and sine [U^2/s].
-        period: [s].
-        count: harmonics; half the samples in a period describe any seasonal pattern.
-
-    Source: Harvey (1989), section 2.3.4.
-    """
-    w = 2.0 * math.pi / period
-    slope = np.kron(np.diag(np.arange(1.0, count + 1.0)), [[0.0, w], [-w, 0.0]])
-    states = [(f"{word}_{k + 1}", "U") for k in range(count) for word in ("harmonic", "quadrature")]
-    output = np.tile([1.0, 0.0], count)
-    orders, anywhere = (0,) * (2 * count), np.full(2 * count, np.inf)
-    return Signal(slope, drift * np.eye(2 * count), output, tuple(states), orders, anywhere)
-
-
 def _harmonic_model(settings: str) -> NamedModel:
-    """`harmonics` with a period and a number from text such as "period=24,harmonics=3"."""
-    rule = f"{HARMONIC} must have a period [s], as {HARMONIC}:period=24, and may have harmonics=N"
+    """`harmonics` of text such as "period=24,harmonics=3"; without a period it is a free number."""
+    rule = "harmonic may have period=SECONDS and harmonics=N"
+    values = _numbers_of(settings, rule, "period", "harmonics")
+    period, count = values.get("period"), values.get("harmonics", 1.0)
+    if not count.is_integer() or not 1 <= count <= MOST_HARMONICS:
+        raise ValueError(f"{rule} of 1 to {MOST_HARMONICS}, but got {settings!r}")
+    free, fixed, name = (SHAPE_DRIFT,), {"count": int(count)}, f"harmonic:{settings}".rstrip(":")
+    if period is None:
+        return NamedModel(name, "a periodic course", (*free, PERIOD), partial(harmonics, **fixed), about_mean=True)
+    signal = partial(harmonics, period=period, **fixed)
+    return NamedModel(name, f"a course of period {period:g} s", free, signal, about_mean=True)
+
+
+def _seasonal_model(settings: str) -> NamedModel:
+    """`seasonal` of text such as "period=86400,seasons=24"; seasons are those of a row a second without it."""
+    rule = f"seasonal must have period=SECONDS and may have seasons=N of 3 to {MOST_SEASONS}, samples in a period"
+    values = _numbers_of(settings, rule, "period", "seasons")
+    if "period" not in values:
+        raise ValueError(f"{rule}, but got {settings!r}")
+    seasons = values.get("seasons", values["period"])
+    if not seasons.is_integer() or not 3 <= seasons <= MOST_SEASONS:
+        raise ValueError(f"{rule}, but got {settings!r}")
+    signal = partial(seasonal, period=values["period"], seasons=int(seasons))
+    about = f"a pattern of {int(seasons)} values in {values['period']:g} s"
+    return NamedModel(f"seasonal:{settings}", about, (SHAPE_DRIFT,), signal, about_mean=True)
+
+
+def _autoregressive_model(settings: str) -> NamedModel:
+    """`autoregression` of text such as "2", its order."""
+    if not settings.isdecimal() or not 1 <= int(settings) <= MOST_ORDER:
+        rule = f"ar must have an order of 1 to {MOST_ORDER}, as ar:2"
+        raise ValueError(f"{rule}, but got {settings!r}")
+    partials = tuple(
+        Free(
+            f"partial_{i}",
+            f"partial autocorrelation at lag {i}",
+            "",
+            lambda s: (-0.9999, 0.9999),
+            start=_first_partials if i == 1 else _further_partials,
+            log=False,
+        )
+        for i in range(1, int(settings) + 1)
+    )
+    free = *partials, _std("std", "standard deviation of the signal")
+    about = f"an autoregression of order {settings}, in equal steps"
+    return NamedModel(f"ar:{settings}", about, free, autoregression, about_mean=True)
+
+
+def _first_partials(scales: Scales) -> Sequence[float]:
+    return 0.8, 0.2, -0.5
+
+
+def _further_partials(scales: Scales) -> Sequence[float]:
+    return 0.4, -0.4
+
+
+def _numbers_of(settings: str, rule: str, *names: str) -> dict[str, float]:
+    """Positive numbers by name of text such as "period=24,harmonics=3"; ValueError with the rule for others."""
     try:
-        pairs = dict(setting.split("=") for setting in settings.split(","))
-        period, count = float(pairs.pop("period")), int(pairs.pop("harmonics", "1"))
-    except (KeyError, ValueError):
+        pairs = dict(setting.split("=") for setting in settings.split(",") if setting)
+        values = {name.strip(): float(text) for name, text in pairs.items()}
+    except ValueError:
         raise ValueError(f"{rule}, but got {settings!r}") from None
-    if pairs or not (0.0 < period < math.inf) or not 1 <= count <= MOST_HARMONICS:
-        raise ValueError(f"{rule} of at most {MOST_HARMONICS}, but got {settings!r}")
-    free = (_density("drift", "density of the drift of its shape", 1),)
-    about, signal = f"a course of period {period:g} s", partial(harmonics, period=period, count=count)
-    return NamedModel(f"{HARMONIC}:{settings}", about, free, signal, about_mean=True)
+    if not set(values) <= set(names) or not all(0.0 < value < math.inf for value in values.values()):
+        raise ValueError(f"{rule}, but got {settings!r}")
+    return values
+
+
+SHAPE_DRIFT = _density("drift", "density of the drift of its shape", 1)
+PERIOD = Free(
+    "period",
+    "period",
+    "s",
+    lambda s: (2.0 * s.dt, 2.0 * s.duration),
+    start=lambda s: [1.0 / frequency for frequency in s.frequencies],
+    is_searched=True,
+)
+WITH_SETTINGS = {"harmonic": _harmonic_model, "seasonal": _seasonal_model, "ar": _autoregressive_model}
+NAMES = (*NAMED, *WITH_SETTINGS)
 
 
 class Sum(NamedTuple):
@@ -434,7 +288,9 @@ class Sum(NamedTuple):
         names = [number.name for number in self.free]
         if set(values) != set(names):
             raise ValueError(f"{self.name} takes {', '.join(names)}, but got {short_repr(list(values))}")
-        return self.signal_of([positive(name, values[name]) for name in names])
+        return self.signal_of(
+            [(positive if number.log else finite)(number.name, values[number.name]) for number in self.free]
+        )
 
     def signal_of(self, values: Sequence[float]) -> Signal:
         """The signal for values of the free numbers in order."""
@@ -443,11 +299,12 @@ class Sum(NamedTuple):
             part.signal(**{number.name: value for number, value in zip(part.free, values[first:], strict=False)})
             for part, first in zip(self.parts, ends, strict=False)
         ]
-        return signals[0] if len(signals) == 1 else _added(signals)
+        return signals[0] if len(signals) == 1 else added(signals)
 
     def check_harmonics(self, signal: Signal, dt: float) -> None:
         """Raise ValueError for a harmonic of fewer than two samples, which looks like another."""
-        rates = np.linalg.eigvals(signal.slope)
+        continuous = [i for i in range(len(signal.output)) if i not in signal.discrete]
+        rates = np.linalg.eigvals(signal.slope[np.ix_(continuous, continuous)])
         fastest = float(rates.imag[np.abs(rates.real) < UNDAMPED * np.abs(rates)].max(initial=0.0))
         if fastest * dt > math.pi * (1.0 + UNDAMPED):
             rule = f"each harmonic of {self.name} must have two samples in its period or more"
@@ -499,7 +356,7 @@ class Sum(NamedTuple):
             process_noise_cov=np.kron(each, noise_cov),
             measurement_noise_cov=[noise] * axes,
             prior_mean=np.kron(np.broadcast_to(first, axes) - offset, level) + 0.0,  # no negative zeros
-            prior_cov=np.tile(signal.start(spread, dt), axes),
+            prior_cov=np.kron(each, signal.start(spread, dt)),
             measurement_offset=offset,
             states=states,
             input_quantities=[],
@@ -531,10 +388,10 @@ def _part(text: str) -> NamedModel:
     """A model by its name, with settings behind a colon."""
     name, _, settings = text.partition(":")
     one_of("a model", name, NAMES)
-    if name == HARMONIC:
-        return _harmonic_model(settings)
+    if name in WITH_SETTINGS:
+        return WITH_SETTINGS[name](settings)
     if settings:
-        raise ValueError(f"settings must be those of {HARMONIC}, but got {settings!r} for {name}")
+        raise ValueError(f"settings must be those of {', '.join(WITH_SETTINGS)}, but got {settings!r} for {name}")
     return NAMED[name]
 
 
@@ -572,23 +429,3 @@ def in_unit(text: str, unit: str) -> str:
 def _unique(part: str, name: str, names: list[str]) -> str:
     part = part.partition(":")[0].replace("-", "_")
     return f"{part}_{name}" if names.count(name) > 1 else name
-
-
-def _added(signals: list[Signal]) -> Signal:
-    """The sum of signals, side by side."""
-    return Signal(
-        _block_diagonal([signal.slope for signal in signals]),
-        _block_diagonal([signal.densities for signal in signals]),
-        np.concatenate([signal.output for signal in signals]),
-        tuple(state for signal in signals for state in signal.states),
-        tuple(order for signal in signals for order in signal.orders),
-        np.concatenate([signal.variances for signal in signals]),
-    )
-
-
-def _block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:
-    matrix, first = np.zeros((sum(map(len, blocks)),) * 2), 0
-    for block in blocks:
-        last = first + len(block)
-        matrix[first:last, first:last], first = block, last
-    return matrix

@@ -224,32 +224,40 @@ def test_the_likelihood_is_that_of_the_filters_innovations_and_its_scale_the_bes
 
 
 @pytest.mark.parametrize(
-    "name", ["constant-acceleration", "singer", "ornstein-uhlenbeck", "constant + oscillator"]
+    "name", ["constant-acceleration", "singer", "constant + oscillator", "ar:2 + constant", "seasonal:period=4"]
 )
 def test_the_likelihood_is_that_of_an_exact_diffuse_filter_on_unequal_steps(name):
     """statsmodels' filter, stationary states as their covariance says and the others diffuse."""
     statespace = pytest.importorskip("statsmodels.tsa.statespace.api")
     kalman_filter = pytest.importorskip("statsmodels.tsa.statespace.kalman_filter")
     rng = np.random.default_rng(8)
-    z, times = 3.0 * rng.normal(size=60), np.cumsum(rng.uniform(0.1, 2.0, 60))
+    steps = np.ones(59) if "ar" in name else rng.uniform(0.1, 2.0, 59)
+    z, times = 3.0 * rng.normal(size=60), np.cumsum(np.append(0.0, steps))
     times[30:] += 9.0
     z[[4, 40]] = np.nan
-    likelihood = ColumnLikelihood(named_model(name), column_of(z, times=times))
-    values = [1.5 + 0.2 * i for i in range(len(likelihood.coordinates.names))]
+    column = column_of(z, times=times)
+    likelihood = ColumnLikelihood(named_model(name), column)
+    names = likelihood.coordinates.names
+    values = [-0.3 - 0.2 * i if name.startswith("partial") else 1.5 + 0.2 * i for i, name in enumerate(names)]
     signal = likelihood._signal(values)
     oracle = kalman_filter.KalmanFilter(1, len(signal.output))
-    oracle.bind(z[None].copy())
+    oracle.bind(likelihood._z.copy())
     oracle["design"], oracle["obs_cov"] = signal.output[None], np.array([[values[-1]]])
     oracle["selection"] = np.eye(len(signal.output))
-    f, q = zip(*map(signal.step, np.append(np.diff(times), 1.0)), strict=True)
+    f, noises = signal.steps(signal.slope, np.append(np.diff(column.times), 1.0), 1.0)
+    q = np.tensordot(np.diag(signal.densities)[list(signal.driven)], noises, 1)
     oracle["transition"], oracle["state_cov"] = np.moveaxis(f, 0, 2), np.moveaxis(q, 0, 2)
     first = statespace.Initialization(len(signal.output))
-    for i, variance in enumerate(signal.variances):
-        known = math.isfinite(variance)
-        first.set(i, "known" if known else "diffuse", **({"stationary_cov": [[variance]]} if known else {}))
+    anywhere = np.isinf(np.diag(signal.first))
+    for i in np.flatnonzero(anywhere).tolist():
+        first.set(i, "diffuse")
+    known = np.flatnonzero(~anywhere)
+    if len(known):  # which stand together
+        cov = signal.first[np.ix_(known, known)]
+        first.set((int(known[0]), int(known[-1]) + 1), "known", stationary_cov=cov)
     oracle.initialize(first)
     result = oracle.filter()
-    count = int(np.isinf(signal.variances).sum())
+    count = int(anywhere.sum())
     expected = result.llf_obs[result.nobs_diffuse :].sum()
     assert result.nobs_diffuse == count
     assert likelihood.value(likelihood.coordinates.of(values)) == pytest.approx(expected, rel=1e-9)
@@ -357,6 +365,29 @@ def test_a_daily_course_and_steps_between_numbers():
     assert masked.remarks == ("1 of 240 row is missing, in 1 place.",)  # without an input that is held
 
 
+def test_a_season_an_autoregression_and_a_period_are_found():
+    rng = np.random.default_rng(11)
+    pattern = np.tile([3.0, 1.0, -2.0, 0.0, 4.0, -6.0], 50)
+    z = pattern + np.cumsum(0.2 * rng.normal(size=300)) + 0.5 * rng.normal(size=300)
+    fit = tuning.fit(z, model="constant + seasonal:period=6")
+    drift, shape, noise = fit.numbers
+    assert drift.low < 0.04 < drift.high and noise.low < 0.25 < noise.high and shape.high < 1e-2
+    assert not fit.is_wrong and tuning.fit(z, model="constant").is_wrong
+    z = np.zeros(600)
+    for k in range(2, 600):  # partial autocorrelations of 1.2/1.6 and -0.6
+        z[k] = 1.2 * z[k - 1] - 0.6 * z[k - 2] + rng.normal()
+    fit = tuning.fit(z + 7.0, model="ar:2")
+    lows, highs = np.array([(number.low, number.high) for number in fit.numbers[:2]]).T
+    assert (
+        (lows < [0.75, -0.6]).all() and (highs > [0.75, -0.6]).all() and fit.level == pytest.approx([7.0], abs=0.3)
+    )
+    z = 2.0 * np.cos(2.0 * np.pi * np.arange(400) / 23.7) + rng.normal(size=400)
+    period = tuning.fit(z, model="harmonic").numbers[1]
+    assert period.low < 23.7 < period.high and period.high - period.low < 0.5
+    noise = tuning.fit(rng.normal(size=400), model="oscillator")
+    assert "do not determine frequency" in str(noise) and "do not determine damping" in str(noise)
+
+
 @pytest.mark.parametrize(
     ("z", "options", "message"),
     [
@@ -365,7 +396,9 @@ def test_a_daily_course_and_steps_between_numbers():
         ([math.nan] * 50, {}, "at least 20 numbers, but has 0"),
         (["a"] * 30, {}, "z must be numbers"),
         (np.zeros((30, 9)), {}, "a column of numbers"),
-        (np.arange(30.0), {"model": "harmonic"}, "must have a period"),
+        (np.arange(30.0), {"model": "seasonal"}, "must have period="),
+        (np.arange(30.0), {"model": "ar"}, "must have an order of 1 to 8, as ar:2, but got ''"),
+        (np.arange(30.0) % 7.0, {"model": "ar:1", "dt": 1.0 + 0.1 * np.arange(29.0)}, "must have equal steps"),
         (
             np.arange(30.0) ** 2 % 11.0,
             {"model": "harmonic:period=7,harmonics=4"},

@@ -30,10 +30,10 @@ def fit(
     """Find the model, Q and R of a column of numbers, or of a track with several axes, by maximum likelihood.
 
     Each model is a plant that everybody knows, driven by white noise: constant, constant-velocity,
-    constant-acceleration, local-trend, ornstein-uhlenbeck, singer, oscillator or harmonic:period=24. Axes are
-    independent and have the same numbers. Of the models that predict unseen
-    blocks of the record as well as the best one, the simplest is chosen. If innovations are correlated, the first
-    line says that no model fits.
+    constant-acceleration, local-trend, ornstein-uhlenbeck, singer, oscillator, harmonic, seasonal:period=12 or
+    ar:2. Axes are independent and have the same numbers. Of the models that predict unseen blocks of the record as
+    well as the best one, the simplest is chosen. If innovations are correlated, the first line says that no model
+    fits.
 
         fit = tuning.fit(z, dt=0.1)
         print(fit)

@@ -4,7 +4,7 @@ What counts are the innovations of a Kalman filter that begins without a prior. 
 candidate is fitted once without the even ones and once without the odd ones, and compared by the likelihood of the
 blocks that it did not see. Of the candidates that are not significantly worse than the best, the simplest is
 chosen. An interval has the values at which the likelihood, with all other numbers at their likeliest, is within
-e^-1.92 of its maximum.
+e^-1.92 of its maximum, of a short record a little less.
 
 Sources: Harvey (1989), Forecasting, Structural Time Series Models and the Kalman Filter, section 3.4; Durbin and
 Koopman (2012), Time Series Analysis by State Space Methods, sections 5.2 and 7.2, for starts without a prior;
@@ -22,11 +22,12 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import chdtri
+from scipy.special import stdtrit
 
 from filters.engine.batch import Estimates, run
 from filters.gaussian.kalman import KalmanFilter
-from filters.models import Scales, Signal, Sum, named_model, steps
+from filters.models import Scales, Sum, named_model
+from filters.signals import Signal
 from thruster_env.core.streams import filter_keys
 from thruster_env.model.affine import AffineModel
 from tuning.identification.objective import Ascent, climb
@@ -50,10 +51,11 @@ SHARES = 0.01, 0.2, 0.9  # R from which searches begin, in squares of the roughn
 SEARCHES = 3
 EXACT = 1e-8  # predicted rise of the log-likelihood at which the last search ends
 NOISE = "variance of the measurement noise"
-FALL = 0.5 * float(chdtri(1, 0.05))  # of the log-likelihood at the ends of a 95 % interval
+LEAST_DEGREES = 8.0  # of freedom, of Student's distribution
 FAR = 100.0  # root of a fall where the filter has no likelihood
-PRECISION = 0.01  # of an interval's end, in coordinates
-NORMAL = 0.03  # standard error, in coordinates, below which the likelihood is normal to its own precision
+PRECISION = 0.01  # of an interval's end, in coordinates, at most
+NORMAL = 0.03  # standard error, in coordinates, below which the likelihood of a long record is normal
+CHANCE = 0.05  # of the highest peak among those of noise
 
 
 class Candidate(NamedTuple):
@@ -64,6 +66,7 @@ class Candidate(NamedTuple):
         values: of the free numbers, and R.
         log_likelihood: of the rows that it was fitted on.
         held_out: log-likelihoods of blocks that it was not fitted on, (blocks,).
+        in_sample: of all these blocks, fitted on all.
         size: how simple it is: free numbers, then states.
     """
 
@@ -71,6 +74,7 @@ class Candidate(NamedTuple):
     values: dict[str, float]
     log_likelihood: float
     held_out: np.ndarray
+    in_sample: float
     size: tuple[int, int]
 
 
@@ -81,14 +85,15 @@ class Fitted(NamedTuple):
     objective: ColumnLikelihood
     ascent: Ascent
     rivals: tuple[Ascent, ...]  # maxima to which searches led from elsewhere, perhaps the same one
-    held_out: np.ndarray  # (blocks,)
+    held_out: np.ndarray = np.zeros(BLOCKS - 1)  # (blocks,)
+    in_sample: float = 0.0
 
     @property
     def candidate(self) -> Candidate:
         """What is left of it for the answer: plain data."""
         values = self.objective.coordinates.named(self.ascent.at)
         size = len(self.model.free), self.objective.states
-        return Candidate(self.model.name, values, self.ascent.found.value, self.held_out, size)
+        return Candidate(self.model.name, values, self.ascent.found.value, self.held_out, self.in_sample, size)
 
 
 class Number(NamedTuple):
@@ -131,13 +136,13 @@ def choose(column: Column, names: Sequence[str], progress: Callable[[str], None]
         fitted.append(_fit(named_model(name), part, prove=len(names) > 1))
     fitted.sort(key=lambda result: -result.held_out.sum())
     candidates = tuple(result.candidate for result in fitted)
-    tied = [i for i, candidate in enumerate(candidates) if _ties(candidate, candidates[0])]
+    tied = [i for i, candidate in enumerate(candidates) if _ties(candidate, candidates[0], len(part.values))]
     chosen = fitted[min(tied, key=lambda i: candidates[i].size)]
     if part is not column:
         progress(f"{chosen.model.name} on all rows")
         chosen = _on_all(chosen, column)
     level = chosen.objective.level(chosen.ascent.at) if chosen.model.about_mean else None
-    return Choice(chosen.candidate, candidates, _numbers(chosen), level)
+    return Choice(chosen.candidate, candidates, _numbers(chosen, column), level)
 
 
 def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
@@ -150,12 +155,13 @@ def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
         return fitted
     blocks = np.arange(len(column.values)) * BLOCKS // len(column.values)
     held_out, everything = np.empty(BLOCKS), ColumnLikelihood(candidate, column, rows=len(column.values))
+    in_sample = float(everything.by_rows(fitted.ascent.at)[blocks > 0].sum())
     for fold in range(2):
         visible = replace(column, values=np.where((blocks % 2 == fold)[:, None], np.nan, column.table))
         values = _maximum(candidate, visible).candidate.values
         densities = everything.by_rows(everything.coordinates.of(list(values.values())))
         held_out[fold::2] = np.bincount(blocks, weights=densities.sum(axis=1), minlength=BLOCKS)[fold::2]
-    return fitted._replace(held_out=held_out[1:])
+    return fitted._replace(held_out=held_out[1:], in_sample=in_sample)
 
 
 def _maximum(candidate: Sum, column: Column) -> Fitted:
@@ -167,7 +173,7 @@ def _maximum(candidate: Sum, column: Column) -> Fitted:
     if not math.isfinite(ascent.found.value):
         rule = f"{candidate.name} must have a likelihood on the data, but has none from any start"
         raise ValueError(f"{rule}: data that a model predicts to the last digit have neither Q nor R")
-    return Fitted(candidate, objective, ascent, tuple(ascents), np.zeros(BLOCKS - 1))
+    return Fitted(candidate, objective, ascent, tuple(ascents))
 
 
 def _on_all(chosen: Fitted, column: Column) -> Fitted:
@@ -192,7 +198,7 @@ def filtered(signal: Signal, model: AffineModel, column: Column) -> Estimates:
         return run(KalmanFilter(model=model), filter_keys([0]), inputs, column.table[None])
     axes, n, r = model.m, len(signal.output), float(model.measurement_noise_cov[0, 0])
     dts, index = np.unique(np.diff(column.stamps), return_inverse=True)
-    f, noises = steps(signal.slope, signal.driven, signal.orders, dts)
+    f, noises = signal.steps(signal.slope, dts, column.dt)
     q = np.tensordot(np.diag(signal.densities)[list(signal.driven)], noises, 1)
     tables = StepTables(f, q, np.empty((0, 0, n, n)), np.empty((0, *q.shape)), np.empty(0))
     prior_covs = np.tile(model.prior_cov[:n, :n].ravel(), (axes, 1))
@@ -233,24 +239,38 @@ def _starts(objective: ColumnLikelihood, candidate: Sum, scales: Scales) -> list
 
 def behind(candidate: Candidate, best: Candidate) -> tuple[float, float]:
     """How much lower a candidate's likelihood on unseen blocks is, and the standard error of that."""
+    if not np.isfinite(candidate.held_out).all():
+        return math.inf, 0.0
     differences = best.held_out - candidate.held_out
     return float(differences.sum()), float(np.std(differences, ddof=1) * math.sqrt(len(differences)))
 
 
-def _ties(candidate: Candidate, best: Candidate) -> bool:
-    """Whether a candidate's likelihood on unseen blocks is as good as the best one's.
+def _ties(candidate: Candidate, best: Candidate, rows: int) -> bool:
+    """Whether a candidate's likelihood is as good as the best one's, on unseen blocks and on all with its size.
+
+    Each fit to half of the blocks tells weak signals from noise less well than one to all of them, so Schwarz's
+    criterion decides, too; of a frequency that is searched with the chance that it is the highest of noise.
 
     Sources: Breiman, Friedman, Olshen, Stone (1984), Classification and Regression Trees, section 3.4.3, for the
-    standard error; Kass, Raftery (1995), "Bayes factors", Journal of the American Statistical Association 90(430),
-    for the evidence below which no model is preferred; Dickey, Fuller (1979), "Distribution of the estimators for
-    autoregressive time series with a unit root", ibid. 74(366): a walk seems to return to the mean of its record.
+    standard error; Schwarz (1978), "Estimating the dimension of a model", Annals of Statistics 6(2); Kass, Raftery
+    (1995), "Bayes factors", Journal of the American Statistical Association 90(430), for the evidence below which
+    no model is preferred; Dickey, Fuller (1979), "Distribution of the estimators for autoregressive time series
+    with a unit root", ibid. 74(366): a walk seems to return to the mean of its record.
     """
     loss, error = behind(candidate, best)
-    returns = named_model(best.name).about_mean and not named_model(candidate.name).about_mean
-    return loss <= max(error, OF_RETURN if returns else EVIDENCE)
+    model = named_model(best.name)
+    returns = model.about_mean and not named_model(candidate.name).about_mean
+    least = OF_RETURN if returns else EVIDENCE
+    if any(number.is_searched for number in model.free):
+        least = max(least, math.log(0.5 * rows / CHANCE))
+    by_size = 0.5 * (best.size[0] - candidate.size[0]) * math.log(rows)
+    return (
+        loss <= max(error, OF_RETURN if returns else EVIDENCE)
+        and best.in_sample - candidate.in_sample <= max(by_size, 0.0) + least
+    )
 
 
-def _numbers(fitted: Fitted) -> tuple[Number, ...]:
+def _numbers(fitted: Fitted, column: Column) -> tuple[Number, ...]:
     """Values with intervals by the profile of the likelihood."""
     coordinates, best = fitted.objective.coordinates, fitted.ascent
     meanings = {number.name: number.meaning for number in fitted.model.free}
@@ -260,6 +280,9 @@ def _numbers(fitted: Fitted) -> tuple[Number, ...]:
             for limits in (coordinates.low, coordinates.high)
         ]
     )
+    for part, is_size in _chance_peaks(fitted, column):
+        ends[0, part] = coordinates.low[part]
+        ends[1, part] = np.where(is_size, ends[1, part], coordinates.high[part])
     inside = (ends[0] > coordinates.low) & (ends[1] < coordinates.high)
     values, low, high = (coordinates.values(at) for at in (best.at, *ends))
     rows = zip(coordinates.free, values.tolist(), low.tolist(), high.tolist(), inside.tolist(), strict=True)
@@ -269,21 +292,74 @@ def _numbers(fitted: Fitted) -> tuple[Number, ...]:
     )
 
 
+def _chance_peaks(fitted: Fitted, column: Column) -> list[tuple[slice, list[bool]]]:
+    """Parts whose frequency may be that of a peak of noise: their numbers, and which of these are sizes.
+
+    The data determine no such frequency, nor damping, nor more than the largest size. Of m frequencies, noise
+    alone gains log(m/0.05) in log-likelihood at one of them with a chance of 5 %.
+
+    Source: Davies (1987), "Hypothesis testing when a nuisance parameter is present only under the alternative",
+    Biometrika 74(1).
+    """
+    parts, first, column = [], 0, column.middle(MOST_ROWS)
+    for part in fitted.model.parts:
+        numbers, first = slice(first, first + len(part.free)), first + len(part.free)
+        if not any(number.is_searched for number in part.free):
+            continue
+        rest = tuple(other for other in fitted.model.parts if other is not part)
+        without = _maximum(Sum(" + ".join(other.name for other in rest), rest), column) if rest else _white(column)
+        densities = [
+            ColumnLikelihood(model, column, rows=len(column.values)).by_rows(at)
+            for model, at in ((fitted.model, fitted.ascent.at), (without.model, without.ascent.at))
+        ]
+        both = (densities[0] != 0.0) & (densities[1] != 0.0)
+        if (densities[0] - densities[1])[both].sum() < math.log(0.5 * both.sum() / CHANCE):
+            parts.append((numbers, ["U" in number.unit for number in part.free]))
+    return parts
+
+
+def _fall(fitted: Fitted, index: int, cov: np.ndarray) -> float:
+    """The fall of the log-likelihood at the ends of a 95 % interval: t^2/2, with t of Student's distribution.
+
+    A variance has as many degrees of freedom as independent squares would determine it equally well: 2 over the
+    variance of its logarithm. The other numbers of a signal have those of its size.
+    """
+    powers, first = fitted.objective.amplitude, 0
+    sizes = [len(powers) - 1]  # of R
+    for part in fitted.model.parts:
+        numbers, first = range(first, first + len(part.free)), first + len(part.free)
+        if index in numbers:
+            sizes = [j for j in numbers if powers[j] > 0.0]
+    degrees = [2.0 * powers[j] ** 2 / max(float(cov[j, j]), 1e-12) for j in sizes]
+    return 0.5 * float(stdtrit(max(min(degrees), LEAST_DEGREES), 0.975)) ** 2
+
+
+def _white(column: Column) -> Fitted:
+    """A level that stays, with white noise."""
+    model = named_model("constant")
+    objective = ColumnLikelihood(model, column)
+    low, high = objective.coordinates.low, objective.coordinates.high
+    ascent = climb(objective, np.array([low[0], high[1]]), low, high, fixed=np.array([True, False]))
+    return Fitted(model, objective, ascent, ())
+
+
 def _end(fitted: Fitted, index: int, limit: float) -> float:
-    """The coordinate towards `limit` from which on the profile has fallen by `FALL`, or the limit.
+    """The coordinate towards `limit` from which on the profile has fallen by `_fall`, or the limit.
 
     The search begins from the outermost maximum that is as likely: a profile may have several.
     """
     objective, best = fitted.objective, fitted.ascent
     coordinates, fixed = objective.coordinates, np.arange(len(best.at)) == index
     ends = coordinates.low[index], coordinates.high[index]
-    likely = [best, *(rival for rival in fitted.rivals if best.found.value - rival.found.value < FALL)]
+    cov = np.linalg.pinv(best.found.information)
+    most = _fall(fitted, index, cov)
+    likely = [best, *(rival for rival in fitted.rivals if best.found.value - rival.found.value < most)]
     outermost = min(likely, key=lambda maximum: abs(limit - maximum.at[index]))
     first, at = float(outermost.at[index]), outermost.at
 
     @cache
     def beyond(coordinate: float) -> float:
-        """The root of the fall, nearly linear in the coordinate, less that of `FALL`."""
+        """The root of the fall, nearly linear in the coordinate, less that of an end."""
         nonlocal at
         start = np.where(fixed, coordinate, at)
         profile = climb(objective, start, coordinates.low, coordinates.high, fixed=fixed, iterations=15)
@@ -291,15 +367,16 @@ def _end(fitted: Fitted, index: int, limit: float) -> float:
         if not math.isfinite(fall):
             return FAR
         at = profile.at
-        return math.sqrt(max(fall, 0.0)) - math.sqrt(FALL)
+        return math.sqrt(max(fall, 0.0)) - math.sqrt(most)
 
-    deviation = math.sqrt(max(float(np.linalg.pinv(best.found.information)[index, index]), 0.0))
-    if 0.0 < deviation < NORMAL and len(likely) == 1:
-        return float(np.clip(first + math.copysign(math.sqrt(2.0 * FALL) * deviation, limit - first), *ends))
-    reach, outer = min(max(2.0 * deviation, NORMAL), 3.0), first
+    deviation = math.sqrt(max(float(cov[index, index]), 0.0))
+    if 0.0 < deviation < NORMAL and objective.counted > MOST_ROWS:
+        return float(np.clip(first + math.copysign(math.sqrt(2.0 * most) * deviation, limit - first), *ends))
+    reach, outer = min(max(2.0 * deviation, PRECISION), 3.0), first
+    precision = min(PRECISION, 0.05 * deviation or PRECISION)
     while outer != limit and beyond(outer) < 0.0:
         inner, outer = outer, min(first + reach, limit) if limit > first else max(first - reach, limit)
         if beyond(outer) > 0.0:
-            return float(brentq(beyond, inner, outer, xtol=PRECISION))
+            return float(brentq(beyond, inner, outer, xtol=precision))
         reach *= 2.0
     return outer

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.models import Signal, Sum, in_unit, steps
+from filters.models import Sum, in_unit
+from filters.signals import Signal, with_level
 from thruster_env.model.affine import AffineModel
 from tuning.identification.objective import STEP, Evaluation
 from tuning.problems.problem import Coordinates, Parameter, squared
@@ -63,7 +64,7 @@ class Points(NamedTuple):
     slopes: np.ndarray  # A of points with different ones, (g', n, n)
     of_slopes: np.ndarray  # (g,), which of these a point has
     densities: np.ndarray  # of the driven states, (g, d)
-    variances: np.ndarray  # (g, n)
+    first: np.ndarray  # covariances of the first state, (g, n, n)
     noises: np.ndarray  # R, (g,)
 
 
@@ -84,9 +85,16 @@ class ColumnLikelihood:
 
     def __init__(self, candidate: Sum, column: Column, rows: int = RUN):
         scales, unit = column.scales, column.quantities[0].unit
-        self._candidate, self._mean, self._rows = candidate, column.mean, len(column.table)
+        self._candidate, self._mean, self._rows, self._dt = candidate, column.mean, len(column.table), column.dt
         free = [
-            Parameter(number.name, low, high, in_unit(number.unit, unit), default=number.values(scales)[0])
+            Parameter(
+                number.name,
+                low,
+                high,
+                in_unit(number.unit, unit),
+                log=number.log,
+                default=number.values(scales)[0],
+            )
             for number in candidate.free
             for low, high in [number.range(scales)]
         ]
@@ -98,7 +106,7 @@ class ColumnLikelihood:
         first = self._signal([parameter.start for parameter in free])
         candidate.check_harmonics(first, column.dt)
         self._n, self.states = len(first.output), len(first.output) - candidate.about_mean
-        self._anywhere = np.flatnonzero(np.isinf(first.variances))
+        self._anywhere = np.flatnonzero(np.isinf(np.diag(first.first)))
         self._wide = first.start(scales.spread, column.dt)
         self._rates_move, self._last_steps = self._moving_rates(), dict[int, Any]()
         count, axes, needed = max(1, round(self._rows / rows)), len(column.mean), max(len(self._anywhere), 1)
@@ -154,7 +162,9 @@ class ColumnLikelihood:
         """Log densities of the innovations that count, (K, axes), 0 elsewhere; the record must be one run."""
         sums = self._summed(at, (), each_row=True)
         v, s = sums.innovations[..., 0], sums.innovations[..., 1]
-        return np.where(self._counts, -0.5 * (np.log(2.0 * math.pi * s) + v**2 / s), 0.0).T
+        with np.errstate(all="ignore"):  # S may be negative, by rounding, for a deviation far above the noise's
+            densities = np.where(s > 0.0, -0.5 * (np.log(2.0 * math.pi * s) + v**2 / s), -math.inf)
+        return np.where(self._counts, densities, 0.0).T
 
     def level(self, at: np.ndarray) -> np.ndarray:
         """The mean about which the signal of each axis varies, by generalised least squares, (axes,)."""
@@ -186,7 +196,7 @@ class ColumnLikelihood:
             np.array([signal.slope for signal, apart in zip(signals, is_apart, strict=True) if apart]),
             np.where(is_apart, np.cumsum(is_apart) - 1, 0),
             np.array([np.diagonal(signal.densities)[list(here.driven)] for signal in signals]),
-            np.array([signal.variances for signal in signals]),
+            np.array([signal.first for signal in signals]),
             np.array(noises),
         )
         begin, parts = self._beginning(here, points), []
@@ -197,10 +207,10 @@ class ColumnLikelihood:
         return parts[0] if len(parts) == 1 else Sums(*map(np.concatenate, zip(*parts, strict=True)))
 
     def _steps(self, here: Signal, slopes: np.ndarray, key: int, dts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`filters.models.steps`, again where rates are those of the last call."""
+        """F and Q of steps for rates, again where rates are those of the last call."""
         rates = slopes.tobytes()
         if self._last_steps.get(key, (b"",))[0] != rates:
-            self._last_steps[key] = rates, steps(slopes, here.driven, here.orders, dts)
+            self._last_steps[key] = rates, here.steps(slopes, dts, self._dt)
         return self._last_steps[key][1]
 
     def _tables(
@@ -280,14 +290,14 @@ class ColumnLikelihood:
         where d are the states that begin anywhere, e and w the stationary states and noise since then.
         """
         n, d, count, g = self._n, len(self._anywhere), len(self._z), len(points.noises)
-        known = np.isfinite(points.variances)
+        known = np.isfinite(points.first)
         if not self._is_exact:
-            covs = np.where(known, points.variances, self._wide)[:, :, None] * np.eye(n)
+            covs = np.where(known, points.first, self._wide)
             covs = np.broadcast_to(covs[:, None], (g, count, n, n))
             return self._as_beginning(np.zeros((g, count, n)), covs, self._begin_at[:, 0], is_prediction=True)
         observed, phi, f, noises = self._observed(here, points.slopes)
         (_, index), of = self._begin_steps, points.of_slopes
-        p = np.where(known, points.variances, 0.0)[:, :, None] * np.eye(n)
+        p = np.where(known, points.first, 0.0)
         p = np.broadcast_to(p[:, None], (g, count, n, n))
         across, among = np.zeros((g, count, d, n)), np.zeros((g, count, d, d))
         for j in range(d):
@@ -313,21 +323,6 @@ class ColumnLikelihood:
         beliefs = np.concatenate([means, covs.reshape(*means.shape[:2], -1)], axis=-1)
         slopes = np.swapaxes(beliefs[1::2] - beliefs[2::2], 0, 1) / (2.0 * STEP)
         return Beginning(rows, is_prediction, beliefs[0], slopes, self._begin_at[:, -1] + 1)
-
-
-def with_level(signal: Signal) -> Signal:
-    """A signal about a level that stays, its last state."""
-    n = len(signal.output)
-    slope, densities = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1))
-    slope[:n, :n], densities[:n, :n] = signal.slope, signal.densities
-    return Signal(
-        slope,
-        densities,
-        np.append(signal.output, 1.0),
-        (*signal.states, ("mean", "U")),
-        (*signal.orders, 0),
-        np.append(signal.variances, np.inf),
-    )
 
 
 def _power(unit: str) -> float:
