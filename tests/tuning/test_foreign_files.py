@@ -11,7 +11,7 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates
 from tests.tuned_files import rewrite, write_untuned
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
-from tuning.api.report import write_report
+from tuning.api.report import report
 from tuning.api.verify import verify
 from tuning.evaluation.tuned import read_tuned
 from tuning.policies.setup import configuration_from_json, in_scenario, make_configuration
@@ -73,7 +73,7 @@ def test_a_tuned_file_that_names_code_is_refused_by_all_that_take_one(file):
         lambda: make_configuration("tracking", scenario, "ekf", tuned=path),
         lambda: read_tuned(path),
         lambda: verify(path),
-        lambda: write_report(path, "none.journal"),
+        lambda: report(path, storage="none.journal", progress=False),
     ]
     for take in takers:
         with pytest.raises(ValueError, match=RULE) as error:

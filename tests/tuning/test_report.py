@@ -10,7 +10,7 @@ import optuna
 import pytest
 
 from filters.consistency.nees import Interval
-from tuning.api.report import write_report
+from tuning.api.report import report as write_report
 from tuning.cli.main import main
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
@@ -77,7 +77,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder):
     result = tuned(Plan("enkf", (MISMATCH,)), 14)
-    report = write_report("s.json", STORAGE)
+    report = write_report("s.json", storage=STORAGE)
     assert (report.page.as_posix(), report.markdown.as_posix()) == ("s.html", "s.md")
     text = report.page.read_text()
     page = Page(text)
@@ -118,7 +118,7 @@ def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder)
         f"| {name} | " in tables for name in ("rule of thumb", "scaled default", "oracle")
     )
     assert "upper end of its 95 % interval" in words and "250000 to 250099" in text
-    assert write_report("s.json", STORAGE, "again").page.read_text() == text
+    assert write_report("s.json", "again", storage=STORAGE).page.read_text() == text
 
 
 @pytest.mark.slow
@@ -128,7 +128,7 @@ def test_without_its_study_a_tuned_file_still_has_a_page():
     tuned(plan, 2)
     open_study("s", plan._replace(seed=1), open_storage("other.journal"))  # of the same name
     for storage in ("nowhere.journal", "other.journal", STORAGE):
-        page = Page(write_report("s.json", storage, "out").page.read_text())
+        page = Page(write_report("s.json", "out", storage=storage).page.read_text())
         said = "Study 's' is not in the storage" in " ".join(page.words)
         assert said == (storage != STORAGE)
         assert "Error against ensemble size" not in page.headings
@@ -140,7 +140,7 @@ def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
     monkeypatch.setattr("tuning.reporting.subject.HELD_OUT_SEEDS", 6)
     plan = Plan("ekf", (MISMATCH, OUTLIERS), objectives=("score", "consistency"), consistent=False)
     run_study(open_study("front", plan, open_storage(STORAGE)), plan, FEWEST_TRIALS)
-    report = write_report("front", STORAGE)
+    report = write_report("front", storage=STORAGE)
     assert report.page.as_posix() == "out/front.html"
     page = Page(report.page.read_text())
     words = " ".join(page.words)
@@ -152,7 +152,7 @@ def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
 @pytest.mark.usefixtures("undrawn")
 def test_a_baseline_has_no_covariance_to_speak_of():
     tuned(Plan("low-pass", (MISMATCH,)), 3)
-    report = write_report("s.json", STORAGE)
+    report = write_report("s.json", storage=STORAGE)
     assert "covariance" not in report.advice
     page = Page(report.page.read_text())
     assert "Is the covariance consistent?" not in page.headings

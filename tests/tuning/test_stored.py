@@ -10,7 +10,7 @@ from filters.tuned_file import read_tuned_file
 from tests.tuned_files import rewrite, write_untuned
 from tuning.api import report
 from tuning.api.held_out import HeldOut
-from tuning.api.report import write_report
+from tuning.api.report import report as write_report
 from tuning.evaluation import held_out as summary
 from tuning.evaluation.held_out import evaluate_held_out, sizes_as_data, stored_comparison, stored_sizes
 from tuning.evaluation.sizes import SizeRow
@@ -57,10 +57,10 @@ def test_a_report_takes_what_the_file_keeps_unless_the_problem_has_changed(tmp_p
     monkeypatch.setattr(
         report, "evaluate_held_out", lambda *given: asked.append(given) or evaluate_held_out(*given)
     )
-    tables = write_report(path, "none.journal").markdown.read_text()
+    tables = write_report(path, storage="none.journal").markdown.read_text()
     assert not asked
     rewrite(path, lambda content: content.update(digest="another"))
-    assert write_report(path, "none.journal").markdown.read_text() == tables and len(asked) == 1
+    assert write_report(path, storage="none.journal").markdown.read_text() == tables and len(asked) == 1
 
 
 def test_ensemble_sizes_read_as_they_were_of_the_same_choice_alone(monkeypatch):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -37,11 +37,11 @@ from tuning.evaluation.evaluate import evaluate, likelihood_gain, score_ratio
 from tuning.evaluation.held_out import (
     Comparison,
     evaluate_held_out,
-    sizes_as_data,
     stored_comparison,
     stored_sizes,
 )
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
+from tuning.evaluation.tuned import tuned_content
 from tuning.likelihood.identifiability import identify, sentences, too_many
 from tuning.problems.problem import Problem
 from tuning.reporting.page import Pair, Section, Table, Words, html_page, markdown_page
@@ -57,12 +57,11 @@ from tuning.reporting.sections import (
     search_section,
     sizes_section,
 )
-from tuning.reporting.subject import Subject, find_subject, is_file
+from tuning.reporting.subject import Subject, find_subject, is_file, kept_nis
 from tuning.reporting.tables import known_table
-from tuning.search.among_types import SIZES
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import at_ends
-from tuning.search.storage import open_storage, quiet_optuna, storage_text
+from tuning.search.storage import quiet_optuna, storage_text
 from tuning.search.trials import measure
 
 
@@ -138,62 +137,81 @@ def report(
         ValueError: if the source is refused, or the page cannot be written.
     """
     console = console_for(progress)
-    several: list[Any] = [source] if isinstance(source, str | Path | Study) else source  # type: ignore[assignment]
-    several = list(several) if isinstance(several, list | tuple) else [several]
+    sources: list[Any] = list(source) if isinstance(source, list | tuple) else [source]
     if isinstance(out, Study) or (out is not None and Path(out).suffix == ".json"):
         rule = "a page must be a file that ends in .html, or a folder for it, and two studies must be in one list"
         raise ValueError(f"{rule}, but got out={short_repr(out if isinstance(out, Study) else str(out))}")
-    page = None if out is None or Path(out).suffix != ".html" else Path(out)
-    if page is not None:
-        check_target(page)
-    names = [subject.name if isinstance(subject, Study) else str(subject) for subject in several]
-    doing = f"reporting on {' and '.join(names)}"
-    with quiet_optuna(), working(doing, console), tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch) / "page" if page is not None else None if out is None else Path(out)
-        if folder is None and several and isinstance(several[0], Study):
-            folder = Path("out")  # beside its scratch file the page would be lost
-        sources = [
-            _of_value(subject, Path(scratch) / str(i))
-            if isinstance(subject, Study)
-            else Source(subject, storage_text(storage), _given(subject, problem, model, preset))
-            for i, subject in enumerate(several)
+    if len(sources) not in (1, 2):
+        raise ValueError(f"a side-by-side report must be of two studies, but got {len(sources)}")
+    names = list(map(_name_of, sources))
+    if len(sources) == 2 and names[0] == names[1]:
+        names = [f"{name} ({which})" for name, which in zip(names, "12", strict=True)]
+    with quiet_optuna(), working(f"reporting on {' and '.join(names)}", console):
+        where = storage_text(storage)
+        subjects = [
+            _of_value(each)
+            if isinstance(each, Study)
+            else find_subject(each, where, _given(each, problem, model, preset))
+            for each in sources
         ]
-        if len(sources) == 1:
-            single = sources[0]
-            written = write_report(single.name, single.storage, folder, single.problems, single.file)
-        else:
-            written = write_two_studies(sources, folder)
-        if page is None:
-            return written
-        write_whole(page, written.page.read_bytes())
-        write_whole(page.with_suffix(".md"), written.markdown.read_bytes())
-        return Report(page, page.with_suffix(".md"), written.advice)
+        page = page_of(sources, "-beside-".join(names), out)
+        prefixes = "p" if len(sources) == 1 else "ab"
+        parts = list(map(pages_of, map(_file_of, sources), subjects, prefixes))
+        contents = parts[0] if len(parts) == 1 else beside(names, parts)
+        advice = [contents.advice] if len(parts) == 1 else contents.advice.splitlines()
+        write_whole(page, html_page(contents.title, advice, contents.sections, two_columns=len(parts) == 2))
+        write_whole(page.with_suffix(".md"), markdown_page(contents.title, [*advice, *contents.results]))
+    return Report(page, page.with_suffix(".md"), contents.advice)
 
 
-def _given(source: str | Path, problem: Any, model: Any, preset: str | Path | None) -> Sequence[Problem]:
-    """What the user gives of the problems that a file or a study names."""
+def page_of(sources: Sequence[Any], name: str, out: str | Path | None) -> Path:
+    """The page: `out`, or a file of a name in the folder `out`, or beside the first tuned file; checked."""
+    first = sources[0]
+    folder = Path("out") if isinstance(first, Study) or not is_file(first) else Path(first).parent
+    page = (folder if out is None else Path(out)) / f"{name}.html"
+    if out is not None and Path(out).suffix == ".html":
+        page = Path(out)
+    for target in (page, page.with_suffix(".md")):
+        check_target(target)
+    return page
+
+
+def _name_of(source: Any) -> str:
+    """The name of a study, or of its tuned file."""
+    if isinstance(source, Study):
+        return source.name
     if not isinstance(source, str | Path):
         raise ValueError(
             f"a report must be of a Study, a tuned file or the name of a study, but got {short_repr(source)}"
         )
+    return Path(source).stem if is_file(source) else str(source)
+
+
+def _file_of(source: str | Path | Study) -> str | None:
+    """What the page calls the tuned file; None if there is none."""
+    if isinstance(source, Study):
+        return None if source.file is None else str(source.file)
+    return str(source) if is_file(source) else None
+
+
+def _given(source: str | Path, problem: Any, model: Any, preset: str | Path | None) -> Sequence[Problem]:
+    """What the user gives of the problems that a file or a study names."""
     if is_file(source) and Path(source).is_file():
         return given_for(source, problem, model, preset)
     return [] if problem is None else problems_of(problem)
 
 
-def _of_value(study: Study, folder: Path) -> Source:
-    """A study as a tuned file and a journal that holds its trials, in a folder of its own."""
-    folder.mkdir()
-    journal, plan, sizes = str(folder / "study.journal"), study.plan, study.result.sizes
-    directions = [StudyDirection.MINIMIZE] * len(plan.objectives)
-    copied = optuna.create_study(study_name=study.name, storage=open_storage(journal), directions=directions)
-    copied.set_user_attr("identity", plan.identity)
-    if sizes:
-        copied.set_user_attr(SIZES, sizes_as_data(sizes, study.result.sized or study.choice, plan))
-    copied.add_trials(study.trials)
-    file = folder / f"{study.name}.json"
-    study.write(file)
-    return Source(file, journal, study.problems, str(study.file) if study.file else "")
+def _of_value(study: Study) -> Subject:
+    """A study that is at hand, as its tuned file would have it."""
+    plan, result = study.plan, study.result
+    content = json.loads(json.dumps(tuned_content(plan, result, study.comparisons, study.name, study.method)))
+    trials = optuna.create_study(
+        study_name=study.name, directions=[StudyDirection.MINIMIZE] * len(plan.objectives)
+    )
+    trials.add_trials(study.trials)
+    consistent, seeds = plan.is_constrained and bool(result.consistent), len(study.comparison.seeds)
+    kept = content, content["ensemble_sizes"], content["choice"], kept_nis(content, plan)
+    return Subject(study.name, plan, study.choice, trials, seeds, True, consistent, *kept)
 
 
 # The page of one study.
@@ -210,50 +228,13 @@ class Pages(NamedTuple):
     comparisons: list[Comparison]
 
 
-def write_report(
-    source: str | Path,
-    storage: str,
-    out: str | Path | None = None,
-    problems: Sequence[Problem] = (),
-    file: str | None = None,
-) -> Report:
-    """Write a page, NAME.html, and its tables, NAME.md, on a tuned file or a study.
+def pages_of(file: str | None, subject: Subject, prefix: str = "p") -> Pages:
+    """The contents of a page on a study, whose pictures' names begin with a prefix.
 
     Held-out metrics and the table of ensemble sizes come from the file or the study if they were made from the
     same problems by the same versions of packages; otherwise they are recomputed. `verify` always recomputes.
-
-    Args:
-        source: a tuned file, or the name of a study.
-        storage: where the study is; without it a page on a tuned file leaves the search out.
-        out: folder of the two files, by default that of the tuned file, or `out`.
-        problems: what it is of, where that is code: nothing that a file or a study names is imported.
-        file: what the page calls the tuned file, empty for one that is not saved; the source itself if None.
-
-    Raises:
-        ValueError: if the tuned file is refused, there is no such study, or the folder cannot be written.
     """
-    subject = find_subject(source, storage, problems)
-    name = Path(source).stem if is_file(source) else subject.name
-    page, tables = report_files(source, name, out)
-    contents = pages_of(source, subject, file=file)
-    write_whole(page, html_page(contents.title, contents.advice, contents.sections))
-    write_whole(tables, markdown_page(contents.title, [contents.advice, *contents.results]))
-    return Report(page, tables, contents.advice)
-
-
-def report_files(source: str | Path, name: str, out: str | Path | None) -> tuple[Path, Path]:
-    """Page and tables of a name, in `out` or beside the tuned file; ValueError if they cannot be written."""
-    folder = Path(out) if out is not None else Path(source).parent if is_file(source) else Path("out")
-    targets = folder / f"{name}.html", folder / f"{name}.md"
-    for target in targets:
-        check_target(target)
-    return targets
-
-
-def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str | None = None) -> Pages:
-    """The contents of a page on a study, whose pictures' names begin with a prefix."""
     plan, choice = subject.plan, subject.choice
-    file = str(source) if file is None and is_file(source) else file or None
     data = plan.training_data()
     sizes: Sequence[SizeRow] = []
     if filter_type(choice.name).has_ensemble:
@@ -315,50 +296,14 @@ def _short(name: str) -> str:
 # The report of two studies: their results, section by section and side by side.
 
 
-class Source(NamedTuple):
-    """One side of a page: a tuned file or a study, and its location."""
-
-    name: str | Path  # a tuned file, or the name of a study
-    storage: str  # where the study is
-    problems: Sequence[Problem] = ()  # what it is of, where that is code
-    file: str | None = None  # what the page calls the tuned file, as in `write_report`
-
-
-def write_two_studies(sources: Sequence[Source], out: str | Path | None = None) -> Report:
-    """Write a page, A-beside-B.html, and its tables, A-beside-B.md, on two tuned files or studies.
-
-    If both are of the same problem, a table has the ratio of their scores, paired on the same held-out seeds.
-
-    Args:
-        sources: two tuned files or studies.
-        out: folder of the two files, by default that of the first tuned file, or `out`.
-
-    Raises:
-        ValueError: as `write_report`, or if these are not two.
-    """
-    if len(sources) != 2:
-        raise ValueError(f"a side-by-side report must be of two studies, but got {len(sources)}")
-    subjects = [find_subject(source.name, source.storage, source.problems) for source in sources]
-    names = [
-        Path(source.name).stem if is_file(source.name) else subject.name
-        for source, subject in zip(sources, subjects, strict=True)
-    ]
-    names = (
-        names if names[0] != names[1] else [f"{name} ({which})" for name, which in zip(names, "12", strict=True)]
-    )
-    page, tables = report_files(sources[0].name, "-beside-".join(names), out)
-    pages = [
-        pages_of(source.name, subject, prefix, source.file)
-        for source, subject, prefix in zip(sources, subjects, "ab", strict=True)
-    ]
-    title = " beside ".join(names)
-    advice = [f"{name}: {contents.advice}" for name, contents in zip(names, pages, strict=True)]
+def beside(names: Sequence[str], pages: Sequence[Pages]) -> Pages:
+    """The contents of a page on two studies; of the same problem with the paired ratio of their scores."""
+    advice = "\n".join(f"{name}: {contents.advice}" for name, contents in zip(names, pages, strict=True))
     table, remark = _summary(names, pages)
     sections = [Section("Side by side", [table, *([Words([remark])] if remark else [])]), *_paired(names, pages)]
-    write_whole(page, html_page(title, advice, sections, two_columns=True))
-    every = [table, *pages[0].results, *pages[1].results]
-    write_whole(tables, markdown_page(title, [*advice, *every]))
-    return Report(page, tables, "\n".join(advice))
+    results = [table, *pages[0].results, *pages[1].results]
+    comparisons = [*pages[0].comparisons, *pages[1].comparisons]
+    return Pages(pages[0].subject, " beside ".join(names), advice, sections, results, comparisons)
 
 
 def _paired(names: Sequence[str], pages: Sequence[Pages]) -> list[Section]:

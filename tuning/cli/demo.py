@@ -16,7 +16,8 @@ from filters.filter import Filter
 from thruster_env.core.text_tables import Table
 from tuning.api.markers import OUTPUT, RUNS, Option, Seed
 from tuning.api.progress import working
-from tuning.api.report import Report, write_report
+from tuning.api.report import Report
+from tuning.api.report import report as write_report
 from tuning.api.result import Printed
 from tuning.api.study import INTERRUPTED, Study
 from tuning.api.tune import run_tuning
@@ -64,7 +65,7 @@ def command(
     best = None if tuning.result.interrupted else best_type(plan, trials, storage, out)
     with working("drawing", progress_console):
         pictures = draw(tuning, out)
-        report = write_report(file, storage, out)
+        report = write_report(file, out, storage=storage, progress=False)
     seconds = time.perf_counter() - started
     data = {
         "tuning": as_json(tuning),

@@ -10,6 +10,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -63,10 +64,21 @@ def write_tuned(
     study_name: str,
     method: str | None = None,
 ) -> None:
-    """Write a tuned file, completely or not at all.
+    """Write a tuned file with `tuned_content`, completely or not at all; ValueError if it cannot be written."""
+    content = tuned_content(plan, result, comparisons, study_name, method)
+    write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
+
+
+def tuned_content(
+    plan: Plan,
+    result: StudyResult,
+    comparisons: Sequence[Comparison],
+    study_name: str,
+    method: str | None = None,
+) -> dict[str, Any]:
+    """The content of a tuned file.
 
     Args:
-        path: path of the file.
         plan: the plan of the study.
         result: its result, with the choice.
         comparisons: held-out evaluations, one for each scenario.
@@ -74,13 +86,13 @@ def write_tuned(
         method: name of the method that made the choice, or "by hand"; the plan's sampler if None.
 
     Raises:
-        ValueError: if the folder cannot be written, or the filter is an estimator, which is code.
+        ValueError: if the filter is an estimator, which is code.
     """
     choice, problem = result.choice, plan.scenarios[0]
     check_keepable(choice.name)
     model = problem.model(**choice.model)
     pairs = list(zip(plan.scenarios, comparisons, strict=True))
-    content = {
+    return {
         "format": FILE_FORMAT,
         "version": FILE_VERSION,
         "made_with": versions(),
@@ -113,7 +125,6 @@ def write_tuned(
         "choice": as_data(result.validation),
         "ensemble_sizes": sizes_as_data(result.sizes, result.sized or choice, plan) if result.sizes else None,
     }
-    write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
 
 
 def _monitor_of(choice: Choice, plan: Plan) -> dict | None:

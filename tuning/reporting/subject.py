@@ -75,12 +75,12 @@ def _of_file(path: str, storage: str, problems: Sequence[Problem]) -> Subject:
         raise ValueError(f"a tuned file must contain its held-out seeds, but {path} does not") from None
     consistent = plan.is_constrained and bool(content["study"].get("any_trial_consistent"))
     stored = content if content.get("digest") == plan.scenarios[0].digest else {}
-    sizes, nis = content.get("ensemble_sizes"), _kept_nis(stored, plan)
+    sizes, nis = content.get("ensemble_sizes"), kept_nis(stored, plan)
     met = content.get("choice")
     return Subject(name, plan, choice, study, count, True, consistent, stored, sizes, met, nis)
 
 
-def _kept_nis(content: Mapping, plan: Plan) -> tuple[float, ...]:
+def kept_nis(content: Mapping, plan: Plan) -> tuple[float, ...]:
     """The mean NIS on the training seeds in a tuned file; nothing if it was made with other packages."""
     ratios = content.get("study", {}).get("mean_nis") if content.get("made_with") == versions() else None
     if not isinstance(ratios, list) or len(ratios) != len(plan.scenarios):

@@ -66,7 +66,7 @@ def test_a_demo_whose_search_was_interrupted_says_so_and_exits_with_130(run_demo
 
     monkeypatch.setattr(demo, "run_tuning", interrupted)
     monkeypatch.setattr(demo, "draw", lambda *_: {})
-    monkeypatch.setattr(demo, "write_report", lambda *_: Report(page, page, "Tuning lowers the score."))
+    monkeypatch.setattr(demo, "write_report", lambda *_, **options: Report(page, page, "Tuning lowers the score."))
     code, lines = run_demo()
     assert code == 130 and "3 trials, interrupted, on 32 runs" in " ".join(lines)
 
