@@ -37,7 +37,7 @@ import numpy as np
 from thruster_env.core.checks import short_repr
 from thruster_env.thruster.analysis import steady_state
 from thruster_env.thruster.dynamics import thrust_and_torque
-from thruster_env.thruster.parameters import T200, ThrusterParameters, derive_constants
+from thruster_env.thruster.parameters import ThrusterParameters, derive_constants
 
 COLUMNS = ("pwm_us", "rpm", "current_A", "voltage_V", "force_kgf")
 CENTRE, SPAN = 1500.0, 400.0  # pulse width at rest, and from there to full throttle [us]
@@ -285,31 +285,3 @@ The gain compensates the model's torque, which is larger astern than the thruste
 but with a gain of exactly one a goal is narrowly missed: the fit then compensates the torque with more thrust
 astern, whose median error at measured speed is 3.03 % at the held-out voltages. With the gain it is 2.93 %.
 """
-
-PRESET = Identified(T200, T200_PULSE_WIDTHS)
-
-
-def identified_numbers(identified: Identified) -> dict[str, float]:
-    """The seven numbers of a fit by name."""
-    return {name: getattr(identified.thruster, name) for name in FITTED} | identified.pulse_widths._asdict()
-
-
-def coefficients(identified: Identified, table: BollardTable) -> dict[str, dict[str, float]]:
-    """Bollard coefficients K_T = T/(rho n^2 D^4) and K_Q = Q/(rho n^2 D^5), n in turns a second, by direction.
-
-    Beside the model's they are the medians of the table, where Q is the motor's current times K1/K2.
-    """
-    p = identified.thruster
-    unit = p.density * p.diameter**4 / (2 * math.pi) ** 2  # thrust over K_T omega_m^2
-    guess = predict(identified, table)
-    astern, ahead = bollard_forces(p)
-    by_direction = {}
-    for name, rows, (thrust, torque) in (("ahead", table.ahead, ahead), ("astern", ~table.ahead, astern)):
-        k_t, k_q = float(thrust / unit), float(torque / unit / p.diameter)
-        by_direction[name] = {
-            "K_T": k_t,
-            "K_T measured": k_t * float(np.median((table.thrust / guess.thrust_from_speed)[rows])),
-            "K_Q": k_q,
-            "K_Q from current": k_q * float(np.median((table.current / guess.current_from_speed)[rows])),
-        }
-    return by_direction

@@ -8,18 +8,18 @@ from thruster_env.thruster.analysis import jacobians, required_substeps, steady_
 from thruster_env.thruster.dynamics import thrust_and_torque
 from thruster_env.thruster.parameters import PRESETS, T200, checked, derive_constants
 from tuning.thruster.bollard import (
-    PRESET,
+    FITTED,
     T200_PULSE_WIDTHS,
     Identified,
     PulseWidthMap,
-    coefficients,
-    identified_numbers,
+    bollard_forces,
     identify,
     predict,
     read_table,
     relative_errors,
 )
 
+PRESET = Identified(T200, T200_PULSE_WIDTHS)
 OTHER = Identified(
     T200._replace(
         lift_coefficient=0.5, drag_coefficient=0.2, thrust_asymmetry=0.1, motor_damping=60.0, voltage_gain=2500.0
@@ -37,6 +37,10 @@ QUOTED = (
     (12, 1700, 1796.49, 1.27913),
     (16, 1300, 2140.15, -1.43789),
 )
+
+
+def identified_numbers(found):
+    return {name: getattr(found.thruster, name) for name in FITTED} | found.pulse_widths._asdict()
 
 
 def recorded_rows(found):
@@ -122,16 +126,13 @@ def test_the_preset_is_a_preset():
     assert T200.added_mass == pytest.approx(T200.density * T200.area * length, rel=1e-4)
 
 
-def test_the_preset_has_the_measured_thrust_coefficients(table_path):
-    bollard = coefficients(PRESET, read_table(table_path))
-    assert bollard["ahead"]["K_T"] == pytest.approx(0.429, rel=0.015)
-    assert bollard["astern"]["K_T"] == pytest.approx(0.335, rel=0.015)
-
-
-def test_the_asymmetry_of_the_preset_hardly_shows_in_its_torque(table_path):
-    bollard = coefficients(PRESET, read_table(table_path))
-    assert bollard["ahead"]["K_Q"] == pytest.approx(0.0566, rel=0.04)
-    assert 1.0 < bollard["astern"]["K_Q"] / bollard["ahead"]["K_Q"] < 1.06
+def test_the_preset_has_the_measured_coefficients_and_its_asymmetry_hardly_shows_in_torque():
+    unit = T200.density * T200.diameter**4 / (2 * math.pi) ** 2  # thrust over K_T omega_m^2
+    (thrust_astern, torque_astern), (thrust, torque) = bollard_forces(T200)
+    assert thrust / unit == pytest.approx(0.429, rel=0.015)
+    assert thrust_astern / unit == pytest.approx(0.335, rel=0.015)
+    assert torque / unit / T200.diameter == pytest.approx(0.0566, rel=0.04)
+    assert 1.0 < torque_astern / torque < 1.06
     assert steady_state(T200, -13.0).omega_m == pytest.approx(-steady_state(T200, 13.0).omega_m, rel=0.015)
 
 
