@@ -22,10 +22,10 @@ from tuning.experiments.vehicle.experiment import (
     PATHS,
     Task,
     along_path,
-    find_path,
     keys_of,
     measured_velocities,
     noise_free,
+    path_inputs,
     run_tasks,
     scores_of,
     true_runs,
@@ -51,7 +51,7 @@ GAPS = {  # x, y, z, psi: RMSE of the transformation by yaw alone on noise-free 
 
 @pytest.mark.parametrize("name", PATHS)
 def test_paths_end_where_they_should_and_yaw_alone_leads_elsewhere(name):
-    states = noise_free("vehicle", PATHS[name].inputs())
+    states = noise_free("vehicle", path_inputs(name))
     np.testing.assert_allclose(states[-1, 9:], ENDS[name], atol=6e-3)
     pose = states[:, [9, 10, 11, 8]]
     gap = np.sqrt(np.square(planar_pose(states[None, :, :6], DT)[0] - pose).mean(axis=0))
@@ -63,35 +63,35 @@ def test_paths_end_where_they_should_and_yaw_alone_leads_elsewhere(name):
 
 
 def test_inputs_of_the_dynamic_path_change_sign_as_the_sines_do():
-    inputs, time = PATHS["dynamic"].inputs(), DT * np.arange(25000)
+    inputs, time = path_inputs("dynamic"), DT * np.arange(25000)
     np.testing.assert_array_equal(inputs[:, 2] > 0, (time % 14.0) < 7.0)
     np.testing.assert_array_equal(inputs[:, 3] > 0, (time % 10.0) < 5.0)
     np.testing.assert_allclose(np.unique(inputs[:, 0]), 2.84531 * np.array([0.6, 1.4]))
     np.testing.assert_allclose(inputs[:, 1], -0.006 * inputs[:, 0])
     with pytest.raises(ValueError, match="path must be one of I, II, III, IV, dynamic, but got 'V'"):
-        find_path("V")
+        path_inputs("V")
 
 
 def test_measurements_alone_are_what_the_sensors_say():
-    truth = true_runs("vehicle", keys_of("III", 2, 0), PATHS["III"].inputs(400))
+    truth = true_runs("vehicle", keys_of("III", 2, 0), path_inputs("III", 400))
     velocities = measured_velocities(truth)
     np.testing.assert_array_equal(velocities[..., [0, 1, 2, 5]], truth.measurements)
     assert not velocities[..., 3:5].any()
     errors = (velocities - truth.states[..., :6])[..., [0, 1, 2, 5]]
     np.testing.assert_allclose(errors.std(axis=(0, 1)), 1e-3, rtol=0.1)
-    scores = scores_of(measured(), truth, keys_of("III", 2, 0), PATHS["III"].inputs(400))
+    scores = scores_of(measured(), truth, keys_of("III", 2, 0), path_inputs("III", 400))
     assert np.isnan(scores.full).all() and np.isnan(scores.nees).all() and np.isfinite(scores.planar).all()
 
 
 def test_bound_of_measured_velocities_is_the_golden_ratio(as_python):
-    _, _, outside, bound = along_path("vehicle", PATHS["IV"].inputs(60))
+    _, _, outside, bound = along_path("vehicle", path_inputs("IV", 60))
     np.testing.assert_allclose(bound.velocities[[0, 1, 2, 5]], GOLDEN, rtol=1e-3)
     assert (bound.velocities[3:5] > 2 * GOLDEN).all() and outside[-1] >= outside[:-1].max()
 
 
 def test_a_forecast_from_the_mean_forgets_the_members(as_python):
     wide = papers_model("motion", integration="euler").replace(prior_cov=(1e-4,) * 8)
-    u = PATHS["I"].inputs(1)[0]
+    u = path_inputs("I", 1)[0]
     spread = {}
     for kind in (MeanPropagatingEnKF, EnsembleKalmanFilter):
         filter_ = kind(model=wide, ensemble_size=400)
@@ -126,7 +126,7 @@ def test_mean_propagating_filter_has_a_gain_of_one_half(as_python):
 def test_own_attitude_is_what_its_own_rates_lead_to(as_python):
     own = kalman()[3].filter
     inputs, keys = np.zeros((2, 40, 6)), keys_of("dynamic", 2, 0)
-    inputs[..., :4] = PATHS["dynamic"].inputs(40)
+    inputs[..., :4] = path_inputs("dynamic", 40)
     z = true_runs("vehicle", keys, inputs[0, :, :4]).measurements
     means = run(own, keys, inputs, z).means
     told = inputs.copy()

@@ -27,6 +27,7 @@ from filters.engine.batch import run
 from filters.filter import Filter
 from filters.logs.findings import TRUTH as TRUTH_LOOK
 from filters.logs.findings import plot_style
+from thruster_env.auv.paths import CRUISE_THRUST, MANOEUVRES, TORQUE_PER_THRUST
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.files import BLUE, GREEN, PLUM, SKY, new_figure, save_figure
 from thruster_env.model.simulate import Truth, simulate
@@ -52,8 +53,6 @@ from tuning.experiments.vehicle.papers import (
 )
 
 THRUST = 2.84531  # [N]; holds 1 m/s, the printed speed
-TORQUE_ARM = -0.006  # propeller's torque over its thrust [m]
-TORQUE = -0.017  # [N m]; that of the constant thrust
 MOST_RUNS = 10_000
 AT_A_TIME = 4  # runs: 31560 steps of eight states and covariances are 23 MB a run, and Ctrl-C waits for them
 SETTLED = 2000  # steps, after which velocities are scored
@@ -80,51 +79,20 @@ EVERY = 20  # steps between points of a line
 # The vehicle's inputs over time on each of the papers' five paths.
 
 
-class Manoeuvre(NamedTuple):
-    """Constant thrust and planes, or ones that change sign."""
-
-    meaning: str
-    stern: float  # angle of the stern plane [deg]
-    rudder: float  # [deg]
-    duration: float  # [s]
-    stern_period: float = math.inf  # of a full cycle of the sign [s]
-    rudder_period: float = math.inf
-    thrust_period: float = math.inf
-    thrust_swing: float = 0.0  # as a fraction of the thrust
-
-    @property
-    def steps(self) -> int:
-        """Steps of DT within the duration."""
-        return math.floor(self.duration / DT)
-
-    def inputs(self, steps: int | None = None) -> np.ndarray:
-        """X_prop [N], K_prop [N m], delta_s and delta_r [rad] of the first so many steps, all if None, (K, 4)."""
-        time = DT * np.arange(self.steps if steps is None else min(steps, self.steps))
-        swing = self.thrust_swing * switching(time, self.thrust_period)
-        torque = np.full(len(time), TORQUE) if self.thrust_swing == 0.0 else TORQUE_ARM * THRUST * (1.0 + swing)
-        stern = math.radians(self.stern) * switching(time, self.stern_period)
-        rudder = math.radians(self.rudder) * switching(time, self.rudder_period)
-        return np.stack([THRUST * (1.0 + swing), torque, stern, rudder], axis=1)
+PATHS = dict(zip(MANOEUVRES, ("turn", "dive", "straight", "three-dimensional", "dynamic"), strict=True))
+"""What each path is, by name. The meanings of I, II and III are inferred from the order of a conclusion."""
 
 
-def switching(time: np.ndarray, period: float) -> np.ndarray:
-    """Sign of sin(2 pi t/period), which is 1 at the start and for ever where the period is infinite."""
-    return np.where((time / period) % 1.0 < 0.5, 1.0, -1.0)
-
-
-PATHS = {
-    "I": Manoeuvre("turn", 0.0, -5.0, 25.0),
-    "II": Manoeuvre("dive", 5.0, 0.0, 25.0),
-    "III": Manoeuvre("straight", 0.0, 0.0, 25.0),
-    "IV": Manoeuvre("three-dimensional", 6.0483275, -1.3502966, 31.560424),
-    "dynamic": Manoeuvre("dynamic", 5.0, 5.0, 25.0, 14.0, 10.0, 9.0, 0.4),
-}
-"""By name. The meanings of I, II and III are inferred from the order of a conclusion."""
-
-
-def find_path(name: str) -> Manoeuvre:
-    """A path by name; ValueError for an unknown one."""
-    return PATHS[one_of("path", name, tuple(PATHS))]
+def path_inputs(name: str, steps: int | None = None) -> np.ndarray:
+    """X_prop [N], K_prop [N m], delta_s and delta_r [rad] of the first so many steps, all if None, (K, 4)."""
+    manoeuvre = MANOEUVRES[one_of("path", name, tuple(PATHS))]
+    count = math.floor(manoeuvre.duration / DT)
+    middles = DT * (np.arange(count if steps is None else min(steps, count)) + 0.5)
+    inputs = np.array([manoeuvre.inputs(time) for time in middles])
+    inputs[:, 0] *= THRUST / CRUISE_THRUST
+    if manoeuvre.thrust_period is not None:
+        inputs[:, 1] = TORQUE_PER_THRUST * inputs[:, 0]
+    return inputs
 
 
 # Scores of a filter: mean squares by run, from which intervals and ratios follow.
@@ -239,11 +207,11 @@ def run_tasks(
     """
     runs, seed = at_least("runs", runs, 2, MOST_RUNS), at_least("seed", seed, 0)
     if steps is not None:
-        steps = at_least("steps", steps, 2, max(path.steps for path in PATHS.values()))
+        steps = at_least("steps", steps, 2, max(len(path_inputs(name)) for name in PATHS))
     parts = [slice(first, min(first + AT_A_TIME, runs)) for first in range(0, runs, AT_A_TIME)]
     total, done, results = sum(len(task.estimators) for task in tasks) * len(parts), 0, []
     for task in tasks:
-        inputs, keys = find_path(task.path).inputs(steps), keys_of(task.path, runs, seed)
+        inputs, keys = path_inputs(task.path, steps), keys_of(task.path, runs, seed)
         by_estimator: dict[str, list[Scores]] = {estimator.label: [] for estimator in task.estimators}
         for part in parts:
             truth = true_runs(task.world, keys[part], inputs)
@@ -389,7 +357,7 @@ class PathRun(NamedTuple):
 
 def path_run(path: str, estimators: Sequence[Estimator], *, seed: int = 0, steps: int | None = None) -> PathRun:
     """The first of the runs that the study makes with the same seed, every 20 ms of it."""
-    inputs, keys = PATHS[path].inputs(steps), keys_of(path, 1, at_least("seed", seed, 0))
+    inputs, keys = path_inputs(path, steps), keys_of(path, 1, at_least("seed", seed, 0))
     truth = true_runs("vehicle", keys, inputs)
     positions = {TRUTH: truth.states[0, :, 9:]}
     for estimator in estimators:
@@ -423,7 +391,7 @@ def paths_figure(path: str | Path, runs: Sequence[PathRun]) -> Path:
         for label, line in drawn.positions.items():
             axis.plot(*line.T, label=label, **STYLES[label])
         _arrange(axis, np.concatenate(list(drawn.positions.values())))
-        meaning = PATHS[drawn.path].meaning
+        meaning = PATHS[drawn.path]
         axis.set_title(drawn.path if drawn.path == meaning else f"{drawn.path}: {meaning}", fontsize=11, y=0.94)
     handles, labels = axis.get_legend_handles_labels()
     if rows * columns > len(runs):
