@@ -67,9 +67,8 @@ class ModelFamily:
         parameters = {name: about(name, float(value)) for name, value in starts.items()}
         units = [quantity.unit for quantity in (*self.base.states, *self.base.measurements)]
         for name, (_, index, variance) in self._noise.items():
-            unit = squared(units[index + (0 if name.startswith("Q") else self.base.n)])
-            ends = variance / NOISE_FACTOR, variance * NOISE_FACTOR
-            parameters.setdefault(name, Parameter(name, *ends, unit, default=variance))
+            unit = units[index + (0 if name.startswith("Q") else self.base.n)]
+            parameters.setdefault(name, variance_about(name, variance, unit))
         return parameters
 
     @property
@@ -116,6 +115,12 @@ def about(name: str, value: float, unit: str = "") -> Parameter:
         return Parameter(name, value / FACTOR, value * FACTOR, unit, default=value)
     reach = FACTOR * abs(value) or 1.0
     return Parameter(name, -reach, reach, unit, log=False, default=value)
+
+
+def variance_about(name: str, variance: float, unit: str) -> Parameter:
+    """A positive variance of a quantity in this unit, within a range about its start."""
+    ends = variance / NOISE_FACTOR, variance * NOISE_FACTOR
+    return Parameter(name, *ends, squared(unit), default=variance)
 
 
 def with_ranges(

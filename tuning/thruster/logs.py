@@ -17,14 +17,13 @@ from thruster_env.thruster.model import NO_BAND, Recorder, lag_weights, logged_p
 from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, checked, is_file, read_preset
 from thruster_env.thruster.plant import Plant
 from tuning.identification.clocks import clock_offsets, offsets_of, shifted
-from tuning.problems.problem import Parameter, Problem, squared
+from tuning.identification.family import about, variance_about
+from tuning.problems.problem import Parameter, Problem
 from tuning.problems.scenario import FILE_SEQUENCES, PlantScenario
 from tuning.search.parameters import r_name
 
 DEFAULT_PRESET = "tunnel"
 FREE = ("motor_damping", "voltage_gain", "lift_coefficient")  # free parameters by default
-FACTOR = 10.0  # range of a positive parameter about its start
-NOISE_FACTOR = 1e4  # range of a variance about its start
 LINEAR = {"blade_angle": (0.05, 1.5), "thrust_asymmetry": (-0.5, 0.5)}
 FASTEST_FLOW = 2.0  # [m/s], ambient
 DEAD_PART = 0.25  # largest dead band, as a fraction of the largest voltage
@@ -249,9 +248,8 @@ class ThrusterFamily:
         q, r = np.diag(plant.process_noise_cov), np.diag(plant.measurement_noise_cov)
         units = [quantity.unit for quantity in (*model.states, *model.measurements)]
         for name, variance, unit in zip(self.noise_names, (*q, *r), units, strict=True):
-            ends = variance / NOISE_FACTOR, variance * NOISE_FACTOR
             if variance > 0:
-                parameters[name] = Parameter(name, *ends, squared(unit), default=float(variance))
+                parameters[name] = variance_about(name, float(variance), unit)
         return parameters
 
     @property
@@ -334,4 +332,4 @@ def _about(name: str, value: float, unit: str) -> Parameter:
         return Parameter(name, min(low, value), max(high, value), unit, log=False, default=value)
     if value == 0:  # as a preset without drag
         return Parameter(name, 0.0, 1.0, unit, log=False, default=0.0)
-    return Parameter(name, value / FACTOR, value * FACTOR, unit, default=value)
+    return about(name, value, unit)
