@@ -34,6 +34,7 @@ from thruster_env.model.shape import (
 )
 from thruster_env.model.simulate import noise_step, simulate, truth_steps
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import refuse_rotations
 
 if TYPE_CHECKING:
     from thruster_env.graphs.loops import Loops
@@ -109,6 +110,7 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
         P_k for every sequence and step, (B, K + 1, n, n); index 0 is after the first measurement. NaN for a
         sequence along which it is too large for float64.
     """
+    refuse_rotations(model)
     inputs = np.ascontiguousarray(as_floats(inputs))
     keys, nothing = np.zeros((len(inputs), 2)), np.zeros((model.n, model.n))
     rounding = 1e-30 * model.measurement_noise_cov  # none at all is no covariance of a measurement

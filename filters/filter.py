@@ -271,9 +271,11 @@ class PageFilter(FilterWithPage):
 
     Attributes:
         forms: pages of the same estimates in other arithmetic, by the value of the field `form`.
+        rotations: whether its page is written with the steps of a state that has rotations.
     """
 
     forms: ClassVar[Mapping[str, Page]] = {}
+    rotations: ClassVar[bool] = False
 
     @property
     def written_page(self) -> Page:
@@ -287,9 +289,16 @@ class PageFilter(FilterWithPage):
         """What the field `form` may be."""
         return "covariance", *self.forms
 
+    @property
+    def takes_rotations(self) -> bool:
+        """Whether this form takes models with rotations."""
+        return self.rotations and getattr(self, "form", "") not in self.forms
+
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
-        plain = page_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
+        model = self.kernel_model
+        shape = model.any_shape if self.takes_rotations else model.shape
+        plain = page_kernels(self.written_page, model.functions, shape)
         bounds, bounded_by = self.model.bounds, self.model.bounded_by
         return bounded_kernels(plain, bounds, bounded_by) if bounds else plain
 

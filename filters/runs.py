@@ -16,6 +16,7 @@ from thruster_env.core.checks import at_least
 from thruster_env.core.modules import to_install
 from thruster_env.logs.log import Log
 from thruster_env.model.continuous import same_dt
+from thruster_env.model.turns import refuse_rotations
 
 if TYPE_CHECKING:
     import pandas
@@ -59,6 +60,7 @@ class FilteredRuns(Estimates):
         from filters.logs.estimate import LogEstimate
 
         data, model = self.data, self.data.filter.model
+        refuse_rotations(model)
         run = at_least("run", run, 0, len(data.keys) - 1)
         steps, z = np.diff(data.times), data.measurements[run, data.rows]
         stamps = None if same_dt(float(steps.min()), float(steps.max())) else data.times - data.times[0]

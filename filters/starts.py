@@ -146,9 +146,9 @@ class FirstRestarts:
     """The first restarts of N copies of a filter."""
 
     def __init__(self, filter_: Filter, count: int):
-        n = filter_.kernel_model.n
+        n, t = filter_.kernel_model.n, filter_.kernel_model.t
         self._filter, self._counts, self._steps = filter_, np.zeros(count), np.zeros(count, dtype=int)
-        self._means, self._covs = np.zeros((count, n)), np.zeros((count, n, n))
+        self._means, self._covs = np.zeros((count, n)), np.zeros((count, t, t))
         self._events: list[tuple[int, tuple[str, ...], str] | None] = [None] * count
 
     def start(self, which: np.ndarray) -> None:
@@ -203,6 +203,8 @@ def _states_and_cause(
         u: input (p,); None without a prediction.
         z: measurement (m,).
     """
+    if filter_.model.turns:  # whose covariance is in another space than the Jacobians that are tried
+        return (), UNKNOWN
     modes = filter_.mode_filters if isinstance(filter_, MultipleModelFilter) else ()
     models = [mode.kernel_model for mode in modes] or [_model_of_numbers(filter_.kernel_model, numbers)]
     begun = before if before is None or len(before) == len(models) else before * len(models)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from filters.engine.belief import Kernels, memory_offsets, vector_like
+from filters.engine.belief import Kernels, vector_like
 from filters.engine.compile import (
     PREDICT,
     START,
@@ -42,7 +42,7 @@ class Estimates(NamedTuple):
 
     Attributes:
         means: of the states, (B, K + 1, n), in the units of the model.
-        covs: covariances of the errors, (B, K + 1, n, n).
+        covs: covariances of the errors, (B, K + 1, n, n); (B, K + 1, t, t) if the state has rotations.
         innovations: measurements minus their predictions, (B, K + 1, m); zero in missing channels.
         innovation_covs: S, (B, K + 1, m, m).
         log_likelihoods: of the innovations, (B, K + 1).
@@ -84,10 +84,10 @@ def run(
     """
     single = is_single(keys, inputs, measurements)
     keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
-    n, (count, times, m) = filter_.kernel_model.n, z.shape
+    n, t, (count, times, m) = filter_.kernel_model.n, filter_.kernel_model.t, z.shape
     out = Estimates(
         np.empty((count, times, n)),
-        np.empty((count, times, n, n)),
+        np.empty((count, times, t, t)),
         np.empty((count, times, m)),
         np.empty((count, times, m, m)),
         np.empty((count, times)),
@@ -211,7 +211,7 @@ def noise_rows(
     filter_.check_noise(process_noise_covs, measurement_noise_covs)
     model = filter_.kernel_model
     return (
-        _noise_rows("process_noise_covs", process_noise_covs, times - 1, model.n),
+        _noise_rows("process_noise_covs", process_noise_covs, times - 1, model.t),
         _noise_rows("measurement_noise_covs", measurement_noise_covs, times, model.m),
     )
 
@@ -346,7 +346,7 @@ class Beliefs:
         """Allocate the memory of `count` beliefs; `start` comes next."""
         self._filter = filter_
         self._kernels, self._size, self._numbers = filter_.kernels(), filter_.size, filter_.numbers
-        self._places = memory_offsets(self._kernels.n, self._kernels.m)
+        self._places = self._kernels.layout
         row, table, _ = self._own = new_memory(self._kernels, self._size)
         self._rows = np.zeros((count, len(row)))
         self._tables = np.zeros((count, self._kernels.kept_rows, table.shape[1]))

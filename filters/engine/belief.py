@@ -39,7 +39,7 @@ from thruster_env.core.compiled import function_fingerprint, inlined, is_interpr
 from thruster_env.core.sources import Source, matrix_reader, matrix_writer, vector_reader, vector_writer
 from thruster_env.core.streams import truncated_normal
 from thruster_env.model.quantities import Bound
-from thruster_env.model.shape import Shape, number_offsets, starts_of
+from thruster_env.model.shape import NumberOffsets, Shape, number_offsets, starts_of
 
 
 class Belief(NamedTuple):
@@ -134,6 +134,22 @@ class Kernels(NamedTuple):
     scratch: int = 0
     vectors: tuple[Callable, ...] = ()
     acting: tuple[int, ...] = ()
+    turns: int = 0  # rotations: rows of the covariance are so many fewer than states
+
+    @property
+    def t(self) -> int:
+        """Rows of the covariance."""
+        return self.n - self.turns
+
+    @property
+    def layout(self) -> MemoryOffsets:
+        """Offsets in the row."""
+        return memory_offsets(self.n, self.m, self.t)
+
+    @property
+    def offsets(self) -> NumberOffsets:
+        """Offsets of the model's numbers."""
+        return number_offsets(self.n, self.m, self.t)
 
     @property
     def kept_rows(self) -> int:
@@ -145,10 +161,10 @@ class Kernels(NamedTuple):
 
 
 class MemoryOffsets(NamedTuple):
-    """Offsets of the parts of a filter's row, for n states and m measurements."""
+    """Offsets of the parts of a filter's row, for n states, m measurements and errors with t components."""
 
     mean: int  # (n,)
-    cov: int  # (n, n)
+    cov: int  # (t, t)
     key_0: int
     key_1: int
     step: int  # steps taken
@@ -161,9 +177,10 @@ class MemoryOffsets(NamedTuple):
 
 
 @cache
-def memory_offsets(n: int, m: int) -> MemoryOffsets:
-    """Offsets in the row of a filter."""
-    return MemoryOffsets(*starts_of(n, n * n, 1, 1, 1, 1, m, m * m, 1, n * m))
+def memory_offsets(n: int, m: int, t: int | None = None) -> MemoryOffsets:
+    """Offsets in the row of a filter; t = n if None."""
+    tt = n * n if t is None else t * t
+    return MemoryOffsets(*starts_of(n, tt, 1, 1, 1, 1, m, m * m, 1, n * m))
 
 
 @lru_cache(maxsize=64)
@@ -173,22 +190,22 @@ def row_access(shape: Shape) -> tuple[tuple[Callable, Callable], ...]:
     Vectors are tuples, covariances tuples of rows. Angles in a mean are kept in (-pi, pi].
 
     Returns:
-        `read(row)` of the mean (n,) and its covariance (n, n).
+        `read(row)` of the mean (n,) and its covariance (t, t).
         `write(row, value)` of the same.
         `write(row, value)` of the innovation (m,) and its covariance (m, m).
     """
-    n, m = shape.n, shape.m
-    layout = memory_offsets(n, m)
+    n, m, t = shape.n, shape.m, shape.t
+    layout = memory_offsets(n, m, t)
     return (
-        (vector_reader(n, layout.mean), matrix_reader(n, n, layout.cov)),
-        (angle_writer(layout.mean, shape.state_angles), matrix_writer(n, n, layout.cov)),
+        (vector_reader(n, layout.mean), matrix_reader(t, t, layout.cov)),
+        (angle_writer(layout.mean, shape.state_angles), matrix_writer(t, t, layout.cov)),
         (vector_writer(m, layout.innovation), matrix_writer(m, m, layout.innovation_cov)),
     )
 
 
 def filter_offset(shape: Shape) -> int:
     """Offset of the filter's own parameters in the packed row, behind those of its model."""
-    return number_offsets(shape.n, shape.m).constants + shape.constants
+    return shape.offsets.constants + shape.constants
 
 
 # Checks of the arguments of filters: beliefs, keys, inputs and measurements.
@@ -264,7 +281,7 @@ def check_belief(belief: Belief, prior_variances: np.ndarray) -> None:
     for name in ("members", "extras"):
         if np.isnan(as_floats(getattr(belief, name))).any():
             raise ValueError(f"{name} of a belief must not be NaN, but got {short_repr(getattr(belief, name))}")
-    covariance("cov of a belief", belief.cov, len(belief.mean), variances=prior_variances)
+    covariance("cov of a belief", belief.cov, len(prior_variances), variances=prior_variances)
 
 
 def _passes_quickly(belief: Belief, prior_variances: np.ndarray) -> bool:
@@ -321,7 +338,7 @@ def _many(mean: np.ndarray, cov: np.ndarray, prior_variances: np.ndarray) -> boo
     if not np.abs(mean).sum() + np.abs(cov).sum() < np.inf or not (cov == cov.T).all() or variances.min() < 0:
         return False
     shifted, known = cov.copy(), ~cov.any(axis=1)  # what is known exactly has a variance of 0 and no covariance
-    shifted.ravel()[:: len(mean) + 1] += np.where(known, 1.0, ROUNDING * np.maximum(variances, prior_variances))
+    shifted.ravel()[:: len(cov) + 1] += np.where(known, 1.0, ROUNDING * np.maximum(variances, prior_variances))
     try:
         np.linalg.cholesky(shifted)
     except np.linalg.LinAlgError:
@@ -335,21 +352,21 @@ LARGEST = 1e300  # of the sum of a belief's absolute numbers
 
 
 @cache
-def row_magnitude(n: int, m: int) -> Callable:
+def row_magnitude(n: int, m: int, t: int) -> Callable:
     """Return `magnitude(row)`: the sum of the absolute values of the numbers of a belief and its innovation.
 
     A negative variance, which rounding may leave in a covariance of very unequal numbers, counts as a number
     beyond LARGEST, and so does NaN.
     """
-    layout = memory_offsets(n, m)
+    layout = memory_offsets(n, m, t)
     beyond = 10 * LARGEST
-    variances = [layout.cov + i * (n + 1) for i in range(n)]
+    variances = [layout.cov + i * (t + 1) for i in range(t)]
     source = Source("magnitude", "row", work=layout.gain)
     if source.loops:
         of_all = source.sum(f"abs(row[{i}])" for i in source.range(layout.gain))
         of_variances = source.sum(
             f"(0.0 if row[{variance}] >= 0.0 else {beyond})"
-            for variance in (i * (n + 1) + layout.cov for i in source.range(n))
+            for variance in (i * (t + 1) + layout.cov for i in source.range(t))
         )
         return source.function(f"{of_all} + {of_variances}")
     terms = [f"abs(row[{i}])" for i in range(layout.gain) if i not in variances]
@@ -360,10 +377,10 @@ def row_magnitude(n: int, m: int) -> Callable:
 @lru_cache(maxsize=64)
 def restart_if_lost(kernels: Kernels) -> Callable:
     """Return `restart(memory, numbers, size)`: replace a diverged belief by the prior, and count the restart."""
-    n, m, start, summarise = kernels.n, kernels.m, kernels.start, kernels.summarise
-    layout, r_offset = memory_offsets(n, m), number_offsets(n, m).r
+    m, start, summarise = kernels.m, kernels.start, kernels.summarise
+    layout, r_offset = kernels.layout, kernels.offsets.r
     innovation, s_offset, log_likelihood = layout.innovation, layout.innovation_cov, layout.log_likelihood
-    divergences, magnitude = layout.divergences, row_magnitude(n, m)
+    divergences, magnitude = layout.divergences, row_magnitude(kernels.n, m, kernels.t)
 
     @inlined
     def restart(memory, numbers, size):

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from filters.engine.belief import LARGEST, Kernels, memory_offsets, restart_if_lost
+from filters.engine.belief import LARGEST, Kernels, restart_if_lost
 from thruster_env.core.compiled import CompiledOrPython, direct, function_fingerprint, is_interpreting
 from thruster_env.core.streams import GROUP
-from thruster_env.model.shape import LANES, number_offsets, padded
+from thruster_env.model.shape import LANES, padded
 
 if TYPE_CHECKING:
     from thruster_env.graphs.machine_code import Code
@@ -35,7 +35,7 @@ def build_side_by_side(kernels: Kernels) -> Callable:
     """
     n, m, start = kernels.n, kernels.m, kernels.start
     begin, advance, finish, update = kernels.vectors
-    layout, source, width, groups = memory_offsets(n, m), number_offsets(n, m), LANES, GROUPS
+    t, layout, source, width, groups = kernels.t, kernels.layout, kernels.offsets, LANES, GROUPS
     mean, cov, innovation, s = layout.mean, layout.cov, layout.innovation, layout.innovation_cov
     divergences, log_likelihood, substeps = layout.divergences, layout.log_likelihood, source.substeps
     q_offset, r_offset, checked = source.q, source.r, layout.gain
@@ -85,9 +85,9 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                     update(rows[g], zs[g], numbers)
                     for i in range(checked * width):
                         total += abs(rows[g, i])
-                    for i in range(n):
+                    for i in range(t):
                         for j in range(width):
-                            variance = rows[g, (cov + i * (n + 1)) * width + j]
+                            variance = rows[g, (cov + i * (t + 1)) * width + j]
                             least = variance if variance < least else least
                 if not (total < LARGEST and least >= 0.0):
                     for g in range(used):
@@ -101,8 +101,9 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                     g, at = j // width, j % width
                     for i in range(n):
                         means[b + j, k, i] = rows[g, (mean + i) * width + at]
-                        for i_2 in range(n):
-                            covs[b + j, k, i, i_2] = rows[g, (cov + i * n + i_2) * width + at]
+                    for i in range(t):
+                        for i_2 in range(t):
+                            covs[b + j, k, i, i_2] = rows[g, (cov + i * t + i_2) * width + at]
                     for i in range(m):
                         innovations[b + j, k, i] = rows[g, (innovation + i) * width + at]
                         for i_2 in range(m):
@@ -128,7 +129,7 @@ REFUSED = -1  # the result for an input that is not finite or an infinite measur
 def build_operation(kernels: Kernels) -> Callable:
     """`operation` as a Python function."""
     start, predict, update, summarise = kernels.start, kernels.predict, kernels.update, kernels.summarise
-    layout, m = memory_offsets(kernels.n, kernels.m), kernels.m
+    layout, m = kernels.layout, kernels.m
     step, divergences = layout.step, layout.divergences
     restart = restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, predict, update, within=__name__)
@@ -161,11 +162,11 @@ def build_operation(kernels: Kernels) -> Callable:
 
 def _build_batch(kernels: Kernels) -> Callable:
     n, m, start, predict, update = kernels.n, kernels.m, kernels.start, kernels.predict, kernels.update
-    layout = memory_offsets(n, m)
+    t, layout = kernels.t, kernels.layout
     mean, cov, innovation, s = layout.mean, layout.cov, layout.innovation, layout.innovation_cov
     key_0, key_1, step, divergences = layout.key_0, layout.key_1, layout.step, layout.divergences
     log_likelihood = layout.log_likelihood
-    q_offset, r_offset = number_offsets(n, m).q, number_offsets(n, m).r
+    q_offset, r_offset = kernels.offsets.q, kernels.offsets.r
     restart = restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, predict, update, within=__name__)
 
@@ -199,8 +200,9 @@ def _build_batch(kernels: Kernels) -> Callable:
                 restart(memory, numbers, size)
                 for i in range(n):
                     means[b, k, i] = row[mean + i]
-                    for j in range(n):
-                        covs[b, k, i, j] = row[cov + i * n + j]
+                for i in range(t):
+                    for j in range(t):
+                        covs[b, k, i, j] = row[cov + i * t + j]
                 for i in range(m):
                     innovations[b, k, i] = row[innovation + i]
                     for j in range(m):
@@ -287,15 +289,15 @@ def _code_side_by_side(kernels: Kernels) -> Code | None:
 
 def _shapes_of_data(kernels: Kernels) -> tuple:
     """Lengths of measurements, numbers, noise and estimates."""
-    n, m = kernels.n, kernels.m
-    noise = [(None, 2 * n * n), (None, 2 * m * m)]
-    out = [(None, None, *part) for part in ((n,), (n, n), (m,), (m, m), ())] + [(None,)]
+    n, m, t = kernels.n, kernels.m, kernels.t
+    noise = [(None, 2 * t * t), (None, 2 * m * m)]
+    out = [(None, None, *part) for part in ((n,), (t, t), (m,), (m, m), ())] + [(None,)]
     return (None, None, m), (None,), noise, out
 
 
 def row_length(kernels: Kernels) -> int:
     """Length of the row of a belief."""
-    return memory_offsets(kernels.n, kernels.m).extras + kernels.extras + kernels.scratch
+    return kernels.layout.extras + kernels.extras + kernels.scratch
 
 
 def new_memory(kernels: Kernels, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

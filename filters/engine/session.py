@@ -18,14 +18,14 @@ from filters.engine.belief import (
     check_belief,
     checked_key,
     filter_offset,
-    memory_offsets,
     vector_like,
 )
 from filters.engine.compile import PREDICT, REFUSED, START, UPDATE, new_memory, operation_on
 from thruster_env.core.checks import covariance, finite, positive
 from thruster_env.logs.log import sample_time_place
 from thruster_env.model.continuous import same_dt
-from thruster_env.model.shape import number_offsets, with_root
+from thruster_env.model.shape import with_root
+from thruster_env.model.turns import unit_mean
 
 if TYPE_CHECKING:
     from filters.filter import Filter
@@ -61,7 +61,8 @@ class Session:
     """A filter that runs in place on its own memory: wrappers step it, and `Filter.predict` uses one.
 
     Attributes:
-        mean, cov, innovation, innovation_cov: views on the memory, (n,), (n, n), (m,), (m, m).
+        mean, cov, innovation, innovation_cov: views on the memory, (n,), (n, n), (m,), (m, m); cov is that of
+            the errors, (t, t), if the state has rotations.
         divergences: restarts from the prior, so far, after an estimate that was not finite.
     """
 
@@ -70,10 +71,10 @@ class Session:
         self._filter = filter_
         kernels, model, size = filter_.kernels(), filter_.kernel_model, filter_.size
         n, m = kernels.n, kernels.m
-        layout = memory_offsets(n, m)
+        t, layout = kernels.t, kernels.layout
         self._name, self._kernels = filter_.name, kernels
         self._numbers, self._size, self._places = filter_.numbers, size, layout
-        self._kept_rows, self._noise_places = kernels.kept_rows, number_offsets(n, m)
+        self._kept_rows, self._noise_places = kernels.kept_rows, kernels.offsets
         self._memory = new_memory(kernels, size)
         self._row, self._table, _ = self._memory
         self._extras = self._row[layout.extras : layout.extras + kernels.extras]
@@ -93,7 +94,7 @@ class Session:
         self._given = (*self._memory, size, values, self._numbers)
         self._operate: Callable[[int], int] = self._operate_first
         self.mean = self._row[layout.mean : layout.mean + n]
-        self.cov = self._row[layout.cov : layout.cov + n * n].reshape(n, n)
+        self.cov = self._row[layout.cov : layout.cov + t * t].reshape(t, t)
         self.innovation = self._row[layout.innovation : layout.innovation + m]
         self.innovation_cov = self._row[layout.innovation_cov : layout.innovation_cov + m * m].reshape(m, m)
 
@@ -164,7 +165,7 @@ class Session:
         `Filter.fixed_noise`.
         """
         self._filter.check_noise(process_noise_cov, measurement_noise_cov)
-        n, m, at = len(self.mean), len(self.innovation), self._noise_places
+        n, m, at = len(self.cov), len(self.innovation), self._noise_places
         self._remember_noise()
         if process_noise_cov is not None:
             q = covariance("process_noise_cov", process_noise_cov, n)
@@ -205,7 +206,7 @@ class Session:
 
     def set_parameter(self, name: str, value: float) -> None:
         """Use another value of one of the filter's parameters from now on; ValueError for one that it lacks."""
-        offset, names = filter_offset(self._filter.kernel_model.shape), []
+        offset, names = filter_offset(self._filter.kernel_model.any_shape), []
         page = getattr(self._filter, "written_page", None)
         for known, shape in () if page is None else page.own:
             if known == name and not shape:
@@ -226,7 +227,7 @@ class Session:
         if "Q" in self._filter.fixed_noise and same_dt(factor, 1.0):
             return
         self._filter.check_noise(process_noise_cov=factor)
-        n, at = len(self.mean), self._noise_places.q
+        n, at = len(self.cov), self._noise_places.q
         self._remember_noise()
         scales = self._q_scales
         scales[: n * n], scales[n * n :] = factor, factor**0.5
@@ -242,11 +243,11 @@ class Session:
 
     @cached_property
     def _q_scales(self) -> np.ndarray:
-        return np.empty(2 * len(self.mean) ** 2)
+        return np.empty(2 * len(self.cov) ** 2)
 
     @cached_property
     def _given_q(self) -> np.ndarray:
-        n, at = len(self.mean), self._noise_places.q
+        n, at = len(self.cov), self._noise_places.q
         return self._filter.numbers[at : at + 2 * n * n]
 
     def start(self, key=(0, 0), z=None) -> None:
@@ -333,6 +334,7 @@ class Session:
                 whose = f"a belief that the filter {self._name!r} can take"
                 raise ValueError(f"{name} of {whose} must have shape {shape}, but got {part_shape}")
         check_belief(belief, self._prior_variances)
+        unit_mean(belief.mean, self._filter.kernel_model.turns)
         self._remember(belief)
         self._has_belief = True
         self.set_key(belief.key)

@@ -21,6 +21,7 @@ from thruster_env.core.modules import error_line, is_code, object_named
 from thruster_env.core.streams import GLOBAL_GENERATORS, GlobalGenerators, derived_seed, seeded_copy
 from thruster_env.model.continuous import same_dt
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import refuse_rotations
 
 # The interface of an estimator, which maps inputs and measurements to means and covariances, and its checks.
 
@@ -370,6 +371,7 @@ class ForeignFilter(Filter):
         if not is_estimator(estimator):
             rule = "an estimator must have reset(key, z) and step(u, z), or run(keys, inputs, measurements)"
             raise ValueError(f"{rule}, but got {short_repr(estimator)}")
+        refuse_rotations(self.model)
         check = getattr(estimator, "check_model", None)
         if callable(check):
             check(self.model)

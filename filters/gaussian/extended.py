@@ -16,6 +16,7 @@ from filters.algebra import roots
 from filters.algebra.operations import divide, eye, joseph, mask_missing, present, sym, uncorrelated, wrap
 from filters.algebra.points import density, log_density, root, square
 from filters.algebra.roots import factor_of, forward_quotient, hstack, part, triangle, vstack, zeros
+from filters.algebra.tangents import move, reset, reset_columns
 from filters.baselines import indices_of
 from filters.filter import PageFilter
 from filters.pages.page import Page
@@ -44,7 +45,8 @@ def update(model, x, P, z):
     v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     K = divide(P @ H.T, S)
-    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
+    d = K @ v
+    return move(model, x, d), reset(model, joseph(P, K, H, R), d), v, S, log_density(v, S, measured)
 
 
 # The square-root form of the Kalman filter carries the root L of P = L L', by orthogonal Theta from the right that
@@ -164,6 +166,7 @@ class ExtendedKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "ekf"
+    rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise, update)
     forms: ClassVar[Mapping[str, Page]] = {"square-root": SQUARE_ROOT, "ud": UD}
     form: str = "covariance"
@@ -177,17 +180,19 @@ class ExtendedKalmanFilter(PageFilter):
 
 def update_iterated(model, x, P, z):
     """Update with the measurement z, linearised again in each iteration; NaN marks missing channels."""
-    measured, R, at, innovations = present(z), uncorrelated(present(z), model.R), x, []
+    measured, R, at, d, innovations = present(z), uncorrelated(present(z), model.R), x, None, []
     for i in range(model.own.iterations):
         H, y = mask_missing(measured, model.H(at)), model.h(at)
-        on_tangent = y + H @ (x - at) if i else y
+        on_tangent = y - H @ d if i else y
+        H = reset_columns(model, H, d) if i else H
         v = mask_missing(measured, wrap(z - on_tangent, model.measurement_angles))
         S = sym(H @ P @ H.T + R)
         K = divide(P @ H.T, S)
-        at = x + K @ v
+        d = K @ v
+        at = move(model, x, d)
         innovations.append((v, S))
     v, S = innovations[0]
-    return wrap(at, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
+    return at, reset(model, joseph(P, K, H, R), d), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -214,6 +219,7 @@ class IteratedExtendedKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "iekf"
+    rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise, update_iterated)
     unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
     iterations: int = 5
@@ -251,6 +257,7 @@ class FadingMemoryFilter(PageFilter):
     """
 
     name: ClassVar[str] = "fading"
+    rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise_fading, update)
     fading: float = 1.01
 

@@ -282,7 +282,8 @@ def as_tuple(results: Any) -> tuple:
 
 def stages_of(page: Page, memory: RowMemory, model: PagedModel) -> list[Stage]:
     """Stages of a page: the start; the representation, a substep and the end of a prediction; the update."""
-    layout, x, p = memory_offsets(memory.shape.n, memory.shape.m), memory.x, memory.P
+    shape, x, p = memory.shape, memory.x, memory.P
+    layout = memory_offsets(shape.n, shape.m, shape.t)
     started = page.started(model)
     model.extras = memory.keep(started)
     begun = (x, p) if page.represent is None else as_tuple(page.represent(model, x, p))
@@ -304,8 +305,9 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     n, m = shape.n, shape.m
     memory, works, vectors = programs_of(page, functions, shape, partial(stages_of, page))
     start_extras, represent, advance, add_process_noise, correct = works
-    layout, extras_size = memory_offsets(n, m), sum(prod(matrix.shape) for matrix in memory.extras.values())
-    prior, step_offset, substeps_offset = prior_start(shape), layout.step, number_offsets(n, m).substeps
+    layout = memory_offsets(n, m, shape.t)
+    extras_size = sum(prod(matrix.shape) for matrix in memory.extras.values())
+    prior, step_offset, substeps_offset = prior_start(shape), layout.step, shape.offsets.substeps
 
     @inlined
     def begin_belief(memory, numbers, size):
@@ -329,6 +331,7 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
         *(n, m, n, 0, begin_belief, predict, update, nothing_to_summarise),
         extras=extras_size,
         scratch=memory.end - layout.extras - extras_size,
+        turns=len(shape.turns),
         vectors=vectors[1:],
         acting=acting_places(memory.extras),
     )
@@ -337,9 +340,8 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
 @cache
 def prior_start(shape: Shape) -> Callable:
     """Return `start(memory, numbers, size)`: mean and covariance are those of the prior."""
-    n, m = shape.n, shape.m
-    source = number_offsets(n, m)
-    read_mean, read_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
+    n, t, source = shape.n, shape.t, shape.offsets
+    read_mean, read_cov = vector_reader(n, source.prior_mean), matrix_reader(t, t, source.prior_cov)
     _, (store_mean, store_cov), _ = row_access(shape)
 
     @inlined

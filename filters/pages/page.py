@@ -37,6 +37,7 @@ import numpy as np
 from filters.algebra.matrices import Matrix, Operation, input_matrix, never, plus, through
 from filters.algebra.points import root
 from filters.algebra.roots import zeros
+from filters.algebra.tangents import columns_in_tangent, rows_in_tangent, unit
 from filters.engine.belief import filter_offset, memory_offsets
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.derivatives import RELATIVE_STEP, step_growth, step_of
@@ -46,7 +47,6 @@ from thruster_env.model.shape import (
     Functions,
     Shape,
     constants_are_array,
-    number_offsets,
     observation_slopes,
     transition_slopes,
 )
@@ -136,17 +136,17 @@ class NumbersMemory:
     """
 
     def __init__(self, shape: Shape, page: Page, x: Matrix, p: Matrix, first_parameter: int):
-        n, m = shape.n, shape.m
-        layout, row = number_offsets(n, m), memory_offsets(n, m)
+        n, m, t = shape.n, shape.m, shape.t
+        layout, row = shape.offsets, memory_offsets(n, m, t)
         self.belief = Place("rows", row.mean), Place("rows", row.cov)
         self.outputs = tuple(Place("rows", at) for at in (row.innovation, row.innovation_cov, row.log_likelihood))
         self.shape, self.x, self.P = shape, x, p
-        self.Q = self.read("numbers", layout.q, n, n, symmetric=True)
+        self.Q = self.read("numbers", layout.q, t, t, symmetric=True)
         self.R = self.read("numbers", layout.r, m, m, symmetric=True)
-        self.Q_root = self.read("numbers", layout.q_root, n, n)
+        self.Q_root = self.read("numbers", layout.q_root, t, t)
         self.R_root = self.read("numbers", layout.r_root, m, m)
         self.prior_mean = self.read("numbers", layout.prior_mean, n)
-        self.prior_root = self.read("numbers", layout.prior_root, n, n)
+        self.prior_root = self.read("numbers", layout.prior_root, t, t)
         self.scales = self.read("numbers", layout.scales, n)
         # Tensors are found by place: without constants this must not be the place of the filter's first parameter.
         at = layout.constants if shape.constants else layout.substeps
@@ -188,9 +188,9 @@ class RowMemory(NumbersMemory):
 
     def __init__(self, shape: Shape, page: Page):
         """Take the sizes. Extras and other representations of the belief are laid out once they are known."""
-        row = memory_offsets(shape.n, shape.m)
+        row = memory_offsets(shape.n, shape.m, shape.t)
         x = input_matrix(Place("rows", row.mean), (shape.n,))
-        p = input_matrix(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)
+        p = input_matrix(Place("rows", row.cov), (shape.t, shape.t), symmetric=True, like=x)
         super().__init__(shape, page, x, p, filter_offset(shape))
         self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
         self.ratio = self.ratio_in("given", 0)
@@ -397,12 +397,14 @@ class PagedModel:
         extras: what the filter keeps besides mean and covariance, by name.
         feed: number of inputs that h takes, all or none.
         state_angles, measurement_angles: flags of components that are angles.
+        turns: rotations among the states.
     """
 
     def __init__(self, memory: NumbersMemory):
         shape, self._constants = memory.shape, memory.constants
         self.feed = shape.feed
         self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
+        self.turns = shape.turns
         self.Q, self.R, self.Q_root, self.R_root = memory.Q, memory.R, memory.Q_root, memory.R_root
         if shape.step_ratio and memory.ratio is not None:
             self.Q = memory.Q * memory.ratio
@@ -465,19 +467,23 @@ class Equations(PagedModel):
 
     def f(self, x: Matrix, u: Matrix) -> Matrix:
         """The state, a substep after x; of points (n, points) that of each."""
-        return (self._f if len(x.shape) == 1 else self._at_points("motion", x))(x, u, self._constants)
+        f = self._f if len(x.shape) == 1 else self._at_points("motion", x)
+        return unit(f(x, u, self._constants), self.turns)
 
     def F(self, x: Matrix, u: Matrix) -> Matrix:  # noqa: N802
-        """df/dx."""
-        return self._F(x, self._scales, u, self._constants)
+        """df/dx, of a state with rotations in the tangents at x and f(x, u), (t, t)."""
+        F = self._F(x, self._scales, u, self._constants)
+        if not self.turns:
+            return F
+        return rows_in_tangent(columns_in_tangent(F, x, self.turns), self._f(x, u, self._constants), self.turns)
 
     def h(self, x: Matrix) -> Matrix:
         """What is measured at x; of points (n, points) at each."""
         return (self._h if len(x.shape) == 1 else self._at_points("sight", x))(x, *self._seen())
 
     def H(self, x: Matrix) -> Matrix:  # noqa: N802
-        """dh/dx."""
-        return self._H(x, self._scales, *self._seen())
+        """dh/dx, of a state with rotations in the tangent at x, (m, t)."""
+        return columns_in_tangent(self._H(x, self._scales, *self._seen()), x, self.turns)
 
     def _operations(
         self, name: str, parts: tuple[Callable, ...], rows: int, n: int, trace: bool

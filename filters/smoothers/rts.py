@@ -39,6 +39,7 @@ from thruster_env.core.angles import difference
 from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
 from thruster_env.core.threads import spread
 from thruster_env.model.shape import Functions, Shape, number_offsets
+from thruster_env.model.turns import refuse_rotations
 
 ROUNDING = 1e-12  # of angles that were wrapped [rad]
 Given = tuple[np.ndarray, np.ndarray, np.ndarray]  # means, covariances, and which are restarts, (B, K + 1, ...)
@@ -269,6 +270,7 @@ RELATIONS: dict[type[Filter], Relation] = {
 def relation_of(filter_: Filter, what: str, alternatives: str = "") -> Relation:
     """The relation of a filter for `smooth_backwards`; ValueError if it has no such smoother."""
     kind = type(filter_)
+    refuse_rotations(filter_.model)
     if filter_.model.bounds:
         raise ValueError(f"{what} needs a model without bounds, but got {filter_.model.bounds}")
     if isinstance(filter_, KalmanFilter) and kind is KalmanFilter and filter_.schedule > 1:

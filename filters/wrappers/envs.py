@@ -130,7 +130,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         n, m = self.filter.model.n, split.channels
         # What an env appends to its measurement, validity flags and the reference, stays in the observation.
         self._appended = env.get_wrapper_attr(APPENDED) if env.has_wrapper_attr(APPENDED) else 0
-        length = {"estimate": n, "measurement+estimate": m + n, "belief": 2 * n}[observation] + self._appended
+        length = {"estimate": n, "measurement+estimate": m + n, "belief": n + self.filter.model.t}[observation]
+        length += self._appended
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
         session: Any = self.filter.session()
         if smoothing_lag is not None:
@@ -278,9 +279,11 @@ class EstimateStates(gym.vector.VectorWrapper):
         actions = check_spaces(env.single_action_space, env.single_observation_space, self.filter.model, inputs)
         self._n, self._m = self.filter.model.n, split.channels
         self._appended = getattr(env.unwrapped, APPENDED, 0)
-        length = {"estimate": self._n, "measurement+estimate": self._m + self._n, "belief": 2 * self._n}[
-            observation
-        ]
+        length = {
+            "estimate": self._n,
+            "measurement+estimate": self._m + self._n,
+            "belief": self._n + self.filter.model.t,
+        }[observation]
         shape = (length + self._appended,)
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, shape=shape, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -392,7 +395,7 @@ class EstimateStates(gym.vector.VectorWrapper):
     ) -> np.ndarray:
         """Report copies of a mask; those of `stepped` (N,), by default all, have a new measurement."""
         n, m, beliefs = self._n, self.filter.model.m, self._beliefs
-        mean, cov = beliefs.part("mean", n), beliefs.part("cov", n, n)
+        mean, cov = beliefs.part("mean", n), beliefs.part("cov", *[self.filter.model.t] * 2)
         reported = np.ones(self.num_envs, dtype=bool) if mask is None else mask.copy()
         stepped = reported if stepped is None else stepped
         added = {

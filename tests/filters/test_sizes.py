@@ -84,7 +84,7 @@ def test_compiled_code_of_many_sensors_has_these_numbers_too(name, fields, n, m)
 
 @pytest.mark.parametrize("m", [1, 12])
 def test_a_negative_variance_is_lost_for_any_number_of_sensors(m):
-    magnitude, row = row_magnitude(2, m), np.ones(200)
+    magnitude, row = row_magnitude(2, m, 2), np.ones(200)
     assert magnitude(row) < LARGEST
     for place, value in ((2, -1e-9), (5, np.nan), (0, np.inf)):  # of a variance, a variance, a mean
         lost = row.copy()

@@ -386,9 +386,9 @@ class AnyStepModel(StateSpaceModel):
         return in_any_steps(self.plain.replace(**changes))
 
     @property
-    def shape(self) -> Shape:
+    def any_shape(self) -> Shape:
         """Sizes, with the flag that pages multiply Q by the last input."""
-        return super().shape._replace(step_ratio=True)
+        return super().any_shape._replace(step_ratio=True)
 
 
 def in_any_steps(model: StateSpaceModel, dt: float | None = None) -> AnyStepModel:

@@ -207,13 +207,15 @@ class Bound(NamedTuple):
     high: float
 
 
-def checked_bounds(user_bounds: Any, states: Sequence[Quantity]) -> tuple[Bound, ...]:
+def checked_bounds(user_bounds: Any, states: Sequence[Quantity], rotations: Any = ()) -> tuple[Bound, ...]:
     """Bounds in the order of the states, from a mapping of symbols or indices to pairs; None is no bound.
 
     Raises ValueError for another state, an angle, or a pair that is not increasing numbers.
     """
     if not isinstance(user_bounds, Mapping):  # those of another model
         user_bounds = {bound[0]: bound[1:] for bound in user_bounds}
+    if rotations and user_bounds:
+        raise ValueError(f"a model with rotations must have no bounds, but got {short_repr(user_bounds)}")
     symbols, result = [state.symbol for state in states], []
     for name, pair in user_bounds.items():
         index = symbols.index(name) if name in symbols else name
@@ -244,6 +246,10 @@ def scales_of(model) -> np.ndarray:
     depend on units.
     """
     scales = np.sqrt(np.diag(model.prior_cov) + np.diag(model.process_noise_cov))
+    if model.turns:
+        from thruster_env.model.turns import stored_of  # which imports this module
+
+        scales = np.array(stored_of(scales, model.turns, 1.0))
     if (scales > 0.0).all():
         return scales
     start = _propagated(model, model.prior_mean)

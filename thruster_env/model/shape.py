@@ -15,6 +15,7 @@ from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import jacobian
 from thruster_env.core.equal_functions import first_equal
 from thruster_env.core.sources import tuple_of, written_out
+from thruster_env.model.turns import Turn
 
 MOST_CONSTANTS = 96  # in a tuple that compiled functions pass on
 
@@ -22,7 +23,7 @@ MOST_CONSTANTS = 96  # in a tuple that compiled functions pass on
 class Shape(NamedTuple):
     """Sizes of a model, and other data needed to compile its code."""
 
-    n: int  # states
+    n: int  # states, as they are stored
     m: int  # measurements
     inputs: int
     form: type | int  # of the constants: their NamedTuple class, or how many
@@ -30,6 +31,17 @@ class Shape(NamedTuple):
     measurement_angles: tuple[bool, ...]  # (m,), which measurements do
     step_ratio: bool = False  # whether the last input is one, by which pages multiply Q: `steps.in_any_steps`
     feeds: bool = False  # whether h takes the input: h(x, u, c)
+    turns: tuple[Turn, ...] = ()  # rotations among the states, whose errors have fewer components
+
+    @property
+    def t(self) -> int:
+        """Number of components of an error of the state, and so rows of P and Q."""
+        return self.n - len(self.turns)
+
+    @property
+    def offsets(self) -> NumberOffsets:
+        """Places of the parts of a model's row."""
+        return number_offsets(self.n, self.m, self.t)
 
     @property
     def constants(self) -> int:
@@ -108,24 +120,25 @@ def padded(size, lanes):
 
 
 class NumberOffsets(NamedTuple):
-    """First places of the parts of a model's row, for n states and m measurements."""
+    """First places of the parts of a model's row, for n states, m measurements and errors with t components."""
 
-    q: int  # (n, n), process noise covariance
-    q_root: int  # (n, n), lower triangular, q_root q_root' = q
+    q: int  # (t, t), process noise covariance
+    q_root: int  # (t, t), lower triangular, q_root q_root' = q
     r: int  # (m, m), measurement noise covariance
     r_root: int  # (m, m)
     prior_mean: int  # (n,)
-    prior_cov: int  # (n, n)
-    prior_root: int  # (n, n)
+    prior_cov: int  # (t, t)
+    prior_root: int  # (t, t)
     scales: int  # (n,), what small steps of each state are measured in
     substeps: int
     constants: int  # the model's own constants; a filter's own numbers follow
 
 
 @cache
-def number_offsets(n: int, m: int) -> NumberOffsets:
-    """Places in the row of a model's numbers; see `StateSpaceModel.numbers`."""
-    return NumberOffsets(*starts_of(n * n, n * n, m * m, m * m, n, n * n, n * n, n, 1))
+def number_offsets(n: int, m: int, t: int | None = None) -> NumberOffsets:
+    """Places in the row of a model's numbers, see `StateSpaceModel.numbers`; t = n if None."""
+    tt = n * n if t is None else t * t
+    return NumberOffsets(*starts_of(tt, tt, m * m, m * m, n, tt, tt, n, 1))
 
 
 def with_root(cov: np.ndarray) -> np.ndarray:
@@ -141,7 +154,7 @@ def starts_of(*lengths: int) -> list[int]:
 @lru_cache(maxsize=64)
 def constants_reader(shape: Shape) -> Callable:
     """Return `read(numbers)`: the model's constants as its functions take them."""
-    start = number_offsets(shape.n, shape.m).constants
+    start = shape.offsets.constants
     if constants_are_array(shape.form):
         return written_out("read", "row", f"row[{start}:{start + shape.constants}]")
     values = [f"row[{start + i}]" for i in range(shape.constants)]

@@ -34,6 +34,7 @@ from thruster_env.model.quantities import (
 )
 from thruster_env.model.shape import Functions, Shape, constants_are_array, constants_form
 from thruster_env.model.traced import called_function
+from thruster_env.model.turns import Turn, refuse_rotations, unit_mean, with_rotations
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,10 +92,11 @@ class StateSpaceModel:
             them in all states of its window.
         bounded_by: how: "truncation", the moments of the Gaussian within the bounds, or "projection", the most
             probable state within (`filters.engine.belief`).
-        states: a `Quantity` or a name for each state; x_1, x_2, ... if None.
+        states: a `Quantity` or a name for each state, or a `Rotation` for four; x_1, x_2, ... if None.
         input_quantities: the same for the inputs; u_1, ... if None.
         measurements: the same for the measurements; z_1, ... if None.
         outputs: outputs of the model by symbol: an `Output` each, a quantity and a function of (x, c).
+        turns: rotations of the state; they follow from `states`.
         positions: `Positions` of states and measurements, for ensembles with localisation; None if unknown.
 
     Raises:
@@ -126,16 +128,20 @@ class StateSpaceModel:
     measurements: Any = None
     outputs: Mapping[str, Any] = field(default_factory=dict)
     positions: Positions | None = None
+    turns: tuple[Turn, ...] = ()
 
     def __post_init__(self):
         """Check shapes and signs, and try the functions; raise ValueError that states the rule and the value."""
         mean = vector("prior_mean", self.prior_mean)
         n, r = len(mean), self.measurement_noise_cov
         m = _channels(r)
+        states, turns = with_rotations(self.states, self.turns)
+        t = n - len(turns)
         checked: dict[str, Any] = {
-            "prior_mean": mean,
-            "prior_cov": covariance("prior_cov", self.prior_cov, n),
-            "process_noise_cov": covariance("process_noise_cov", self.process_noise_cov, n),
+            "turns": turns,
+            "prior_mean": unit_mean(mean, turns),
+            "prior_cov": covariance("prior_cov", self.prior_cov, t),
+            "process_noise_cov": covariance("process_noise_cov", self.process_noise_cov, t),
             "measurement_noise_cov": covariance("measurement_noise_cov", r, m, positive_definite=True),
             "substeps": at_least("substeps", self.substeps, 1, 10_000),
             "constants": checked_constants(self.constants),
@@ -152,7 +158,7 @@ class StateSpaceModel:
         if self.analytic:
             checked["transition_jacobian"] = self._exact("transition", n, n, "u, c")
             checked["observe_jacobian"] = self._exact("observe", m, n, "u, c" if self.feeds else "c")
-        checked["states"] = quantities("states", self.states, n, "x", "prior_mean")
+        checked["states"] = quantities("states", states, n, "x", "prior_mean")
         checked["input_quantities"] = quantities(
             "input_quantities", self.input_quantities, checked["inputs"], "u", "inputs, or b,"
         )
@@ -160,7 +166,7 @@ class StateSpaceModel:
         checked["outputs"] = outputs(self.outputs)
         if self.positions is not None:
             checked["positions"] = Positions(*self.positions).checked(n, m)
-        checked["bounds"] = checked_bounds(self.bounds, checked["states"])
+        checked["bounds"] = checked_bounds(self.bounds, checked["states"], turns)
         one_of("bounded_by", self.bounded_by, ("truncation", "projection"))
         for name, value in checked.items():
             object.__setattr__(self, name, value)
@@ -187,6 +193,11 @@ class StateSpaceModel:
         return len(self.prior_mean)
 
     @property
+    def t(self) -> int:
+        """Number of components of an error of the state: n, less one for each rotation."""
+        return self.n - len(self.turns)
+
+    @property
     def m(self) -> int:
         """Number of measurements."""
         return len(self.measurement_noise_cov)
@@ -198,18 +209,22 @@ class StateSpaceModel:
 
     @property
     def shape(self) -> Shape:
-        """Sizes of the model, and other data needed to compile its code."""
-        states, channels = (
-            tuple(quantity.angle for quantity in part) for part in (self.states, self.measurements)
-        )
+        """Sizes of the model, and other data needed to compile its code; ValueError if its state has rotations."""
+        refuse_rotations(self)
+        return self.any_shape
+
+    @property
+    def any_shape(self) -> Shape:
+        """`shape`, for what takes rotations, too."""
+        states, channels = (tuple(part.angle for part in parts) for parts in (self.states, self.measurements))
         form = constants_form(self.constants)
-        return Shape(self.n, self.m, self.inputs, form, states, channels, feeds=self.feeds)
+        return Shape(self.n, self.m, self.inputs, form, states, channels, feeds=self.feeds, turns=self.turns)
 
     @property
     def functions(self) -> Functions:
         """The model's functions, ready for compiled code: large results are always arrays."""
         n, m, slopes = self.n, self.m, first_equal((self.transition_jacobian, self.observe_jacobian))
-        shape = self.shape
+        shape = self.any_shape
         form, sizes, arguments_of_h = (
             shape.form,
             (n, self.inputs, len(self.constants)),
@@ -231,7 +246,7 @@ class StateSpaceModel:
     @property
     def given_constants(self) -> tuple | np.ndarray:
         """The constants as functions get them: an array if there are too many for a tuple."""
-        return np.array(self.constants) if constants_are_array(self.shape.form) else self.constants
+        return np.array(self.constants) if constants_are_array(self.any_shape.form) else self.constants
 
     def replace(self, **changes) -> Self:
         """A copy of the model with some fields changed; ValueError as for a new model."""
@@ -258,7 +273,7 @@ class StateSpaceModel:
             object.__setattr__(model, attribute.name, copied)
         for name, value in changes.items():
             measured = name == "measurement_noise_cov"
-            size = self.m if measured else self.n
+            size = self.m if measured else self.t
             object.__setattr__(model, name, covariance(name, value, size, positive_definite=measured))
         return model
 
@@ -534,6 +549,8 @@ def digest_of(model: StateSpaceModel) -> str:
         "transition": _values(model.transition, model, (model.n, model.inputs)),
         "observe": _values(model.observe, model, (model.n, model.inputs) if model.feeds else (model.n,)),
     }
+    if model.turns:
+        parts["turns"] = model.turns
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:LENGTH]
 
 

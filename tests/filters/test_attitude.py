@@ -1,0 +1,281 @@
+"""States with rotations: an attitude filter against a naive one, its sides, its consistency, and refusals."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation as Turned
+
+import filters
+from filters.bounds import path_bound, posterior_bound
+from filters.c.project import c_filter
+from filters.estimators.foreign import Estimator, ForeignFilter
+from filters.registry import FILTERS
+from thruster_env.core.compiled import interpreted
+from thruster_env.env.model_env import ModelEnv
+from thruster_env.model import rotations
+from thruster_env.model.simulate import simulate
+from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import Rotation
+
+DT, GYRO, WALK, SENSOR, BIAS = 0.1, 2e-3, 2e-4, 0.05, 0.02
+GRAVITY, FIELD = (0.0, 0.0, 1.0), (0.0, 0.6, -0.8)
+TAKE_ROTATIONS = "ekf", "iekf", "fading"
+
+
+def advance(x, u, c):
+    """A gyroscope turns the attitude; its bias is constant."""
+    q, bias = x[:4], x[4:]
+    return *rotations.product(q, rotations.exponential(tuple((u[i] - bias[i]) * c[0] for i in range(3)))), *bias
+
+
+def directions(x, c):
+    """Gravity and the magnetic field in the axes of the body."""
+    return *rotations.to_body(x[:4], GRAVITY), *rotations.to_body(x[:4], FIELD)
+
+
+def attitude_model(side="body", degrees=5.0, start=(1.0, 0.0, 0.0, 0.0)):
+    """Attitude and bias of a gyroscope."""
+    return StateSpaceModel(
+        transition=advance,
+        observe=directions,
+        process_noise_cov=[GYRO**2 * DT] * 3 + [WALK**2 * DT] * 3,
+        measurement_noise_cov=[SENSOR**2] * 6,
+        prior_mean=[*start, 0.0, 0.0, 0.0],
+        prior_cov=[np.deg2rad(degrees) ** 2] * 3 + [BIAS**2] * 3,
+        constants=(DT,),
+        states=(Rotation("attitude", side=side), "b_x", "b_y", "b_z"),
+        input_quantities=("w_x", "w_y", "w_z"),
+    )
+
+
+def simulated(runs, steps, degrees):
+    """True attitudes and biases (runs, steps + 1, 7) about an estimate of none, gyroscope and measurements."""
+    draw = np.random.default_rng(1).normal
+    q, bias = Turned.from_rotvec(np.deg2rad(degrees) * draw(size=(runs, 3))), BIAS * draw(size=(runs, 3))
+    truth, gyro, z = [], [], []
+    for k in range(steps + 1):
+        x, y, zz, w = q.as_quat().T
+        truth.append(np.column_stack([w, x, y, zz, bias]))
+        channels = np.column_stack([q.inv().apply(GRAVITY), q.inv().apply(FIELD)])
+        z.append(channels + SENSOR * draw(size=(runs, 6)))
+        rate = np.sin(0.3 * k * DT + np.arange(3)) * 0.5
+        gyro.append(rate + bias + GYRO / np.sqrt(DT) * draw(size=(runs, 3)))
+        q, bias = (
+            q * Turned.from_rotvec(np.tile(rate * DT, (runs, 1))),
+            bias + WALK * DT**0.5 * draw(size=(runs, 3)),
+        )
+    return (np.stack(part, axis=1) for part in (truth, gyro[:-1], z))
+
+
+def errors_of(truth, means):
+    """Errors of the body (..., 6)."""
+    stored, estimated = (Turned.from_quat(part[..., [1, 2, 3, 0]].reshape(-1, 4)) for part in (truth, means))
+    turned = (estimated.inv() * stored).as_rotvec().reshape(*means.shape[:-1], 3)
+    return np.concatenate([turned, truth[..., 4:] - means[..., 4:]], axis=-1)
+
+
+def nees_of(truth, estimates):
+    """Squares of the errors in units of P, (runs, steps)."""
+    errors = errors_of(truth, estimates.means)
+    return np.einsum("bki,bki->bk", errors, np.linalg.solve(estimates.covs, errors[..., None])[..., 0])
+
+
+def skew(v):
+    """[v]x."""
+    return np.cross(np.eye(3), v)
+
+
+def naive(gyro, z, degrees):
+    """The error-state filter of the body with the exact reset, of one run, in matrices: last q, bias and P."""
+    q, bias = Turned.identity(), np.zeros(3)
+    P, Q = (
+        np.diag([np.deg2rad(degrees) ** 2] * 3 + [BIAS**2] * 3),
+        np.diag([GYRO**2 * DT] * 3 + [WALK**2 * DT] * 3),
+    )
+    for k, measured in enumerate(z):
+        if k:
+            turn = (gyro[k - 1] - bias) * DT
+            F = np.eye(6)
+            F[:3, :3] = Turned.from_rotvec(turn).as_matrix().T
+            F[:3, 3:] = -np.array(rotations.left_jacobian(-turn)) * DT
+            q, P = q * Turned.from_rotvec(turn), F @ P @ F.T + Q
+        expected = q.inv().apply([GRAVITY, FIELD])
+        H = np.zeros((6, 6))
+        H[:3, :3], H[3:, :3] = skew(expected[0]), skew(expected[1])
+        S = H @ P @ H.T + SENSOR**2 * np.eye(6)
+        K = np.linalg.solve(S, H @ P).T
+        d = K @ (measured - expected.ravel())
+        G = np.eye(6)
+        G[:3, :3] = rotations.left_jacobian(-d[:3])
+        P = G @ (P - K @ S @ K.T) @ G.T
+        q, bias = q * Turned.from_rotvec(d[:3]), bias + d[3:]
+    return q, bias, P
+
+
+@pytest.fixture(scope="module")
+def data():
+    return tuple(simulated(16, 100, 5.0))
+
+
+@pytest.fixture(scope="module")
+def of_side(data):
+    """Estimates of all 16 runs by the extended filter, by the side of the error."""
+    _, gyro, z = data
+    return {
+        side: filters.run(filters.ExtendedKalmanFilter(model=attitude_model(side)), inputs=gyro, measurements=z)
+        for side in ("body", "world")
+    }
+
+
+def test_the_extended_filter_is_the_error_state_filter(data, of_side):
+    """Written with matrices and scipy's rotations it has the same estimates."""
+    _, gyro, z = data
+    q, bias, P = naive(gyro[0], z[0], 5.0)
+    mean = of_side["body"].means[0, -1]
+    assert (q.inv() * Turned.from_quat(mean[[1, 2, 3, 0]])).magnitude() < 1e-12
+    np.testing.assert_allclose(mean[4:], bias, atol=1e-13)
+    np.testing.assert_allclose(of_side["body"].covs[0, -1], P, atol=1e-15)
+
+
+def test_estimates_do_not_depend_on_the_side_of_the_error(of_side):
+    """With the exact reset; the covariance of the world's error is that of the body's, turned."""
+    body, world = of_side["body"], of_side["world"]
+    np.testing.assert_allclose(world.means, body.means, atol=1e-12)
+    np.testing.assert_allclose(world.log_likelihoods, body.log_likelihoods, atol=1e-9)
+    A = np.eye(6)
+    A[:3, :3] = rotations.matrix(body.means[0, -1, :4])
+    np.testing.assert_allclose(world.covs[0, -1], A @ body.covs[0, -1] @ A.T, atol=1e-15)
+
+
+def test_errors_are_consistent_from_five_degrees(data, of_side):
+    """The mean NEES of 16 runs is that of six states, at a level of 1e-4; quaternions keep length 1."""
+    estimates = of_side["body"]
+    assert 3.9 < nees_of(data[0], estimates)[:, 20:].mean() < 8.6
+    np.testing.assert_allclose(np.linalg.norm(estimates.means[..., :4], axis=-1), 1.0, atol=4e-16)
+
+
+def test_minus_q_is_the_same_rotation(data, of_side):
+    """A filter that starts at -q has the same estimates, to the last bit."""
+    _, gyro, z = data
+    start = filters.ExtendedKalmanFilter(model=attitude_model(start=(-1.0, 0.0, 0.0, 0.0)))
+    estimates = filters.run(start, inputs=gyro[0], measurements=z[0])
+    np.testing.assert_array_equal(abs(estimates.means), abs(of_side["body"].means[0]))
+    np.testing.assert_array_equal(estimates.covs, of_side["body"].covs[0])
+
+
+def test_the_iterated_filter_holds_from_sixty_degrees():
+    """Gauss and Newton's steps on the rotation lose no run, and its first errors are consistent, too."""
+    truth, gyro, z = simulated(16, 50, 60.0)
+    iterated = filters.IteratedExtendedKalmanFilter(model=attitude_model(degrees=60.0), iterations=8)
+    estimates = filters.run(iterated, inputs=gyro, measurements=z)
+    nees, errors = nees_of(truth, estimates), errors_of(truth, estimates.means)
+    assert 3.0 < nees[:, 0].mean() < 9.6  # the mean of 16 runs, at a level of 1e-4
+    assert np.rad2deg(np.linalg.norm(errors[:, -1, :3], axis=-1)).max() < 5.0
+
+
+def test_the_iterated_filter_does_not_depend_on_the_side(data):
+    """Each iteration's Jacobian is brought into the tangent of the prediction."""
+    body, world = (
+        filters.run(
+            filters.IteratedExtendedKalmanFilter(model=attitude_model(side), iterations=2),
+            inputs=data[1],
+            measurements=data[2],
+        )
+        for side in ("body", "world")
+    )
+    np.testing.assert_allclose(world.means, body.means, atol=1e-12)
+
+
+class Sensor(gym.Env):
+    """An env that measures the directions of a body at rest."""
+
+    action_space = gym.spaces.Box(-1.0, 1.0, (3,))
+    observation_space = gym.spaces.Box(-2.0, 2.0, (6,))
+
+    def reset(self, *, seed=None, options=None):
+        """Begin."""
+        return np.array([*GRAVITY, *FIELD], dtype=np.float32), {}
+
+    def step(self, action):
+        """Turn nothing."""
+        return self.reset()[0], 0.0, False, False, {}
+
+
+def test_sessions_beliefs_wrapped_envs_and_python_have_the_numbers_of_a_batch(data, of_side):
+    """The same run on each path; P has a row less than the state."""
+    _, gyro, z = data
+    filter_, expected = filters.ExtendedKalmanFilter(model=attitude_model()), of_side["body"]
+    session, (belief, _) = filter_.session(), filter_.update(filter_.init(), z[0, 0])
+    session.start(z=z[0, 0])
+    for k in range(3):
+        session.step(gyro[0, k], z[0, k + 1])
+        belief, innovation = filter_.update(filter_.predict(belief, gyro[0, k]), z[0, k + 1])
+    for mean, cov in ((session.mean, session.cov), (belief.mean, belief.cov)):
+        np.testing.assert_allclose(mean, expected.means[0, 3], atol=1e-15)
+        np.testing.assert_allclose(cov, expected.covs[0, 3], atol=1e-16)
+    np.testing.assert_allclose(innovation.value, expected.innovations[0, 3], atol=1e-14)
+    with interpreted():
+        in_python = filters.run(filter_, inputs=gyro[0, :3], measurements=z[0, :4])
+    np.testing.assert_allclose(in_python.means, expected.means[0, :4], atol=1e-15)
+    env = filters.EstimateState(Sensor(), model=attitude_model(), filter="ekf", observation="belief")
+    observation, info = env.reset(seed=1)
+    observation, *_, info = env.step(np.zeros(3))
+    assert observation.shape == (13,)
+    assert info["estimate_cov"].shape == (6, 6)
+    assert env.observation_space.contains(observation)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_every_filter_runs_on_rotations_or_refuses_them(name):
+    """In one line, before it computes anything."""
+    extra = {"low": -np.ones(7), "high": np.ones(7)} if name == "fuzzy" else {}
+    make = lambda: FILTERS[name](model=attitude_model(), **extra)  # noqa: E731
+    if name in TAKE_ROTATIONS:
+        assert make().kernels().t == 6
+    else:
+        with pytest.raises(ValueError, match="is of rotations|must have an affine model"):
+            make().kernels()
+
+
+def test_every_other_path_refuses_them():
+    """Smoothers, tensors, C, gradients, bounds, simulation, envs and models made of a model."""
+    model, filter_ = attitude_model(), filters.ExtendedKalmanFilter(model=attitude_model())
+    data = {"inputs": np.zeros((2, 3)), "measurements": np.zeros((3, 6))}
+    refusals = (
+        lambda: filters.ExtendedKalmanFilter(model=model, form="square-root").kernels(),
+        lambda: filters.ExtendedKalmanFilter(model=model, form="ud").kernels(),
+        lambda: filters.smooth(filter_, **data),
+        lambda: filters.run(filter_, **data).to_frame(),
+        lambda: ForeignFilter(model=model, estimator=Estimator()),
+        lambda: filters.torch(filter_),
+        lambda: c_filter(filter_),
+        lambda: filters.EstimateState(Sensor(), model=model, filter="ekf", smoothing_lag=2),
+        lambda: posterior_bound(model, data["inputs"][None]),
+        lambda: path_bound(model, data["inputs"][None]),
+        lambda: simulate(model, np.zeros((1, 2)), data["inputs"][None]),
+        lambda: ModelEnv(model),
+        lambda: filters.linearize(model, model.prior_mean, np.zeros(3)),
+        lambda: filters.augmented_model(model, {0: filters.Unknown(0.1)}),
+        lambda: filters.transformed_model(model, {"b_x": (-1.0, 1.0)}),
+        lambda: model.replace(bounds={"b_x": (-1.0, 1.0)}),
+    )
+    for path in refusals:
+        with pytest.raises(ValueError, match="rotations"):
+            path()
+
+
+def test_what_is_no_rotation_is_refused():
+    """Quaternions without length 1, other sides, covariances of stored numbers; a copy with other noise is one."""
+    model = attitude_model()
+    with pytest.raises(ValueError, match="'attitude' must be a quaternion"):
+        attitude_model(start=(1.0, 1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="must be 'body' or 'world', but got 'left'"):
+        attitude_model(side="left")
+    with pytest.raises(ValueError, match="prior_cov must be 6 variances"):
+        model.replace(prior_cov=np.ones(7))
+    changed = model.replace(process_noise_cov=np.ones(6)).replace(observe_jacobian=None)
+    assert changed.turns == model.turns
+    assert changed.digest == model.digest != attitude_model("world").digest
+    filter_ = filters.ExtendedKalmanFilter(model=model)
+    with pytest.raises(ValueError, match="'attitude' must be a quaternion"):
+        filter_.predict(filter_.init()._replace(mean=np.ones(7)), np.zeros(3))
