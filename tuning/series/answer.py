@@ -234,7 +234,16 @@ class SeriesFit(Result):
             numbers,
             *lines,
             *sentences,
+            f"Next: --code FILE.md (fit.code) writes it for a controller; elsewhere it is --model {self.text}",
         ]
+
+    @property
+    def text(self) -> str:
+        """The model with its numbers as other commands and `EstimateState` take it (`filters.named`)."""
+        axes = [f"axes={self.model.m}"] * (self.model.m > 1)
+        return (
+            f"{self.name}:{','.join([*axes, *(f'{number.name}={number.value:.4g}' for number in self.numbers)])}"
+        )
 
     def _standings(self) -> list[tuple[str, float, float]]:
         """Of each candidate, best first: by how much it is behind the best, and the standard error of that."""
