@@ -15,9 +15,9 @@ pygame = pytest.importorskip("pygame")
 
 from thruster_env.render.canvas import BAND, fitting_axis  # noqa: E402
 from thruster_env.render.renderer import Window  # noqa: E402
-from thruster_env.thruster.dynamics import BLADES, end_view  # noqa: E402
-from thruster_env.thruster.rendering import (  # noqa: E402
+from thruster_env.thruster.rendering import (  # noqa: E402  # noqa: E402
     AXIS,
+    BLADES,
     FLOW,
     FORCE,
     FORCE_LENGTH,
@@ -26,6 +26,7 @@ from thruster_env.thruster.rendering import (  # noqa: E402
     OUTSIDE,
     PORTHOLE,
     PORTHOLE_RADIUS,
+    end_view,
 )
 
 GEAR_RATIO, DT = 2.0, 0.01
