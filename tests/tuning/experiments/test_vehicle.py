@@ -227,7 +227,7 @@ def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, t
     else:
         assert set(by_path) == {(path, "vehicle") for path in PATHS} | {("dynamic", "no restoring moments")}
         assert by_path["III", "vehicle"]["fuzzy 0..1"]["published"]["rmse"]["psi"] == 1e-5
-        assert "23 of the 64" in words and "4.834" in words
+        assert "23 of the 64" in words and "4.83" in words
     assert all(one["why"] for filters in by_path.values() for one in filters.values() if one["published"])
 
 
