@@ -27,6 +27,7 @@ SCRIPTS = {  # of this folder, by page; experiments name theirs
     "gallery": ("gallery",),
     "machine_code": ("machine_code",),
     "plant": ("plant",),
+    "q_and_r": ("q_and_r",),
     "ranking": ("ranking", "estimators"),
     "readme": ("pictures",),
     "tuning": ("tuning", "tuning_choice"),

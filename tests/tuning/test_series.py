@@ -14,9 +14,11 @@ import pytest
 import filters
 import tuning
 from filters.models import NAMED, Scales, named_model
+from thruster_env.graphs.loops import machine_code_of
 from tuning.series.column import column_of
 from tuning.series.likelihood import ColumnLikelihood
 from tuning.series.paste import LANGUAGES
+from tuning.series.recursion import _recursion
 
 NILE = """
 1120 1160 963 1210 1160 1160 813 1230 1370 1140 995 935 1110 994 1020 960 1180 799 958 1140 1100 1210 1150
@@ -261,6 +263,11 @@ def test_the_likelihood_is_that_of_an_exact_diffuse_filter_on_unequal_steps(name
     expected = result.llf_obs[result.nobs_diffuse :].sum()
     assert result.nobs_diffuse == count
     assert likelihood.value(likelihood.coordinates.of(values)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_recursion_needs_no_numba():
+    code = _recursion  # whose sizes no call knows before
+    assert machine_code_of(code._function, code._shapes) is not None
 
 
 def test_lines_for_python_make_the_same_filter(position):

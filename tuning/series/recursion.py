@@ -140,11 +140,10 @@ def _filter(
                 cov[i, j] = begin_beliefs[b, n + i * n + j]
                 before[i, j] = 0.0
         for a in range(p):
-            dmean, dcov = vectors[3 + 4 * a], matrices[5 + 4 * a]
             for i in range(n):
-                dmean[i] = begin_slopes[b, a, i]
+                vectors[3 + 4 * a, i] = begin_slopes[b, a, i]
                 for j in range(n):
-                    dcov[i, j] = begin_slopes[b, a, n + i * n + j]
+                    matrices[5 + 4 * a, i, j] = begin_slopes[b, a, n + i * n + j]
         settled, step_before, s, begin = 0.0, -1.0, 1.0, int(begin_rows[b])
         for k in range(begin, rows):
             is_measured = z[b, k] == z[b, k] and (k > begin or is_prediction > 0.0)
@@ -260,29 +259,33 @@ def _filter(
                             if not change * change <= SETTLED * SETTLED * size:
                                 can_settle = 0.0
                     for a in range(p):
-                        dcov, dpredicted, dbefore = matrices[5 + 4 * a], matrices[6 + 4 * a], matrices[7 + 4 * a]
-                        dgain, ds = vectors[6 + 4 * a], r_slopes[a]
+                        updated_slope, ahead_slope, slope_before = (
+                            matrices[5 + 4 * a],
+                            matrices[6 + 4 * a],
+                            matrices[7 + 4 * a],
+                        )
+                        gain_slope, ds = vectors[6 + 4 * a], r_slopes[a]
                         for i in range(n):
                             total = 0.0
                             for j in range(n):
-                                total += dpredicted[i, j] * output[j]
+                                total += ahead_slope[i, j] * output[j]
                             vectors[5 + 4 * a, i] = total
                             ds += output[i] * total
                         scalars[a] = ds
                         for i in range(n):
-                            dgain[i] = (vectors[5 + 4 * a, i] - gain[i] * ds) / s
+                            gain_slope[i] = (vectors[5 + 4 * a, i] - gain[i] * ds) / s
                         for i in range(n):
                             for j in range(n):
-                                dbefore[i, j] = dcov[i, j]
-                                dcov[i, j] = (
-                                    dpredicted[i, j]
+                                slope_before[i, j] = updated_slope[i, j]
+                                updated_slope[i, j] = (
+                                    ahead_slope[i, j]
                                     - vectors[5 + 4 * a, i] * gain[j]
                                     - gain[i] * vectors[5 + 4 * a, j]
                                     + gain[i] * gain[j] * ds
                                 )
                         for i in range(n):
                             for j in range(n):
-                                change, size = dcov[i, j] - dbefore[i, j], cov[i, i] * cov[j, j]
+                                change, size = updated_slope[i, j] - slope_before[i, j], cov[i, i] * cov[j, j]
                                 if not change * change <= SETTLED * SETTLED * size:
                                     can_settle = 0.0
                     settled, step_before = can_settle, index[b, k]
@@ -291,12 +294,11 @@ def _filter(
                 sums[b, 0] -= 0.5 * counts * (LOG_TWO_PI + math.log(s) + v * v / s)
                 sums[b, 1] += counts * v * v / s
                 for a in range(p):
-                    dmean, dahead, dgain = vectors[3 + 4 * a], vectors[4 + 4 * a], vectors[6 + 4 * a]
                     dv = 0.0
                     for i in range(n):
-                        dv -= output[i] * dahead[i]
+                        dv -= output[i] * vectors[4 + 4 * a, i]
                     for i in range(n):
-                        dmean[i] = dahead[i] + dgain[i] * v + gain[i] * dv
+                        vectors[3 + 4 * a, i] = vectors[4 + 4 * a, i] + vectors[6 + 4 * a, i] * v + gain[i] * dv
                     scalars[p + a] = dv
                     sums[b, 2 + a] -= counts * (0.5 * scalars[a] / s * (1.0 - v * v / s) + v * dv / s)
                     for c in range(a + 1):
