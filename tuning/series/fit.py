@@ -21,7 +21,6 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import stdtrit
 
 from filters.engine.batch import Estimates, run
@@ -52,6 +51,7 @@ SEARCHES = 3
 EXACT = 1e-8  # predicted rise of the log-likelihood at which the last search ends
 NOISE = "variance of the measurement noise"
 LEAST_DEGREES = 8.0  # of freedom, of Student's distribution
+LINEAR = 0.01  # root of a fall less that of an end, from which on the profile is a line
 FAR = 100.0  # root of a fall where the filter has no likelihood
 PRECISION = 0.01  # of an interval's end, in coordinates, at most
 NORMAL = 0.03  # standard error, in coordinates, below which the likelihood of a long record is normal
@@ -377,6 +377,22 @@ def _end(fitted: Fitted, index: int, limit: float) -> float:
     while outer != limit and beyond(outer) < 0.0:
         inner, outer = outer, min(first + reach, limit) if limit > first else max(first - reach, limit)
         if beyond(outer) > 0.0:
-            return float(brentq(beyond, inner, outer, xtol=precision))
+            return _root(beyond, inner, outer, precision)
         reach *= 2.0
     return outer
+
+
+def _root(function: Callable[[float], float], below: float, above: float, precision: float) -> float:
+    """Where a nearly linear function is zero, between points where it is negative and where it is positive."""
+    low, high = function(below), function(above)
+    while abs(above - below) > precision:
+        share = min(max(low / (low - high), 0.1), 0.9)  # of the way, so that both ends move
+        middle = below + share * (above - below)
+        value = function(middle)
+        if value < 0.0:
+            below, low = middle, value
+        else:
+            above, high = middle, value
+        if abs(value) < LINEAR:
+            return middle - value * (above - below) / (high - low)
+    return below + low / (low - high) * (above - below)
