@@ -13,6 +13,7 @@ import numpy as np
 
 from filters.algebra.matrices import operation, same
 from filters.algebra.operations import sym, wrap
+from filters.algebra.points import ones, outer
 from thruster_env.graphs.graphs import Number
 from thruster_env.graphs.tracing import traced
 from thruster_env.model import turns as steps
@@ -22,11 +23,15 @@ _traced = cache(traced)
 
 def _computed(function: Callable, turns: Any, *vectors: Any) -> np.ndarray:
     """A function of sequences of components, and of the rotations, for arrays of floats or of Numbers."""
-    if vectors[0].dtype != object:
+    if all(vector.dtype != object for vector in vectors):
         return np.array(function(*vectors, turns))
-    for number in np.concatenate(vectors):
+    for number in np.concatenate([vector.ravel() for vector in vectors]):
         if isinstance(number, Number):
             number.graph.whole.add(number.place)  # its own operations may be rounded as they like
+    points = [vector.shape[1] for vector in vectors if vector.ndim == 2]
+    if points:
+        columns = [[v[:, j] if v.ndim == 2 else v for v in vectors] for j in range(points[0])]
+        return np.array([_traced(function)(*map(list, column), turns) for column in columns], dtype=object).T
     return np.array(_traced(function)(*map(list, vectors), turns), dtype=object)
 
 
@@ -35,9 +40,14 @@ def move(model, x, d):
     return wrap(moved(x, d, model.turns) if model.turns else x + d, model.state_angles)
 
 
-def difference(model, x, y):
-    """The d of the tangent at y with move(model, y, d) = x: x - y, and the logarithm of a rotation."""
-    return wrap(x - y, model.state_angles) if not model.turns else apart(x, y, model.turns)
+def points_around(model, x, D):
+    """The points move(model, x, d) of each column d of D, (n, points), angles not wrapped."""
+    return moved(x, D, model.turns) if model.turns else outer(x, ones(D)) + D
+
+
+def differences(model, Y, y):
+    """The d with move(model, y, d) = y_j for each column of Y, (t, points): y_j - y of numbers."""
+    return apart(Y, y, model.turns) if model.turns else Y - outer(y, ones(Y))
 
 
 def reset(model, p, d):
@@ -68,15 +78,15 @@ def columns_in_tangent(a, x, turns):
     return a @ slopes_of_stored(x, turns) if turns else a
 
 
-@operation(same)
+@operation(lambda x, d, turns: (x[0], *d[1:]))
 def moved(x, d, turns):
-    """`move`, if there are rotations."""
+    """`move` and `points_around`, if there are rotations."""
     return _computed(steps.move, turns, x, d)
 
 
-@operation(lambda x, y, turns: (x[0] - len(turns),))
+@operation(lambda x, y, turns: (x[0] - len(turns), *x[1:]))
 def apart(x, y, turns):
-    """`difference`, if there are rotations."""
+    """`differences`, if there are rotations."""
     return _computed(steps.difference, turns, x, y)
 
 

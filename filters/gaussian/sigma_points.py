@@ -12,6 +12,7 @@ from filters.algebra.matrices import operation
 from filters.algebra.operations import divide, mask_missing, of_best_gain, present, sym, uncorrelated, wrap
 from filters.algebra.points import first, log_density, on_circle, ones, outer, root, square, units, without_first
 from filters.algebra.roots import hstack, part, triangle, vstack, zeros
+from filters.algebra.tangents import differences, move, points_around, reset
 from filters.baselines import index_of
 from filters.filter import PageFilter
 from filters.gaussian.extended import initial_root, root_result
@@ -28,7 +29,7 @@ MOST_STATES = 8  # premises, for 256 rules
 
 def unscented_points(model, x, L):
     """The mean, and the points around it."""
-    return outer(x, ones(units(x))) + (L * model.own.spread) @ units(x)
+    return points_around(model, x, (L * model.own.spread) @ units(first(L)))
 
 
 def unscented_moments(model, Y, angles):
@@ -36,6 +37,13 @@ def unscented_moments(model, Y, angles):
     D = wrap(without_first(Y) - outer(first(Y), ones(without_first(Y))), angles)
     s = (D @ ones(D)) * model.own.weight
     return first(Y) + s, s, D
+
+
+def unscented_state(model, X):
+    """Mean and covariance of states at the points."""
+    D = wrap(differences(model, without_first(X), first(X)), model.state_angles)
+    s = (D @ ones(D)) * model.own.weight
+    return move(model, first(X), s), reset(model, scatter(model, D, s), s)
 
 
 def scatter(model, D, s):
@@ -98,14 +106,15 @@ def represent_unscented(model, x, P):
 
 def add_process_noise_unscented(model, X):
     """Mean and covariance of the points, with Q added, at the end of a step."""
-    x, s, D = unscented_moments(model, X, model.state_angles)
-    return wrap(x, model.state_angles), scatter(model, D, s) + model.Q
+    x, P = unscented_state(model, X)
+    return x, P + model.Q
 
 
 def update_unscented(model, x, P, z):
     """Update with the measurement z; NaN marks missing channels."""
     g, w = model.own.spread, model.own.weight
-    L, U, measured = root(P), without_first(units(x)), present(z)
+    L, measured = root(P), present(z)
+    U = without_first(units(first(L)))
     y, s, D = unscented_moments(model, model.h(unscented_points(model, x, L)), model.measurement_angles)
     s, D, R = mask_missing(measured, s), mask_missing(measured, D), uncorrelated(measured, model.R)
     v = mask_missing(measured, wrap(z - y, model.measurement_angles))
@@ -113,7 +122,8 @@ def update_unscented(model, x, P, z):
     S = scatter(model, D, s) + R
     K = divide(C, S)
     rest = scatter(model, (L * g) @ U - K @ D, K @ s) + sym(K @ R @ K.T)
-    return wrap(x + K @ v, model.state_angles), of_best_gain(rest, P, C, S, K), v, S, log_density(v, S, measured)
+    d, P = K @ v, of_best_gain(rest, P, C, S, K)
+    return move(model, x, d), reset(model, P, d), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -151,6 +161,7 @@ class UnscentedKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "ukf"
+    rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(
         propagate_points, add_process_noise_unscented, update_unscented, represent_unscented
     )
@@ -161,7 +172,7 @@ class UnscentedKalmanFilter(PageFilter):
     form: str = "covariance"
 
     def __post_init__(self):
-        n = self.model.n
+        n = self.model.t
         alpha, beta, kappa = positive("alpha", self.alpha), finite("beta", self.beta), finite("kappa", self.kappa)
         if n + kappa <= 0:
             raise ValueError(f"kappa must be above minus the number of states, {-n}, but got {kappa}")
@@ -177,7 +188,7 @@ class UnscentedKalmanFilter(PageFilter):
     @property
     def parameters(self) -> dict[str, float]:
         """The distance of the points, and their weights."""
-        square, curvature = self.alpha**2 * (self.model.n + self.kappa), self.beta - self.alpha**2
+        square, curvature = self.alpha**2 * (self.model.t + self.kappa), self.beta - self.alpha**2
         parameters = {"spread": square**0.5, "weight": 0.5 / square, "shift_weight": curvature}
         if self.form == "covariance":
             return parameters

@@ -19,7 +19,7 @@ from thruster_env.model.turns import Rotation
 
 DT, GYRO, WALK, SENSOR, BIAS = 0.1, 2e-3, 2e-4, 0.05, 0.02
 GRAVITY, FIELD = (0.0, 0.0, 1.0), (0.0, 0.6, -0.8)
-TAKE_ROTATIONS = "ekf", "iekf", "fading"
+TAKE_ROTATIONS = "ekf", "iekf", "fading", "ukf"
 
 
 def advance(x, u, c):
@@ -184,6 +184,44 @@ def test_the_iterated_filter_does_not_depend_on_the_side(data):
         for side in ("body", "world")
     )
     np.testing.assert_allclose(world.means, body.means, atol=1e-12)
+
+
+def naive_points(mean, P):
+    """Sigma points of alpha = 1 and kappa = 0 as rotations and biases, 13 of each."""
+    L = np.linalg.cholesky(P) * np.sqrt(6.0)
+    D = np.vstack([np.zeros(6), L.T, -L.T])
+    return Turned.from_quat(mean[[1, 2, 3, 0]]) * Turned.from_rotvec(D[:, :3]), mean[4:] + D[:, 3:], D
+
+
+def naive_unscented(mean, P, gyro, z):
+    """A prediction and an update of the unscented filter, in matrices: its rotation, bias and P."""
+    q, bias, _ = naive_points(mean, P)
+    q = q * Turned.from_rotvec((gyro - bias) * DT)
+    D = np.hstack([(q[0].inv() * q).as_rotvec(), bias - bias[0]])[1:]
+    s, G = D.sum(axis=0) / 12.0, np.eye(6)
+    G[:3, :3] = rotations.left_jacobian(-s[:3])
+    P = G @ (D.T @ D / 12.0 + np.outer(s, s)) @ G.T + np.diag([GYRO**2 * DT] * 3 + [WALK**2 * DT] * 3)
+    x, y, zz, w = (q[0] * Turned.from_rotvec(s[:3])).as_quat()
+    q, bias, D = naive_points(np.array([w, x, y, zz, *(bias[0] + s[3:])]), P)
+    Y = np.hstack([q.inv().apply(GRAVITY), q.inv().apply(FIELD)])
+    E, s = Y[1:] - Y[0], (Y[1:] - Y[0]).sum(axis=0) / 12.0
+    S = E.T @ E / 12.0 + np.outer(s, s) + SENSOR**2 * np.eye(6)
+    K = np.linalg.solve(S, E.T @ D[1:] / 12.0).T
+    d, G = K @ (z - Y[0] - s), np.eye(6)
+    G[:3, :3] = rotations.left_jacobian(-d[:3])
+    return q[0] * Turned.from_rotvec(d[:3]), bias[0] + d[3:], G @ (P - K @ S @ K.T) @ G.T
+
+
+def test_the_unscented_filter_is_that_of_points_on_the_rotation(data):
+    """A step from 20 degrees has the naive one's estimate."""
+    _, gyro, z = data
+    filter_ = filters.UnscentedKalmanFilter(model=attitude_model(degrees=20.0))
+    start = filter_.init()
+    belief, _ = filter_.update(filter_.predict(start, gyro[0, 0]), z[0, 1])
+    q, bias, P = naive_unscented(start.mean, start.cov, gyro[0, 0], z[0, 1])
+    assert (q.inv() * Turned.from_quat(belief.mean[[1, 2, 3, 0]])).magnitude() < 1e-14
+    np.testing.assert_allclose(belief.mean[4:], bias, atol=1e-15)
+    np.testing.assert_allclose(belief.cov, P, atol=1e-15)
 
 
 class Sensor(gym.Env):
