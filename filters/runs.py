@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -138,7 +138,9 @@ def run(
     arguments = data.keys, data.inputs, data.measurements
     estimates = batch.run(data.filter, *arguments, **data.noise)
     warn_of_restarts(data.filter, estimates.divergences, *arguments, **data.noise)
-    parts = [*(part[:, data.rows] for part in estimates[:5]), estimates.divergences]
+    parts: Sequence = estimates
+    if len(data.rows) < estimates.means.shape[1]:  # else a copy would take as long as the filter
+        parts = [*(part[:, data.rows] for part in estimates[:5]), estimates.divergences]
     runs = FilteredRuns(*(part[0] for part in parts) if data.is_single else parts)
     runs.data = data
     return runs
