@@ -57,7 +57,8 @@ def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | 
         return f"the model of {env.unwrapped}", make
     if isinstance(model, StateSpaceModel):
         return "the model", model
-    named = model_for_step(model, sample_time(env))
+    plant_dt = getattr(getattr(env.unwrapped, "plant", None), "dt", None)
+    named = model_for_step(model, sample_time(env) or plant_dt)
     if named is not None:
         return f"model {model!r}", named
     module, _, name = str(model).partition(":")

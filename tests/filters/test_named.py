@@ -84,5 +84,7 @@ def test_a_filter_of_a_model_without_inputs_ignores_the_actions(as_python):
         single = env.step(np.zeros(2))[4]["estimate"]
         several = copies.step(np.ones((2, 2)))[4]["estimate"]
     np.testing.assert_allclose(several[0], single, rtol=1e-12)
+    env = filters.EstimateState(gym.make("BowThruster-v0"), "kf", model="constant:drift=1,R=0.25")  # of its dt
+    assert env.filter.model.process_noise_cov[0, 0] == pytest.approx(env.unwrapped.plant.dt)
     with pytest.raises(ValueError, match="must have a sample time, but .* has no dt here: constant:dt=..."):
         filters.EstimateState(Drifting(), model="constant:drift=0.01,R=1")
