@@ -7,16 +7,20 @@ numbers. What it gives is a function of numbers that makes a model, as other sou
 from __future__ import annotations
 
 import inspect
+import math
 import re
+from collections import namedtuple
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
+import numpy as np
+
 from filters.models import NAMED, is_named, named_model
-from filters.plants import PLANTS
+from filters.plants import FINE, PLANTS
 from thruster_env.core.checks import at_least, finite, one_of, positive, short_repr
-from thruster_env.model.affine import AffineModel
+from thruster_env.model.affine import AffineModel, affine_functions
 from thruster_env.model.continuous import AtDt, ContinuousModel
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
@@ -88,6 +92,53 @@ class NamedMaker:
             offset=0.0 if self.mean is None else self.mean,
             quantities=self.quantities,
         )
+
+    def continuous(self, *, dt: float | None = None, **numbers: float) -> ContinuousModel:
+        """The same model in continuous time, for steps of any length: dx/dt = A x + w, z = C x + offset + v.
+
+            plant = model_named("constant-velocity:acceleration=0.04,R=0.25").continuous(dt=0.1)
+            filters.run(make_filter("ekf", plant.at(0.1)), z, dt=steps, noise=plant.noise)
+
+        Args:
+            dt: typical sample time [s], by which the prior is wide.
+            **numbers: values that the text does not give.
+        """
+        plain, axes = self(dt=dt, **numbers), np.eye(len(self.quantities))
+        values = {name: value for name, value in {**self.values, **numbers}.items() if name != R}
+        signal = named_model(self.name).signal(values)
+        slope, output = np.kron(axes, signal.slope), np.kron(axes, signal.output[None])
+        offset = plain.matrices()[4]
+        parts = slope, np.zeros(plain.n), output, offset
+        functions = affine_functions(plain.n, plain.m, 0)
+        fastest = float(np.abs(np.linalg.eigvals(signal.slope)).max())
+        return ContinuousModel(
+            rates=functions["transition"],
+            observe=functions["observe"],
+            densities=np.kron(axes, signal.densities),
+            constants=_form(sum(part.size for part in parts))(*np.concatenate([np.ravel(p) for p in parts]), 1.0),
+            longest=FINE / fastest if fastest > 0.0 else math.inf,
+            arguments={
+                "prior_mean": plain.prior_mean,
+                "prior_cov": plain.prior_cov,
+                "measurement_noise_cov": plain.measurement_noise_cov,
+                "inputs": 0,
+                "states": plain.states,
+                "measurements": plain.measurements,
+            },
+        )
+
+
+@lru_cache(maxsize=64)
+def _form(size: int) -> Any:
+    """A class of so many constants and `substep`, whose values can be pickled."""
+    make: Any = namedtuple  # whose names are no literals
+    form = make("Constants", [*(f"c_{i}" for i in range(size)), "substep"])
+    form.__reduce__ = lambda self: (_constants, tuple(self))
+    return form
+
+
+def _constants(*values: float) -> Any:
+    return _form(len(values) - 1)(*values)
 
 
 def model_named(text: Any) -> NamedMaker | Callable[..., ContinuousModel] | None:

@@ -1,5 +1,7 @@
 """Models by name as text: their settings, and around an env whose actions they ignore."""
 
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -88,3 +90,30 @@ def test_a_filter_of_a_model_without_inputs_ignores_the_actions(as_python):
     assert env.filter.model.process_noise_cov[0, 0] == pytest.approx(env.unwrapped.plant.dt)
     with pytest.raises(ValueError, match="must have a sample time, but .* has no dt here: constant:dt=..."):
         filters.EstimateState(Drifting(), model="constant:drift=0.01,R=1")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "constant-velocity:acceleration=0.4,R=0.25,axes=2",
+        "oscillator:frequency=0.3,damping=0.1,std=2,R=0.1,mean=3",
+        "constant:drift=1,R=1 + ornstein-uhlenbeck:time_constant=2,std=1",
+    ],
+)
+def test_steps_of_any_length_have_the_transition_and_noise_of_that_length(text, as_python):
+    maker, rng = model_named(text), np.random.default_rng(2)
+    plant, prior = maker.continuous(dt=0.1), maker(dt=0.1)
+    z, steps = np.cumsum(rng.normal(size=(12, prior.m)), axis=0), rng.uniform(0.05, 0.25, 11)
+    x, cov = prior.prior_mean, prior.prior_cov
+    _, _, _, c, offset = prior.matrices()
+    for k, measured in enumerate(z):
+        if k:
+            step = maker(dt=steps[k - 1])
+            a = step.matrices()[0]
+            x, cov = a @ x, a @ cov @ a.T + step.process_noise_cov
+        gain = np.linalg.solve(c @ cov @ c.T + prior.measurement_noise_cov, c @ cov).T
+        x, cov = x + gain @ (measured - c @ x - offset), cov - gain @ c @ cov
+    filter_ = pickle.loads(pickle.dumps(filters.make_filter("ekf", plant.at(0.1))))
+    estimates = filters.run(filter_, z, dt=steps, noise=plant.noise)
+    np.testing.assert_allclose(estimates.means[-1], x, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(estimates.covs[-1], cov, rtol=1e-5, atol=1e-6)

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import tuning
+from filters import make_filter, run
 from filters.models import kalman_filter
+from filters.named import model_named
 from tuning.api.problems import problem_of
 
 rng = np.random.default_rng(4)
@@ -44,7 +46,7 @@ def test_an_estimate_uses_given_numbers_or_finds_them_and_says_which(log):
     stated = tuning.estimate((f"{NAME}:acceleration=0.5,R=0.3", log), filter="kf")
     np.testing.assert_allclose(stated.filter.model.process_noise_cov, filter_.model.process_noise_cov, rtol=1e-9)
     assert not any("maximum-likelihood" in sentence for sentence in stated.sentences())
-    free, fit = tuning.estimate(("auto", log), filter="kf"), tuning.fit(log)
+    free, fit = tuning.estimate((NAME, log), filter="kf"), tuning.fit(log, model=NAME)
     assert free.filter.model.measurement_noise_cov[0, 0] == pytest.approx(fit.r, rel=1e-4)
     assert any(f"--model {NAME}:acceleration=" in sentence for sentence in free.sentences())
     for numbers in (Z, Z.tolist()):
@@ -96,3 +98,16 @@ def test_numbers_without_a_model_and_logs_of_another_plant_name_the_way():
         tuning.tune("mismatch", trial=3)
     with pytest.raises(ValueError, match="has time, x .m., y .m.: tuning.fit finds a model.*--model auto"):
         tuning.estimate(TRACK)
+
+
+def test_an_estimate_on_its_own_stamps_has_the_q_of_each_step():
+    times = np.cumsum(rng.uniform(0.05, 0.15, 300))
+    reading = {"model": f"{NAME}:acceleration=0.5,R=0.3", "grid": False, "dt": 0.1}
+    estimate = tuning.estimate(tuning.read_logs({"t": times, "pos": Z}, **reading), filter="ekf")
+    maker = model_named(reading["model"])
+    plant = maker.continuous(dt=0.1)
+    filter_ = make_filter("ekf", estimate.filter.model.replace(process_noise_cov=plant.noise(0.1)))
+    by_run = run(filter_, Z, dt=np.diff(times), noise=plant.noise)
+    np.testing.assert_allclose(estimate.means, by_run.means, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="must be tuned or identified on a grid, but run1 is on its own stamps"):
+        problem_of(tuning.read_logs({"t": times, "pos": Z}, **reading))

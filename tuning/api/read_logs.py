@@ -17,7 +17,7 @@ from thruster_env.logs.recorders.bags import STAMPS
 from tuning.api.markers import LOGS, READ, Augment, ModelOption, Option, PresetOption
 from tuning.logs.read import model_of_logs, name_of, read_named
 from tuning.series.column import as_columns, is_numbers
-from tuning.series.named import with_numbers
+from tuning.series.named import check_on_grid, with_numbers
 
 if TYPE_CHECKING:
     from tuning.problems.problem import Problem
@@ -70,8 +70,11 @@ class RecordedRuns:
         log, offer = read_named(file, **self.reading, name=name_of(file, 0))
         if not isinstance(offer, NamedMaker):
             return log, offer
-        fitted = with_numbers(offer, log)
-        return log if is_tuned else fitted.log, fitted.maker
+        if is_tuned:
+            check_on_grid(offer, [log])
+            return log, with_numbers(offer, log).maker
+        maker, _, log = with_numbers(offer, log)
+        return log, maker if log.stamps is None else maker.continuous(dt=log.dt)
 
     def check_uncut(self, what: str, options: Sequence[str] = (*CUTS, AUGMENT)) -> None:
         """Raise ValueError if an option is set that only problems of logs have."""

@@ -33,7 +33,7 @@ from tuning.problems.find import logs_package, named
 from tuning.problems.log_parts import check_apart, check_times, parts_of
 from tuning.problems.log_problem import MISSING, LogProblem, without_outliers
 from tuning.problems.problem import Parameter, Problem
-from tuning.series.named import Fitted, is_auto, maker_of, with_numbers
+from tuning.series.named import Fitted, check_on_grid, is_auto, maker_of, with_numbers
 
 # Of `read_named`.
 OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid", "inputs_act", "stamps")
@@ -104,6 +104,7 @@ def log_problem(
 
 def _learnt(maker: NamedMaker, logs: Sequence[Log], cuts: Mapping[str, Any]) -> tuple[int, Fitted]:
     """The run that has most rows in training blocks, and a model by name with the numbers of these."""
+    check_on_grid(maker, logs)
     logs = list(map(without_outliers, logs)) if cuts.get("outliers") == MISSING else logs
     options = {"hold_gaps": cuts.get("hold_gaps", False), "sizes": True}
     parts = parts_of(logs, cuts.get("lead"), cuts.get("blocks"), cuts.get("held_out"), **options)
@@ -353,6 +354,7 @@ def family_of(
         of_preset = logs_package().family_of_preset(logs, whose, sensors, list(free), noise=noise)
         return AnyStepFamily(of_preset, logs) if stamped else of_preset
     if maker is not None:
+        check_on_grid(maker, logs)
         longest = max(logs, key=lambda log: log.steps)
         maker, parameters, _ = with_numbers(replace(maker, quantities=tuple(longest.measured)), longest)
         return NamedFamily(logs, maker, parameters, list(free))

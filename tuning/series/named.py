@@ -6,7 +6,7 @@ count for nothing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -84,6 +84,16 @@ def read_columns(
     return log, replace(maker, quantities=tuple(log.measured))
 
 
+def check_on_grid(maker: NamedMaker, logs: Sequence[Log]) -> None:
+    """Raise ValueError for a log on its own stamps, where Q of a step is in proportion to its length."""
+    stamped = next((log.name for log in logs if log.stamps is not None), None)
+    if stamped is not None:
+        raise ValueError(
+            f"{maker.name} must be tuned or identified on a grid, but {stamped} is on its own stamps: leave "
+            "--no-grid out, or use thruster fit and estimate, which have the Q of each step"
+        )
+
+
 def with_numbers(maker: NamedMaker, log: Log, rows: np.ndarray | None = None) -> Fitted:
     """The model with the numbers that the text gives, the others by maximum likelihood on some rows of a log.
 
@@ -98,13 +108,8 @@ def with_numbers(maker: NamedMaker, log: Log, rows: np.ndarray | None = None) ->
     from tuning.series.fit import CANDIDATES, choose  # with what only a search needs
     from tuning.series.likelihood import ColumnLikelihood
 
-    if log.stamps is not None:
-        raise ValueError(
-            f"a model by name must be of a log on a grid, but {log.name} is on its own stamps: leave --no-grid "
-            "out, or give a model in continuous time, such as one of filters.plants"
-        )
     values = log.measurements if rows is None else np.where(rows[:, None], log.measurements, np.nan)
-    column = Column(values[:, 0] if values.shape[1] == 1 else values, log.dt, maker.quantities)
+    column = Column(values[:, 0] if values.shape[1] == 1 else values, log.dt, maker.quantities, stamps=log.stamps)
     known, axes = dict(maker.values), len(maker.quantities)
     if maker.name == AUTO or not maker.is_complete:
         chosen = choose(column, CANDIDATES if maker.name == AUTO else (maker.name,)).chosen
