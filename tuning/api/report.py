@@ -157,7 +157,7 @@ def report(
         page = page_of(sources, "-beside-".join(names), out)
         prefixes = "p" if len(sources) == 1 else "ab"
         parts = list(map(pages_of, map(_file_of, sources), subjects, prefixes))
-        contents = parts[0] if len(parts) == 1 else beside(names, parts)
+        contents = parts[0] if len(parts) == 1 else two_columns(names, parts)
         advice = [contents.advice] if len(parts) == 1 else contents.advice.splitlines()
         write_whole(page, html_page(contents.title, advice, contents.sections, two_columns=len(parts) == 2))
         write_whole(page.with_suffix(".md"), markdown_page(contents.title, [*advice, *contents.results]))
@@ -210,8 +210,8 @@ def _of_value(study: Study) -> Subject:
     )
     trials.add_trials(study.trials)
     consistent, seeds = plan.is_constrained and bool(result.consistent), len(study.comparison.seeds)
-    kept = content, content["ensemble_sizes"], content["choice"], kept_nis(content, plan)
-    return Subject(study.name, plan, study.choice, trials, seeds, True, consistent, *kept)
+    stored = content, content["ensemble_sizes"], content["choice"], kept_nis(content, plan)
+    return Subject(study.name, plan, study.choice, trials, seeds, True, consistent, *stored)
 
 
 # The page of one study.
@@ -296,7 +296,7 @@ def _short(name: str) -> str:
 # The report of two studies: their results, section by section and side by side.
 
 
-def beside(names: Sequence[str], pages: Sequence[Pages]) -> Pages:
+def two_columns(names: Sequence[str], pages: Sequence[Pages]) -> Pages:
     """The contents of a page on two studies; of the same problem with the paired ratio of their scores."""
     advice = "\n".join(f"{name}: {contents.advice}" for name, contents in zip(names, pages, strict=True))
     table, remark = _summary(names, pages)
