@@ -191,7 +191,9 @@ def programs_of(filter_: Filter) -> FilterPrograms:
             too large, or a page that keeps something under a name that C does not take.
     """
     paged = with_page(filter_, "a filter in C")
-    shape, (f, by_f, h, by_h) = paged.kernel_model.shape, paged.kernel_model.functions
+    model = paged.kernel_model
+    shape = model.any_shape if getattr(paged, "takes_rotations", False) else model.shape
+    f, by_f, h, by_h = model.functions
     try:
         _check_traced("transition", f, by_f, "motion", shape)
         _check_traced("observe", h, by_h, "sight", shape)
@@ -202,8 +204,8 @@ def programs_of(filter_: Filter) -> FilterPrograms:
 
 def _row_programs(paged: FilterWithPage) -> FilterPrograms:
     model, page, numbers = paged.kernel_model, paged.written_page, paged.numbers
-    shape = model.shape
-    layout, memory = memory_offsets(shape.n, shape.m), RowMemory(shape, page)
+    shape = model.any_shape
+    layout, memory = memory_offsets(shape.n, shape.m, shape.t), RowMemory(shape, page)
     equations = Equations(model.functions, memory, constants_move=False, trace=True)
     stages = [stage.of_rows for stage in stages_of(page, memory, equations)]
     extras = {name: matrix.shape for name, matrix in memory.extras.items()}
@@ -290,12 +292,12 @@ def _where(
     points: int = 0,
 ) -> Callable[[Place], Place]:
     """The function from a place to its expression in C: in the filter, in X, or in the argument u or z."""
-    n, m = shape.n, shape.m
-    layout = memory_offsets(n, m)
+    n, m, t = shape.n, shape.m, shape.t
+    layout = memory_offsets(n, m, t)
     parts = [
         (NIS, (), "filter->nis"),
         (layout.mean, (n,), mean),
-        (layout.cov, (n, n), "filter->P"),
+        (layout.cov, (t, t), "filter->P"),
         (layout.innovation, (m,), "filter->innovation"),
         (layout.innovation_cov, (m, m), "filter->S"),
         (layout.log_likelihood, (), "filter->log_likelihood"),

@@ -20,6 +20,7 @@ from filters.c.writer import EnsembleWriter, Writer
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of
 from thruster_env.core.files import check_target, write_whole
+from thruster_env.model.turns import refuse_rotations
 
 CLASS = """\
 /* The filter {name} as a class of C++11; link with {name}.c, which a compiler of C makes. */
@@ -336,6 +337,7 @@ def write_project(
     Raises:
         ValueError: as `c_filter`, for a wrong monitor, or if a file cannot be written.
     """
+    refuse_rotations(filter_.model)  # the program's log has a standard deviation of each state
     watch = monitor_of(monitor)
     generated, programs = c_filter(filter_, name, single=single, monitor=watch), programs_of(filter_)
     model = programs.model

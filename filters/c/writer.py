@@ -56,7 +56,7 @@ class Writer:
     def header(self, filter_name: str) -> str:
         """NAME.h."""
         name, model, real = self.name, self.model, self.real
-        guard, n, m = name.upper(), model.n, model.m
+        guard, n, m, t = name.upper(), model.n, model.m, model.t
         u, z = self._input_parameters()
         types, members, declared = (
             ("", "", "") if self.tests is None else (self.tests.types, self.tests.members, self.tests.declared)
@@ -78,7 +78,7 @@ enum {{ {guard}_STATES = {n}, {guard}_INPUTS = {model.inputs}, {guard}_MEASUREME
 
 {types}typedef struct {{
     {real} x[{n}];            /* estimate: {_listed(model.states)} */
-    {real} P[{n * n}];            /* covariance of its error, by rows */
+    {real} P[{t * t}];            /* covariance of its error{", of 3 for each rotation" * (t < n)}, by rows */
     {real} innovation[{m}];   /* measurement minus its prediction: {_listed(model.measurements)}; 0 if missing */
     {real} S[{m * m}];            /* covariance of the innovation, by rows */
     {real} nis;             /* v' S^-1 v of the innovation v: chi-square of `channels` degrees of freedom */
@@ -106,7 +106,7 @@ void {name}_update({name} *filter{z});
     def source(self) -> str:
         """NAME.c."""
         name, model, real = self.name, self.model, self.real
-        n, m, zero = model.n, model.m, literal(0.0, self.single)
+        n, m, t, zero = model.n, model.m, model.t, literal(0.0, self.single)
         magnitude = "fabsf" if self.single else "fabs"
         u, z = self._input_parameters()
         constants = "\n".join(self._array(key, np.ravel(value)) for key, value in self.constants().items())
@@ -143,11 +143,13 @@ static int is_lost(const {name} *filter)
 
     for (int i = 0; i < {n}; i++) {{
         sum += {magnitude}(filter->x[i]);
-        if (!(filter->P[i * {n + 1}] >= {zero})) {{
+    }}
+    for (int i = 0; i < {t}; i++) {{
+        if (!(filter->P[i * {t + 1}] >= {zero})) {{
             return 1;
         }}
     }}
-    for (int i = 0; i < {n * n}; i++) {{
+    for (int i = 0; i < {t * t}; i++) {{
         sum += {magnitude}(filter->P[i]);
     }}
     for (int i = 0; i < {m}; i++) {{
@@ -196,7 +198,7 @@ void {name}_update({name} *filter{z})
     def constants(self) -> Mapping[str, np.ndarray]:
         """Arrays by their names."""
         model = self.model
-        mean = wrapped_where(model.prior_mean, model.shape.state_angles)
+        mean = wrapped_where(model.prior_mean, model.any_shape.state_angles)
         return {"prior_mean": mean, "prior_cov": model.prior_cov, "R": model.measurement_noise_cov}
 
     def functions(self) -> list[str]:
@@ -214,12 +216,12 @@ void {name}_update({name} *filter{z})
 
     def prior(self) -> str:
         """Statements that set the belief."""
-        n, start = self.model.n, "    start(filter);\n" * bool(self.programs.extras)
+        n, t, start = self.model.n, self.model.t, "    start(filter);\n" * bool(self.programs.extras)
         return f"""\
     for (int i = 0; i < {n}; i++) {{
         filter->x[i] = prior_mean[i];
     }}
-    for (int i = 0; i < {n * n}; i++) {{
+    for (int i = 0; i < {t * t}; i++) {{
         filter->P[i] = prior_cov[i];
     }}
 {start}"""

@@ -1,5 +1,9 @@
 """States with rotations: an attitude filter against a naive one, its sides, its consistency, and refusals."""
 
+import ctypes
+import shutil
+import subprocess
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,7 +11,7 @@ from scipy.spatial.transform import Rotation as Turned
 
 import filters
 from filters.bounds import path_bound, posterior_bound
-from filters.c.project import c_filter
+from filters.c.project import c_filter, write_project
 from filters.estimators.foreign import Estimator, ForeignFilter
 from filters.registry import FILTERS
 from thruster_env.core.compiled import interpreted
@@ -263,6 +267,27 @@ def test_sessions_beliefs_wrapped_envs_and_python_have_the_numbers_of_a_batch(da
     assert env.observation_space.contains(observation)
 
 
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_the_filter_in_c_has_the_same_numbers(data, of_side, tmp_path):
+    """Its struct begins with seven states and a P of six rows; it compiles without a warning."""
+    _, gyro, z = data
+    generated = c_filter(filters.ExtendedKalmanFilter(model=attitude_model()), "attitude")
+    (tmp_path / "attitude.h").write_text(generated.header)
+    (tmp_path / "attitude.c").write_text(generated.source)
+    library = tmp_path / "attitude.so"
+    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-shared", "-fPIC"]
+    subprocess.run(["gcc", *flags, str(tmp_path / "attitude.c"), "-o", str(library), "-lm"], check=True)
+    c, memory = ctypes.CDLL(str(library)), np.zeros(7 + 36 + 6 + 36 + 4)
+    address = lambda array: array.ctypes.data_as(ctypes.c_void_p)  # noqa: E731
+    c.attitude_init(address(memory))
+    for k in range(20):
+        if k:
+            c.attitude_predict(address(memory), address(gyro[0, k - 1].copy()))
+        c.attitude_update(address(memory), address(z[0, k].copy()))
+    np.testing.assert_allclose(memory[:7], of_side["body"].means[0, 19], atol=1e-14)
+    np.testing.assert_allclose(memory[7:43].reshape(6, 6), of_side["body"].covs[0, 19], atol=1e-16)
+
+
 @pytest.mark.parametrize("name", FILTERS)
 def test_every_filter_runs_on_rotations_or_refuses_them(name):
     """In one line, before it computes anything."""
@@ -286,7 +311,7 @@ def test_every_other_path_refuses_them():
         lambda: filters.run(filter_, **data).to_frame(),
         lambda: ForeignFilter(model=model, estimator=Estimator()),
         lambda: filters.torch(filter_),
-        lambda: c_filter(filter_),
+        lambda: write_project(filter_, "a folder"),
         lambda: filters.EstimateState(Sensor(), model=model, filter="ekf", smoothing_lag=2),
         lambda: posterior_bound(model, data["inputs"][None]),
         lambda: path_bound(model, data["inputs"][None]),

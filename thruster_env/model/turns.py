@@ -96,7 +96,7 @@ def refuse_rotations(model: Any) -> None:
         names = " and ".join(repr(turn.name) for turn in model.turns)
         raise ValueError(
             f"states must be numbers and angles here, but {names} {'is' if len(model.turns) == 1 else 'are'} of "
-            "rotations: 'ekf', 'iekf', 'ukf' and 'fading' take these, in filters.run, sessions and wrapped envs"
+            "rotations: 'ekf', 'iekf', 'ukf' and 'fading' take these, in filters.run, sessions, wrapped envs and C"
         )
 
 
