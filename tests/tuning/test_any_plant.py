@@ -11,6 +11,7 @@ from filters.consistency.report import NO_TRUTH, sentences
 from filters.engine.batch import run
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
+from thruster_env.core.files import save_figure
 from tuning.api.held_out import CovarianceCheck, HeldOut
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
@@ -22,7 +23,7 @@ from tuning.problems.problem import score_label
 from tuning.reporting import leaderboard
 from tuning.reporting.choice_words import gains
 from tuning.reporting.leaderboard import ABOVE, comparison_table
-from tuning.reporting.search_figures import comparison_figure, consistency_figure
+from tuning.reporting.search_figures import draw_comparison, draw_consistency
 from tuning.reporting.sections import advice, held_out_section
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import choice_table
@@ -205,7 +206,7 @@ def test_consistency_without_truth_is_that_of_the_innovations(tmp_path):
     assert np.isnan(report.coverage).all() and states == ("p [m]", "v [m/s]", "b [m]")
     assert known.coverage[0].value == pytest.approx(0.95, abs=0.03) and len(sentences(known)) >= 5 + 6
     for name, one in (("without", report), ("with", known)):
-        assert consistency_figure(tmp_path / f"{name}.png", one, "title").stat().st_size > 10_000
+        assert save_figure(draw_consistency(one, "title"), tmp_path / f"{name}.png").stat().st_size > 10_000
 
 
 def test_of_many_states_sentences_tell_the_worst():
@@ -230,10 +231,10 @@ def test_figures_are_drawn_for_any_plant(comparisons, case, tmp_path):
         estimates_figure(tmp_path / "run.png", filters, problem.data(SEEDS), 1, problem.dt)
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
     if problem.truth:
-        assert comparison_figure(tmp_path / "rmse.png", comparison, "a title").is_file()
+        assert save_figure(draw_comparison(comparison, "a title"), tmp_path / "rmse.png").is_file()
     else:
         with pytest.raises(ValueError, match="needs the truth, but there is none"):
-            comparison_figure(tmp_path / "rmse.png", comparison, "a title")
+            save_figure(draw_comparison(comparison, "a title"), tmp_path / "rmse.png")
 
 
 def test_of_many_states_the_scored_ones_have_panels_first():

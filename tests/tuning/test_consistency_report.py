@@ -21,10 +21,11 @@ from filters.engine.batch import Estimates
 from filters.ensembles.square_root import Members, record_members
 from tests.models import scalar_model
 from thruster_env.core.compiled import interpreted
+from thruster_env.core.files import save_figure
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
 from tuning.problems.data import held_out_seeds
-from tuning.reporting.search_figures import consistency_figure
+from tuning.reporting.search_figures import draw_consistency
 from tuning.thruster.scenario import find_scenario
 
 
@@ -241,7 +242,7 @@ def test_the_figure_is_drawn(scalar_truth, kind, tmp_path):
             "No run diverged.",
         ]
         with pytest.raises(ValueError, match="needs something to draw"):
-            consistency_figure(tmp_path / "none.png", report, "a title")
+            save_figure(draw_consistency(report, "a title"), tmp_path / "none.png")
     ratios = {"one\nover other": rmse_ratios(np.ones((40, 1)), np.full((40, 1), 2.0))}
-    path = consistency_figure(tmp_path / "new" / "calibrated.png", report, "a title", ratios)
+    path = save_figure(draw_consistency(report, "a title", ratios), tmp_path / "new" / "calibrated.png")
     assert path.read_bytes().startswith(b"\x89PNG")

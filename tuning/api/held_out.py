@@ -307,7 +307,8 @@ def _of_squares(check: SquaresCheck) -> dict[str, Any]:
 
 def covariance_check(evaluation: HeldOut, label: str, path: str | Path) -> CovarianceCheck:
     """Check the covariance of an evaluated filter, called `label`, and draw the checks."""
-    from tuning.reporting.search_figures import consistency_figure
+    from thruster_env.core.files import save_figure
+    from tuning.reporting.search_figures import draw_consistency
 
     report, comparison = evaluation.check_consistency(), evaluation.comparison
     ratios: Sequence[Interval] | None = None
@@ -316,7 +317,7 @@ def covariance_check(evaluation: HeldOut, label: str, path: str | Path) -> Covar
         ratios = rmse_ratios(comparison.tuned.mean_squares, comparison.true.mean_squares, comparison.tuned.weights)
         against[f"{label}\nover {ORACLE}"] = ratios
     title = f"{evaluation.choice.name}, {label}, on {report.runs} seeds of {evaluation.problem.name}"
-    consistency_figure(Path(path), report, title, against, comparison.tuned.scored or None)
+    save_figure(draw_consistency(report, title, against, comparison.tuned.scored or None), path)
     return CovarianceCheck(label, report, ratios, str(path))
 
 

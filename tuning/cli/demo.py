@@ -13,6 +13,7 @@ from typing import Annotated
 from rich.table import Table as RichTable
 
 from filters.filter import Filter
+from thruster_env.core.files import save_figure
 from thruster_env.core.text_tables import Table
 from tuning.api.markers import OUTPUT, RUNS, Option, Seed
 from tuning.api.progress import working
@@ -26,7 +27,7 @@ from tuning.evaluation.baselines import NOISE, ORACLE, TUNED, baselines, same_fi
 from tuning.evaluation.evaluate import score_ratio
 from tuning.problems.problem import score_label
 from tuning.reporting.leaderboard import above_bound, consistency_cells
-from tuning.reporting.search_figures import comparison_figure, history_figure
+from tuning.reporting.search_figures import draw_comparison, draw_history
 from tuning.reporting.time_figures import estimates_figure
 from tuning.reporting.tuning_report import as_json
 from tuning.search.plan import TRAINING_SEEDS, Plan
@@ -148,12 +149,10 @@ def draw(tuning: Study, out: Path) -> dict[Path, str]:
     comparison, scenario = tuning.comparison, tuning.problem
     label, data = f"{tuning.result.choice.name} on {scenario.name}", scenario.data(comparison.seeds[:1])
     run = estimates_figure(out / "estimates.png", before_and_after(tuning), data, 0, scenario.dt)
-    errors = comparison_figure(
-        out / "rmse.png", comparison, f"{label}: RMSE on {len(comparison.seeds)} held-out seeds"
-    )
-    search = history_figure(
-        out / "history.png", tuning.result.trials, f"Study of {label}", score_label((scenario,))
-    )
+    drawn = draw_comparison(comparison, f"{label}: RMSE on {len(comparison.seeds)} held-out seeds")
+    errors = save_figure(drawn, out / "rmse.png")
+    drawn = draw_history(tuning.result.trials, f"Study of {label}", score_label((scenario,)))
+    search = save_figure(drawn, out / "history.png")
     return {
         run: f"one of these runs: {best_baseline(tuning)}, then tuned",
         errors: "the errors of the table",

@@ -1,7 +1,6 @@
 """Pictures of a study and its results: history, importance, slices, Pareto front, ensemble sizes, and consistency.
 
-`draw_...` returns a figure, `..._figure` saves it as a file. The picture of a filter's consistency has a panel for
-each check of `filters.consistency`.
+The picture of a filter's consistency has a panel for each check of `filters.consistency`.
 """
 
 from __future__ import annotations
@@ -9,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from itertools import count
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,7 +29,6 @@ from thruster_env.core.files import (
     grid_of,
     new_figure,
     panels,
-    save_figure,
     tidy,
 )
 from thruster_env.core.text_tables import TITLE, verbatim
@@ -59,13 +56,6 @@ PANEL = (4.0, 3.0)  # [inch]
 MOST_HANDLES = 5  # of a legend side by side
 MOST_VALUES = 3  # in the title of a panel
 LOGARITHMIC_FROM = 20  # times the right value
-
-
-def history_figure(
-    path: str | Path, trials: Sequence[FrozenTrial], title: str, label: str, objective: str = SCORE
-) -> Path:
-    """Save what `draw_history` draws."""
-    return save_figure(draw_history(trials, title, label, objective), path)
 
 
 def draw_history(trials: Sequence[FrozenTrial], title: str, label: str, objective: str = SCORE) -> Figure:
@@ -118,11 +108,6 @@ def limit_values(axis, values: list[float], objective: str = SCORE) -> int:
     top = max(low + 3 * room, values[0] + 1.5 * room)
     axis.set_ylim(*sorted(reported(objective, end) for end in (low - room, top)))
     return sum(value > top for value in values)
-
-
-def comparison_figure(path: str | Path, comparison: Comparison, title: str, filter_name: str = "ekf") -> Path:
-    """Save what `draw_comparison` draws."""
-    return save_figure(draw_comparison(comparison, title, filter_name), path)
 
 
 def draw_comparison(comparison: Comparison, title: str, filter_name: str = "ekf") -> Figure:
@@ -336,11 +321,6 @@ class Sketchbook:
         """A figure as a part of a page."""
         svg, readings = figure_svg(figure, next(self._names))
         return Picture(svg, caption, alt, readings)
-
-
-def consistency_figure(path: str | Path, report: ConsistencyReport, title: str, *arguments, **options) -> Path:
-    """Save what `draw_consistency` draws."""
-    return save_figure(draw_consistency(report, title, *arguments, **options), path)
 
 
 def draw_consistency(
