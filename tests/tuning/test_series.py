@@ -363,6 +363,8 @@ def test_a_daily_course_and_steps_between_numbers():
     values = {"constant_drift": 0.01, "harmonic_drift": 0.02, "R": 0.09}  # the quadrature of period 2 is unseen
     name = "constant + harmonic:period=8,harmonics=4"
     assert 2.0 < replace(fit, chosen=fit.chosen._replace(name=name, values=values)).memory < 8.0
+    far = column_of(np.append(z, z), times=np.append(hours, hours + 1e6))  # a gap is a long step
+    assert len(far.values) == 480 and far.dt == 1.0
     steps = np.ones(239)
     steps[100] = 3.0
     column = column_of(z, steps)
@@ -403,6 +405,7 @@ def test_a_season_an_autoregression_and_a_period_are_found():
         ([math.nan] * 50, {}, "at least 20 numbers, but has 0"),
         (["a"] * 30, {}, "z must be numbers"),
         (np.zeros((30, 9)), {}, "a column of numbers"),
+        ([*range(30), math.inf], {}, "numbers must be finite"),
         (np.arange(30.0), {"model": "seasonal"}, "must have period="),
         (np.arange(30.0), {"model": "ar"}, "must have an order of 1 to 8, as ar:2, but got ''"),
         (np.arange(30.0) % 7.0, {"model": "ar:1", "dt": 1.0 + 0.1 * np.arange(29.0)}, "must have equal steps"),

@@ -29,6 +29,7 @@ from thruster_env.model.state_space import StateSpaceModel
 
 LEAST_ROWS = 20  # with a number
 ROUNDING, MOST_DIGITS = 1e-6, 9  # of a sample time, and of stamps
+SPARSE = 2.0  # rows of a grid a number, from which on numbers have their own times
 DIGITS = 1e-12  # of the largest number: noise that is rounding
 MOST_AXES = 6
 RANGES = 1e-60, 1e60  # of a column's numbers, of which Q and R are squares
@@ -89,14 +90,20 @@ class Column:
         duration = float(times[-1] - times[0])
         roughness = [_roughness(times, *axis) for axis in zip(self.table.T, spreads.tolist(), strict=True)]
         peaks = _peaks(times, self.table[:, int(spreads.argmax())], self.dt)
-        noise, largest = _root_mean_square(roughness), float(np.nanmax(np.abs(self.table)))
-        if noise <= DIGITS * largest:
+        noise = max(_root_mean_square(roughness), self.rounding)
+        return Scales(_root_mean_square(spreads), noise, self.dt, duration, peaks)
+
+    @property
+    def rounding(self) -> float:
+        """Deviation of noise that may be that of rounding."""
+        return DIGITS * float(np.nanmax(np.abs(self.table)))
+
+    def check_noise(self) -> None:
+        """Raise ValueError for numbers that lie on a smooth curve, from which no Q and R follow."""
+        if self.scales.roughness <= self.rounding:
             name = ", ".join(quantity.name for quantity in self.quantities)
             rule = f"{name} must have noise, from which Q and R follow"
-            raise ValueError(
-                f"{rule}, but its numbers lie on a smooth curve to {noise / largest:.0e} of the largest"
-            )
-        return Scales(_root_mean_square(spreads), noise, self.dt, duration, peaks)
+            raise ValueError(f"{rule}, but its numbers lie on a smooth curve to {DIGITS:g} of the largest")
 
     def axis(self, index: int) -> Column:
         """One axis alone."""
@@ -136,9 +143,14 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
         raise ValueError(f"{rule}, but got {short_repr(times)} beside it")
     named = column.split(",") if isinstance(column, str) else column
     log, stamps = log_of_columns(z, named, dt=dt, times=times), None
-    if log.irregular or log.recording.jitter > 0.0:
+    has_gaps = len(log.measurements) > SPARSE * (~np.isnan(log.measurements)).any(axis=1).sum()
+    if log.irregular or has_gaps or log.recording.jitter > 0.0:
         at_times = log_of_columns(z, named, dt=dt, times=times, grid=False)
-        if log.irregular or log.recording.jitter > _resolution(at_times.times + at_times.start, log.dt):
+        if (
+            log.irregular
+            or has_gaps
+            or log.recording.jitter > _resolution(at_times.times + at_times.start, log.dt)
+        ):
             log, stamps = at_times, at_times.times
     for quantity, values in zip(log.measured, log.measurements.T, strict=True):
         _check_numbers(quantity.symbol, values)

@@ -130,10 +130,12 @@ def choose(column: Column, names: Sequence[str], progress: Callable[[str], None]
     Raises:
         ValueError: for an unknown model, or one that has no likelihood.
     """
+    models = [named_model(name) for name in names]
+    column.check_noise()
     part, fitted = column.middle(MOST_ROWS), []
-    for name in names:
-        progress(name)
-        fitted.append(_fit(named_model(name), part, prove=len(names) > 1))
+    for model in models:
+        progress(model.name)
+        fitted.append(_fit(model, part, prove=len(models) > 1))
     fitted.sort(key=lambda result: -result.held_out.sum())
     candidates = tuple(result.candidate for result in fitted)
     tied = [i for i, candidate in enumerate(candidates) if _ties(candidate, candidates[0], len(part.values))]
@@ -153,22 +155,24 @@ def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
     fitted = _maximum(candidate, column)
     if not prove:
         return fitted
-    blocks = np.arange(len(column.values)) * BLOCKS // len(column.values)
+    counts = np.cumsum(column.measured.any(axis=1))  # so that each block has as many rows with numbers
+    blocks = np.maximum(counts - 1, 0) * BLOCKS // counts[-1]
     held_out, everything = np.empty(BLOCKS), ColumnLikelihood(candidate, column, rows=len(column.values))
     in_sample = float(everything.by_rows(fitted.ascent.at)[blocks > 0].sum())
     for fold in range(2):
         visible = replace(column, values=np.where((blocks % 2 == fold)[:, None], np.nan, column.table))
-        values = _maximum(candidate, visible).candidate.values
+        values = _maximum(candidate, visible, column.scales).candidate.values
         densities = everything.by_rows(everything.coordinates.of(list(values.values())))
         held_out[fold::2] = np.bincount(blocks, weights=densities.sum(axis=1), minlength=BLOCKS)[fold::2]
     return fitted._replace(held_out=held_out[1:], in_sample=in_sample)
 
 
-def _maximum(candidate: Sum, column: Column) -> Fitted:
-    """The candidate with the likeliest numbers for a column."""
-    objective = ColumnLikelihood(candidate, column)
+def _maximum(candidate: Sum, column: Column, scales: Scales | None = None) -> Fitted:
+    """The candidate with the likeliest numbers for a column; of a part of one with the scales of that."""
+    scales = scales or column.scales
+    objective = ColumnLikelihood(candidate, column, scales=scales)
     bounds = objective.coordinates.low, objective.coordinates.high
-    ascents = [climb(objective, at, *bounds) for at in _starts(objective, candidate, column.scales)]
+    ascents = [climb(objective, at, *bounds) for at in _starts(objective, candidate, scales)]
     ascent = climb(objective, max(ascents, key=lambda end: end.found.value).at, *bounds, enough=EXACT)
     if not math.isfinite(ascent.found.value):
         rule = f"{candidate.name} must have a likelihood on the data, but has none from any start"

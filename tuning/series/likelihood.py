@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.models import Sum, in_unit
+from filters.models import Scales, Sum, in_unit
 from filters.signals import Signal, with_level
 from thruster_env.model.affine import AffineModel
 from tuning.identification.objective import STEP, Evaluation
@@ -75,6 +75,7 @@ class ColumnLikelihood:
         candidate: the named model.
         column: the numbers.
         rows: of a run.
+        scales: of the ranges, where the column is a part of the one that they are of.
 
     Attributes:
         coordinates: of the free numbers and R, with their ranges.
@@ -83,8 +84,8 @@ class ColumnLikelihood:
         counted: number of innovations that count.
     """
 
-    def __init__(self, candidate: Sum, column: Column, rows: int = RUN):
-        scales, unit = column.scales, column.quantities[0].unit
+    def __init__(self, candidate: Sum, column: Column, rows: int = RUN, scales: Scales | None = None):
+        scales, unit = scales or column.scales, column.quantities[0].unit
         self._candidate, self._mean, self._rows, self._dt = candidate, column.mean, len(column.table), column.dt
         free = [
             Parameter(
