@@ -16,10 +16,10 @@ from benchmarks.timing import Measure, Row, alone, side_by_side
 from filters import run
 from filters.filter import Filter
 from thruster_env.core.checks import covariance_root
-from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import column_reader, column_writer, vector_reader
 from thruster_env.core.streams import FILTER_PROCESS, fill_normals
 from thruster_env.core.threads import cores, spread
+from thruster_env.graphs.loops import Loops
 from thruster_env.thruster.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.thruster.plant import Plant
 from tuning.evaluation.evaluate import evaluate
@@ -105,10 +105,8 @@ def floor_measures(plant: Plant, steps: int) -> dict[str, Measure]:
 
 @cache
 def _floor_functions() -> tuple[Callable, Callable]:
-    fingerprint = function_fingerprint(within=__name__)
 
     def propagate(table, steps, substeps, numbers):
-        fingerprint  # noqa: B018 - part of the cache's key
         c = Constants(*_read_constants(numbers))
         for _ in range(steps):
             for _ in range(substeps):
@@ -116,11 +114,10 @@ def _floor_functions() -> tuple[Callable, Callable]:
                     _store(table, j, substep(_column(table, j), (12.0, c.ambient_velocity), c))
 
     def draw(draws, steps, key):
-        fingerprint  # noqa: B018 - part of the cache's key
         for step in range(steps):
             fill_normals(draws, draws.shape[0], step, FILTER_PROCESS, key, 0)
 
-    return compiled(propagate), compiled(draw)
+    return Loops(propagate), Loops(draw)
 
 
 # Filters over many trajectories at once; the ensemble filter beside one written in JAX.

@@ -13,7 +13,7 @@ from filterpy.kalman import (
     UnscentedKalmanFilter,
 )
 
-from thruster_env.core.compiled import compiled, function_fingerprint
+from thruster_env.core.compiled import FASTMATH, with_callees
 from thruster_env.core.sources import vector_reader
 from thruster_env.model.affine import AffineModel
 from thruster_env.thruster.dynamics import Constants, substep, thrust_and_torque
@@ -55,12 +55,20 @@ def compiled_model(plant: Plant) -> tuple[list[float], Callable, Callable]:
     return u, fx, hx
 
 
+def _by_numba(function: Callable) -> Callable:
+    import numba
+    from numba.extending import register_jitable
+
+    for part in with_callees([function]):
+        if part is not function:
+            register_jitable(part)
+    return numba.njit(fastmath=set(FASTMATH), error_model="numpy")(function)
+
+
 @cache
 def _compiled_functions() -> tuple[Callable, Callable]:
-    fingerprint = function_fingerprint(within=__name__)
 
     def advance(x, voltage, numbers, substeps):
-        fingerprint  # noqa: B018 - part of the cache's key
         c = Constants(*_read_constants(numbers))
         state = (x[0], x[1])
         for _ in range(substeps):
@@ -68,10 +76,9 @@ def _compiled_functions() -> tuple[Callable, Callable]:
         return state
 
     def thrust(x, numbers):
-        fingerprint  # noqa: B018 - part of the cache's key
         return thrust_and_torque((x[0], x[1]), Constants(*_read_constants(numbers)))[0]
 
-    return compiled(advance), compiled(thrust)
+    return _by_numba(advance), _by_numba(thrust)
 
 
 class EnsembleStep:

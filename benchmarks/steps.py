@@ -16,11 +16,11 @@ import thruster_env  # noqa: F401 - registers BowThruster-v0
 from benchmarks.peers import EnsembleStep, KalmanStep, UnscentedStep, compiled_model, python_model
 from benchmarks.timing import Measure, Row, alone, seconds_a_call, side_by_side
 from filters.wrappers.envs import EstimateState
-from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import written_out
 from thruster_env.core.streams import ACTION_SPACE, derived_seed
 from thruster_env.core.threads import spread
 from thruster_env.env.copies import WIDTH
+from thruster_env.graphs.loops import Loops
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.dynamics import Constants, substep
 from thruster_env.thruster.model import thruster_model
@@ -215,17 +215,15 @@ _constants = written_out(
 
 @cache
 def _propagate() -> Callable:
-    fingerprint = function_fingerprint(within=__name__)
 
     def propagate(states, numbers, calls, first, last):
-        fingerprint  # noqa: B018 - part of the cache's key
         c = _constants(numbers)
         for b in range(first, last):
             for _ in range(calls):
                 for j in range(states.shape[2]):
                     states[b, 0, j], states[b, 1, j] = substep((states[b, 0, j], states[b, 1, j]), (12.0, 0.0), c)
 
-    return compiled(propagate)
+    return Loops(propagate)
 
 
 # A filter on every copy of a vector env.

@@ -17,8 +17,8 @@ from filters.filter import Filter
 from thruster_env.auv.dynamics import motion_substep
 from thruster_env.auv.parameters import Constants
 from thruster_env.auv.plant import make_plant
-from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.sources import tuple_of, written_out
+from thruster_env.graphs.loops import Loops
 from tuning.auv.scenario import Scenario, find_scenario
 from tuning.problems.data import training_seeds
 
@@ -97,16 +97,14 @@ def papers_ensemble(seed: int) -> Measure:
 
 @cache
 def _propagate() -> Callable:
-    fingerprint = function_fingerprint(within=__name__)
 
     def propagate(table, steps, numbers):
-        fingerprint  # noqa: B018 - part of the cache's key
         c = _constants(numbers)
         for _ in range(steps):
             for j in range(table.shape[1]):
                 _store(table, j, motion_substep(_column(table, j), CRUISE, c))
 
-    return compiled(propagate)
+    return Loops(propagate)
 
 
 @cache
@@ -120,4 +118,4 @@ def _sines() -> Callable:
                     total += math.sin(x) * math.cos(x)
                 angles[j] = 0.1 * total / PAIRS  # so that each round depends on the last
 
-    return compiled(evaluate)
+    return Loops(evaluate)

@@ -37,7 +37,7 @@ from filters.smoothers.smooth import Smoothed, SmoothedModes, smooth, smooth_mod
 from filters.starts import Restarts, RestartWarning, restarts_of
 from filters.tensors import torch
 from filters.wrappers import register_filtered_envs
-from thruster_env.core.modules import may_be_inlined, when_imported
+from thruster_env.core.modules import when_imported
 from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -105,7 +105,6 @@ __all__ = [
     "transformed_model",
 ]
 
-may_be_inlined(__name__, "thruster_env.env", "thruster_env.graphs")
 when_imported("gymnasium", register_filtered_envs)
 
 

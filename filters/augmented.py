@@ -16,7 +16,6 @@ import numpy as np
 
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.checks import finite, positive
-from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import (
@@ -218,7 +217,7 @@ def _augmented_functions(
         }
         values = ", ".join(["a", *slopes, *["one()"] * len(ones)])
         return written_out(
-            name, f"x, {arguments}c", *lines, f"whole({values})", analytic=inlined(analytic), **names, **tools
+            name, f"x, {arguments}c", *lines, f"whole({values})", analytic=analytic, **names, **tools
         )
 
     if transition_jacobian is not None:

@@ -15,7 +15,6 @@ from filters.filter import Filter
 from filters.pages.kernels import nothing_to_summarise
 from thruster_env.core.angles import wrapped
 from thruster_env.core.checks import at_least, positive, short_repr
-from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import Source, vector_reader, vector_writer, written_out, zeros_of
 from thruster_env.model.shape import (
     Functions,
@@ -43,16 +42,13 @@ def component_solver(observe: Callable, n: int, component: int, channel: int, an
     source = Source("replaced", "x, v", result=(n,), x=(n,))
     replaced = source.function(source.vector(n, lambda i: source.if_same(i, component, "v", f"x[{i}]")))
 
-    @inlined
     def misfit(x, v, z, c):
         off = observe(replaced(x, v), c)[channel] - z
         return wrapped(off) if angle else off
 
-    @inlined
     def crossing(before, after):
         return (after > 0.0) != (before > 0.0) and (not angle or abs(after - before) < math.pi)
 
-    @inlined
     def halved(x, z, c, near, far, misfit_near):
         for _ in range(HALVINGS):
             middle = 0.5 * (near + far)
@@ -63,7 +59,6 @@ def component_solver(observe: Callable, n: int, component: int, channel: int, an
                 far = middle
         return 0.5 * (near + far)
 
-    @inlined
     def nearest_approach(x, z, c, low, high):
         for _ in range(HALVINGS):
             left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
@@ -73,7 +68,6 @@ def component_solver(observe: Callable, n: int, component: int, channel: int, an
                 low = left
         return 0.5 * (low + high)
 
-    @inlined
     def solve(x, z, c, reach):
         start, step = x[component], reach / INTERVALS
         below = above = misfit(x, start, z, c)
@@ -128,11 +122,9 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     solve = component_solver(of_both, n, component, channel, angle)
     no_cov, no_s = zeros_of(n, n), zeros_of(m, m)
 
-    @inlined
     def blend(y, z, share):  # the low-pass filter; of angles from y the short way towards z
         return wrapped(y + (1.0 - share) * wrapped(z - y)) if angle else share * y + (1.0 - share) * z
 
-    @inlined
     def estimate(row, numbers):
         x = read_open(row)
         store_mean(row, x)
@@ -140,7 +132,6 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
             c = at_last(row), constants(numbers)
             store_mean(row, solve(x, row[smooth_offset], c, numbers[reach_offset]))
 
-    @inlined
     def start(memory, numbers, size):
         row, _, _ = memory
         store_open(row, prior_mean(numbers))
@@ -150,7 +141,6 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
         estimate(row, numbers)
         store_cov(row, no_cov())
 
-    @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         v, c = control(u), constants(numbers)
@@ -161,7 +151,6 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
         estimate(row, numbers)
         row[step_offset] += 1.0
 
-    @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
         store_innovation(row, difference(measured(z), observe(read_mean(row), acts(row), constants(numbers))))

@@ -15,7 +15,7 @@ import numpy as np
 from filters.engine.batch import run
 from filters.gaussian.extended import ExtendedKalmanFilter
 from thruster_env.core.checks import as_floats, at_least, correlations, covariance_root, with_progress
-from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import function_fingerprint, is_interpreting, sources_hash
 from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.matrices import multiplier, quadratic_form
 from thruster_env.core.sources import Source, matrix_reader, vector_reader, vector_writer
@@ -256,8 +256,13 @@ def posterior_variances(
 def gathering_code(model: StateSpaceModel) -> tuple[Loops, str]:
     """What sums up Jacobians for the bound of a model, and a hash of all code that determines the bound."""
     functions = model.functions
-    fingerprint = function_fingerprint(*functions, within=__name__)
-    return _gatherer(functions, model.shape, is_interpreting()), fingerprint
+    fingerprint = function_fingerprint(*(function for function in functions if function is not None))
+    return _gatherer(functions, model.shape, is_interpreting()), fingerprint + _sources_hash()
+
+
+@cache
+def _sources_hash() -> str:
+    return sources_hash("thruster_env.core", "thruster_env.graphs", "thruster_env.model", "filters")
 
 
 def sequences_taken(inputs: np.ndarray, truths: int, model: StateSpaceModel) -> np.ndarray:
@@ -354,9 +359,7 @@ def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
     accumulate = _into("out[b, k, {i}, {j}] += weight * a[{i}][{j}]", n)
     move_mean = _into("out[b, k, {i}, {j}] += weight * (a[{i}][{j}] - out[b, k, {i}, {j}])", n)
     less_mean = _from_mean(n, functions.transition_jacobian is None)
-    fingerprint = function_fingerprint(transition, transition_matrix, observation_matrix, within=__name__)
 
-    @inlined
     def whole_step(x, u, numbers, c, eye):
         f = identity(eye)
         for _ in range(int(numbers[substeps])):
@@ -365,7 +368,6 @@ def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
         return f, x
 
     def gather(keys, before, inputs, numbers, q_inverse, r_inverse, f_mean, spread_of_f, information, first, last):
-        fingerprint  # noqa: B018 - part of the cache's key
         x, u, draws, eye = np.zeros(n), np.zeros(inputs.shape[2]), np.zeros(room), np.zeros(n * n)
         for i in range(n):
             eye[i * (n + 1)] = 1.0

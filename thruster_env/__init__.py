@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from thruster_env.core.modules import may_be_inlined, when_imported
+from thruster_env.core.modules import when_imported
 
 if TYPE_CHECKING:
     from thruster_env.thruster.env import (
@@ -14,13 +14,6 @@ if TYPE_CHECKING:
     )
     from thruster_env.thruster.parameters import PRESETS, ThrusterParameters
 
-may_be_inlined("thruster_env.core")
-may_be_inlined("thruster_env.graphs", "thruster_env.core")
-may_be_inlined("thruster_env.model", "thruster_env.core")
-may_be_inlined("thruster_env.effects", "thruster_env.graphs")
-may_be_inlined("thruster_env.env", "thruster_env.model", "thruster_env.effects")
-may_be_inlined("thruster_env.thruster", "thruster_env.env")
-may_be_inlined("thruster_env.auv", "thruster_env.env")
 
 __version__ = "0.1.0"
 __all__ = [

@@ -17,7 +17,6 @@ from filters.augmented import Unknown, augmented_model
 from filters.consistency.nees import Interval
 from filters.filter import Filter
 from filters.registry import make_filter
-from thruster_env.core.compiled import inlined
 from thruster_env.core.files import BLUE, DARK, RUST, save_figure
 from thruster_env.core.sources import written_out
 from thruster_env.core.text_tables import markdown_table
@@ -304,7 +303,7 @@ def lifted(scenario: Scenario, **changes) -> StateSpaceModel:
     ]
     fill = written_out("fill", "c", f"Constants({', '.join(values)})", Constants=Constants)
     functions = {
-        name: written_out(name, f"{arguments}, c", f"plain({arguments}, fill(c))", fill=fill, plain=inlined(plain))
+        name: written_out(name, f"{arguments}, c", f"plain({arguments}, fill(c))", fill=fill, plain=plain)
         for name, arguments, plain in (
             ("transition", "x, u", model.transition),
             ("observe", "x", model.observe),

@@ -219,8 +219,7 @@ def calls_of(
     for position, matrix in stores:
         if known.get(matrix) != position:
             text.lines += _stored(position, matrix, text.values[matrix])
-    loops = any(matrix.member or is_array(*matrix.shape) for matrix in text.values if matrix.shape)
-    return written_out("work", ", ".join(arrays), *text.lines, "None", _loops=loops, **text.names)
+    return written_out("work", ", ".join(arrays), *text.lines, "None", **text.names)
 
 
 class _Text:

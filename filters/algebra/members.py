@@ -22,7 +22,6 @@ from filters.algebra.operations import choose, constant, exceeds
 from filters.algebra.points import outer
 from thruster_env.core import matrices as arrays
 from thruster_env.core.angles import row_aligner, whole_turns
-from thruster_env.core.compiled import not_inlined
 from thruster_env.core.sources import Source, column_reader, column_writer, entrywise, is_array, written_out
 from thruster_env.core.streams import exponential
 from thruster_env.graphs.graphs import Number, arctan2, over_members, size_of, where
@@ -224,10 +223,9 @@ def _of_entries(arguments: str, size: str, text: str) -> Callable:
         f"        out[i, j] = {text}",
         "out",
     )
-    return not_inlined(written_out("by_entries", arguments, *lines, _loops=True, np=np))
+    return written_out("by_entries", arguments, *lines, np=np)
 
 
-@not_inlined
 def _called_means(a, size):
     out = np.zeros(a.shape[0])
     for i in range(a.shape[0]):
@@ -238,7 +236,6 @@ def _called_means(a, size):
     return out
 
 
-@not_inlined
 def _over_size(out, size):
     for i in range(out.shape[0]):
         for k in range(out.shape[1]):
@@ -246,14 +243,12 @@ def _over_size(out, size):
     return out
 
 
-@not_inlined
 def _square(a, size):
     return _over_size(
         arrays.square_of_rows(arrays.deviations(a, 0, a.shape[0], _called_means(a, size), size)), size
     )
 
 
-@not_inlined
 def _covariance(a, b, size):
     d = arrays.deviations(a, 0, a.shape[0], _called_means(a, size), size)
     return _over_size(
@@ -261,7 +256,6 @@ def _covariance(a, b, size):
     )
 
 
-@not_inlined
 def _variances(a, size):
     means, out = _called_means(a, size), np.zeros(a.shape[0])
     for i in range(a.shape[0]):
@@ -272,7 +266,6 @@ def _variances(a, size):
     return out
 
 
-@not_inlined
 def _centred(a, size):
     means, factor, out = _called_means(a, size), (size / (size - 1.0)) ** 0.5, np.empty_like(a)
     for i in range(a.shape[0]):
@@ -281,7 +274,6 @@ def _centred(a, size):
     return out
 
 
-@not_inlined
 def _called_total(a, size):
     total = 0.0
     for j in range(size):
@@ -289,7 +281,6 @@ def _called_total(a, size):
     return total
 
 
-@not_inlined
 def _weighted_sums(a, w, size):
     out = np.zeros(a.shape[0])
     for i in range(a.shape[0]):
@@ -298,7 +289,6 @@ def _weighted_sums(a, w, size):
     return out
 
 
-@not_inlined
 def _largest(a, size):
     most = -math.inf
     for j in range(size):
@@ -306,7 +296,6 @@ def _largest(a, size):
     return most if most > -math.inf else math.nan
 
 
-@not_inlined
 def _effective_size(w, size):
     squares = 0.0
     for j in range(size):
@@ -314,7 +303,6 @@ def _effective_size(w, size):
     return 1.0 / squares
 
 
-@not_inlined
 def _spread_share(w, size):
     rest = minor_total = 0.0
     for j in range(size):
@@ -324,7 +312,6 @@ def _spread_share(w, size):
     return rest + minor_total * (1.0 - minor_total)
 
 
-@not_inlined
 def _weighted_square(d, w, size):
     return arrays.weighted_square_of_rows(d[:, :size].copy(), w, 0)
 

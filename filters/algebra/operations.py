@@ -39,7 +39,6 @@ from filters.algebra.matrices import (
 )
 from thruster_env.core import matrices
 from thruster_env.core.angles import wrapped
-from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import Source, entrywise, is_array, matrix_reader, matrix_writer
 from thruster_env.graphs.graphs import Graph, called, where
 from thruster_env.graphs.programs import CALLED, CALLED_IN_ROUNDS, Place, Program, program_of
@@ -477,7 +476,6 @@ def geometric_mean_of(size: int) -> Callable:
         (matrix_reader(size, size, at), matrix_writer(size, size, at)) for at in (0, size * size)
     )
 
-    @inlined
     def mean(a, b):
         unit_a, unit_b = unit(cholesky(a)), unit(cholesky(b))
         pair = np.empty(2 * size * size)
@@ -506,7 +504,6 @@ def _taught(size: int) -> tuple[str, Callable]:
     mean, name, write = geometric_mean_of(size), f"geometric_mean_{size}", matrix_writer(size, size, 0)
     first, second = (matrix_reader(size, size, at) for at in (0, size * size))
 
-    @inlined
     def work(pair, result):
         write(result, mean(first(pair), second(pair)))
 

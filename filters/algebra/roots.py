@@ -16,7 +16,6 @@ from filters.algebra import matrices, operations
 from filters.algebra.matrices import Operation, minus, operation, same, through
 from filters.algebra.operations import factor, forward, mirrored, pivoted
 from thruster_env.core import matrices as matrix_functions
-from thruster_env.core.compiled import not_inlined
 from thruster_env.core.matrices import NEGLIGIBLE
 from thruster_env.core.sources import (
     LONGEST_TEXT,
@@ -198,7 +197,7 @@ def _pick(result: tuple, rows: tuple[int, ...], columns: tuple[int, ...], a: tup
         "        out[i, j] = a[rows[i], columns[j]]",
         "out",
     )
-    return written_out("pick", "a", *lines, _loops=True, np=np, rows=rows, columns=columns)
+    return written_out("pick", "a", *lines, np=np, rows=rows, columns=columns)
 
 
 def _forward_quotient(result: tuple, lower: tuple, v: tuple) -> Callable:
@@ -317,7 +316,6 @@ def _measured(ud: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 # Operations of `upper` as functions for their sizes, for `calls`: loops over arrays, whatever the size.
 
 
-@not_inlined
 def called_unit_upper(ud):
     """U."""
     out = np.eye(len(ud))
@@ -327,7 +325,6 @@ def called_unit_upper(ud):
     return out
 
 
-@not_inlined
 def called_upper_root(ud):
     """U D^(1/2)."""
     out = np.zeros(ud.shape)
@@ -339,7 +336,6 @@ def called_upper_root(ud):
     return out
 
 
-@not_inlined
 def called_weighted_factors(w, ud):
     """The factors of W diag(D, I) W', by Gram and Schmidt's method with these weights."""
     n, columns = w.shape
@@ -363,7 +359,6 @@ def called_weighted_factors(w, ud):
     return out
 
 
-@not_inlined
 def measured(ud, h):
     """`measured_factors` and `measured_gain`."""
     (m, n), updated, k = h.shape, ud.copy(), np.zeros(len(ud))

@@ -30,7 +30,7 @@ from filters.algebra.points import density, density_slope, dot, heavier, outlier
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.pages.kernels import Stage, as_calls, as_programs, as_tuple, stage_of, with_extras
 from filters.pages.page import Equations, NumbersMemory, Page, PagedModel
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.graphs.graphs import uncollected
 from thruster_env.graphs.programs import Place, callable_of
 from thruster_env.model.shape import (
@@ -38,9 +38,7 @@ from thruster_env.model.shape import (
     Shape,
     constants_reader,
     number_offsets,
-    observation_slopes,
     starts_of,
-    transition_slopes,
 )
 from thruster_env.model.traced import MOST
 
@@ -202,7 +200,7 @@ def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page
         stages = stages_of(memory, model, wanted, page)
         compiled = [as_programs(stage, memory.length, MOST) for stage in stages]
         works = [callable_of(program, AT_ONCE) for programs in compiled for program in programs[:2]]
-        fingerprint, at_once = function_fingerprint(within=__name__), AT_ONCE
+        at_once = AT_ONCE
     except Exception:  # a user's function cannot be traced, whatever it raises: it is called instead
         model = Equations(functions, memory, constants_move=wanted.constants, trace=False)
         readers = {memory.constants: constants_reader(shape)}
@@ -211,32 +209,25 @@ def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page
             for stage in stages_of(memory, model, wanted, page)
         ]
         works = [work for calls in compiled for work in calls[:2]]
-        slopes = transition_slopes(functions, shape), observation_slopes(functions, shape)
-        fingerprint = function_fingerprint(functions.transition, functions.observe, *slopes, within=__name__)
         at_once = 1
     length = max(stage.length for stage in compiled)
     if page.initial is None and not shape.feeds:
         works[:0] = nothing, nothing
     if page.represent is None:
         works[2:2] = nothing, nothing
-    accumulate = _accumulator(memory, works, wanted, page, at_once, fingerprint)
-    code = None if interpreting or at_once == 1 else _machine_code(accumulate)
-    run = CompiledOrPython(accumulate) if code is None else code
-    return Recursion(run, at_once, length, memory.depth)
+    accumulate = _accumulator(memory, works, wanted, page, at_once)
+    return Recursion(_as_loops(accumulate), at_once, length, memory.depth)
 
 
-def _machine_code(accumulate: Callable) -> Callable | None:
-    from thruster_env.graphs.loops import machine_code_of
-    from thruster_env.graphs.machine_code import function_of
+def _as_loops(accumulate: Callable) -> Callable:
+    from thruster_env.graphs.loops import Loops
 
     dimensions = dict.fromkeys(inspect.signature(accumulate).parameters, 1)
     dimensions |= {"turns": 0, "first": 0, "last": 0, "begins": 2, "moves": 2, "changes": 2}
     dimensions |= dict.fromkeys(("inputs", "measurements", "truth", "out", "information", "outputs"), 3)
-    code = machine_code_of(accumulate, [(None,) * count if count else None for count in dimensions.values()])
-    return None if code is None else function_of(code)
+    return Loops(accumulate, [(None,) * count if count else None for count in dimensions.values()])
 
 
-@inlined
 def nothing(rows, change, numbers, move):
     """Do nothing, in place of a stage that a filter does not have."""
 
@@ -294,9 +285,7 @@ def _by_offset(memory: Memory, extras: Mapping[str, Matrix]) -> dict[int, Matrix
     return {memory.extras[name].operation.at: extra for name, extra in extras.items()}
 
 
-def _accumulator(
-    memory: Memory, works: list[Callable], wanted: Wanted, page: Page, at_once: int, fingerprint: str
-) -> Callable:
+def _accumulator(memory: Memory, works: list[Callable], wanted: Wanted, page: Page, at_once: int) -> Callable:
     """The recursion over steps of some runs."""
     start, start_slopes, begin, begin_slopes, advance, advance_slopes, add_noise, add_noise_slopes = works[:8]
     update, update_slopes = works[8:10]
@@ -329,7 +318,6 @@ def _accumulator(
         first,
         last,
     ):
-        fingerprint  # noqa: B018 - part of the cache's key
         count = out.shape[2] - 1
         for b in range(first, last, at_once):
             lanes = min(at_once, last - b)  # beyond, the last run again

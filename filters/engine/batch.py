@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from filters.engine.compile import (
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from thruster_env.core.checks import as_floats, covariance, short_repr
-from thruster_env.core.compiled import inlined, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.streams import filter_keys
 from thruster_env.core.threads import spread
 from thruster_env.logs.grid import count_steps, resolution_of
@@ -134,8 +134,6 @@ def trajectories(
         keys, measurements = None, keys
     if is_single(None, inputs, measurements):
         measurements, inputs = _as_batch(model, measurements, inputs)
-    # Writeable arrays, because numba would compile again for read-only ones.
-    requirements: tuple[Literal["C_CONTIGUOUS", "WRITEABLE"], ...] = "C_CONTIGUOUS", "WRITEABLE"
     if measurements is None:
         raise ValueError("measurements must be an array (B, K + 1, m), but got None")
     if inputs is None or keys is None:
@@ -147,7 +145,7 @@ def trajectories(
             keys = filter_keys(range(count)).reshape(count, 2) if draws else np.zeros((count, 2))
     arguments = {"keys": keys, "inputs": inputs, "measurements": measurements}
     keys, inputs, z = (
-        np.require(_floats(name, value), np.float64, requirements) for name, value in arguments.items()
+        np.ascontiguousarray(_floats(name, value), dtype=np.float64) for name, value in arguments.items()
     )
     if z.ndim != 3 or inputs.ndim != 3 or keys.shape != (len(z), 2):
         rule = "keys, inputs, measurements must have shapes (B, 2), (B, K, p), (B, K + 1, m)"
@@ -401,7 +399,7 @@ class Beliefs:
 def _operation(kernels: Kernels, inputs: int, interpreting: bool) -> InParts:
     from thruster_env.graphs.workers import InParts
 
-    operate = inlined(build_operation(kernels))
+    operate = build_operation(kernels)
     kept_rows, m, p = kernels.kept_rows, kernels.m, inputs
 
     def operate_many(first, last, row_like, table_like, draws_like, size, rows, tables, us, zs, numbers, tasks):

@@ -35,7 +35,7 @@ import numpy as np
 
 from thruster_env.core.angles import angle_writer
 from thruster_env.core.checks import ROUNDING, as_floats, at_least, covariance, short_repr
-from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.sources import Source, matrix_reader, matrix_writer, vector_reader, vector_writer
 from thruster_env.core.streams import truncated_normal
 from thruster_env.model.quantities import Bound
@@ -382,7 +382,6 @@ def restart_if_lost(kernels: Kernels) -> Callable:
     innovation, s_offset, log_likelihood = layout.innovation, layout.innovation_cov, layout.log_likelihood
     divergences, magnitude = layout.divergences, row_magnitude(kernels.n, m, kernels.t)
 
-    @inlined
     def restart(memory, numbers, size):
         row, _, _ = memory
         if not magnitude(row) < LARGEST:
@@ -416,29 +415,24 @@ def bounded_kernels(kernels: Kernels, bounds: tuple[Bound, ...], bounded_by: str
     plain_start, plain_predict, plain_update = kernels.start, kernels.predict, kernels.update
     constrain = _constraint(n, mean, layout.cov, bounds, bounded_by)
 
-    @inlined
     def tell(row):
         for i in range(size):
             row[free + i] = row[mean + i]
         constrain(row)
 
-    @inlined
     def recall(row):
         for i in range(size):
             row[mean + i] = row[free + i]
 
-    @inlined
     def start(memory, numbers, size):
         plain_start(memory, numbers, size)
         tell(memory[0])
 
-    @inlined
     def predict(memory, u, numbers, size):
         recall(memory[0])
         plain_predict(memory, u, numbers, size)
         tell(memory[0])
 
-    @inlined
     def update(memory, z, numbers, size):
         recall(memory[0])
         plain_update(memory, z, numbers, size)
@@ -463,10 +457,8 @@ def _constrain_rows(n: int, bounds: tuple[Bound, ...], bounded_by: str, interpre
     from thruster_env.graphs.loops import Loops
 
     constrain = _constraint(n, 0, n, bounds, bounded_by)
-    fingerprint = function_fingerprint(constrain, within=__name__)
 
     def constrain_rows(rows):
-        fingerprint  # noqa: B018 - part of the cache's key
         for i in range(len(rows)):
             constrain(rows[i])
 
@@ -480,7 +472,6 @@ def _constraint(n: int, mean: int, cov: int, bounds: tuple[Bound, ...], bounded_
 
 
 def _truncation(n: int, mean: int, cov: int, states: tuple, low: tuple, high: tuple) -> Callable:
-    @inlined
     def constrain(row):
         # A state's bounds act as a Gaussian factor: a precision and an information. The cavity is without it.
         column, precisions, informations = np.zeros(n), np.zeros(len(states)), np.zeros(len(states))
@@ -512,7 +503,6 @@ def _truncation(n: int, mean: int, cov: int, states: tuple, low: tuple, high: tu
 
 
 def _projection(n: int, mean: int, cov: int, states: tuple, low: tuple, high: tuple) -> Callable:
-    @inlined
     def constrain(row):
         forces = np.zeros(len(states))  # x = x_f + P (the forces at the bounds), each zero or at its bound
         for _ in range(ROUNDS):

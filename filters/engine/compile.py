@@ -3,8 +3,7 @@
 The memory of eight beliefs is interleaved: number i of belief j is `rows[group, 8 i + j]`. Each stage of a step
 runs over four such groups, whose instructions the processor overlaps.
 
-Filters whose stages are programs need no numba: `graphs.loops` translates the loops around the programs, and LLVM
-compiles both together. Everything else, numba compiles.
+`graphs.loops` translates the loops around the stages, and LLVM compiles both together.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from filters.engine.belief import LARGEST, Kernels, restart_if_lost
-from thruster_env.core.compiled import CompiledOrPython, direct, function_fingerprint, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.streams import GROUP
 from thruster_env.model.shape import LANES, padded
 
@@ -40,10 +39,8 @@ def build_side_by_side(kernels: Kernels) -> Callable:
     divergences, log_likelihood, substeps = layout.divergences, layout.log_likelihood, source.substeps
     q_offset, r_offset, checked = source.q, source.r, layout.gain
     length, restart = row_length(kernels), restart_if_lost(kernels)
-    fingerprint = function_fingerprint(start, begin, advance, finish, update, within=__name__)
 
     def run(inputs, measurements, numbers, noise, out, memory, first, last):
-        fingerprint  # noqa: B018 - part of the cache's key
         qs, rs = noise
         means, covs, innovations, innovation_covs, log_likelihoods, counts = out
         belief, rows, us, zs = memory
@@ -132,10 +129,8 @@ def build_operation(kernels: Kernels) -> Callable:
     layout, m = kernels.layout, kernels.m
     step, divergences = layout.step, layout.divergences
     restart = restart_if_lost(kernels)
-    fingerprint = function_fingerprint(start, predict, update, within=__name__)
 
     def operate(row, table, draws, size, values, numbers, task):
-        fingerprint  # noqa: B018 - part of the cache's key
         memory, inputs = (row, table, draws), values.shape[0] - m
         for i in range(values.shape[0]):
             if i < inputs:
@@ -168,10 +163,8 @@ def _build_batch(kernels: Kernels) -> Callable:
     log_likelihood = layout.log_likelihood
     q_offset, r_offset = kernels.offsets.q, kernels.offsets.r
     restart = restart_if_lost(kernels)
-    fingerprint = function_fingerprint(start, predict, update, within=__name__)
 
     def batch(row, table, draws, size, keys, inputs, measurements, numbers, noise, out, first, last):
-        fingerprint  # noqa: B018 - part of the cache's key
         qs, rs = noise
         means, covs, innovations, innovation_covs, log_likelihoods, counts = out
         memory = (row, table, draws)
@@ -213,26 +206,18 @@ def _build_batch(kernels: Kernels) -> Callable:
     return batch
 
 
-def operation(kernels: Kernels) -> CompiledOrPython:
-    """`operate(*memory, size, values, numbers, task)` on one belief; returns its number of restarts, or REFUSED.
-
-    values = (u, z) in one array, because each further array costs some 80 ns a call; task is a sum of START,
-    PREDICT and UPDATE.
-    """
-    return _runner(build_operation, kernels, is_interpreting())
-
-
 def operation_on(kernels: Kernels, given: tuple) -> Callable[[int], int]:
     """`operate(task)` on a session's memory: given = (*memory, size, values, numbers), which stay where they are.
 
-    Call this again after the first call: then numba has compiled it, and calls skip numba's dispatch.
+    It works on one belief, and returns its number of restarts, or REFUSED. values = (u, z) in one array; task is a
+    sum of START, PREDICT and UPDATE.
     """
     code = None if is_interpreting() else _code_one_by_one(kernels)
-    if code is not None:
-        from thruster_env.graphs.machine_code import builtin_of
+    if code is None:
+        return partial(_as_python(build_operation, kernels), *given)
+    from thruster_env.graphs.machine_code import builtin_of
 
-        return builtin_of(code, *given)
-    return partial(direct(operation(kernels), *given, PREDICT + UPDATE), *given)
+    return builtin_of(code, *given)
 
 
 def batch(kernels: Kernels) -> Callable:
@@ -241,27 +226,25 @@ def batch(kernels: Kernels) -> Callable:
     noise = (qs, rs) has a row (Q, its root) for each step and a row (R, its root) for each measurement, in place
     of the model's, or no rows. They are written into `numbers`, so threads must not share these.
     """
-    code = None if is_interpreting() else _code_one_by_one(kernels)
-    if code is None:
-        return _runner(_build_batch, kernels, is_interpreting())
-    from thruster_env.graphs.machine_code import function_of
-
-    return function_of(code)
+    return _function(None if is_interpreting() else _code_one_by_one(kernels), _build_batch, kernels)
 
 
 def vectors(kernels: Kernels) -> Callable:
     """`run` of `build_side_by_side`, for kernels that have vectors."""
-    code = None if is_interpreting() else _code_side_by_side(kernels)
+    return _function(None if is_interpreting() else _code_side_by_side(kernels), build_side_by_side, kernels)
+
+
+def _function(code: Code | None, build: Callable, kernels: Kernels) -> Callable:
     if code is None:
-        return _runner(build_side_by_side, kernels, is_interpreting())
+        return _as_python(build, kernels)
     from thruster_env.graphs.machine_code import function_of
 
     return function_of(code)
 
 
 @lru_cache(maxsize=128)
-def _runner(build: Callable, kernels: Kernels, interpreting: bool) -> CompiledOrPython:
-    return CompiledOrPython(build(kernels))
+def _as_python(build: Callable, kernels: Kernels) -> Callable:
+    return np.errstate(all="ignore")(build(kernels))  # machine code does not warn of overflow either
 
 
 @lru_cache(maxsize=64)

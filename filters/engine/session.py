@@ -116,12 +116,11 @@ class Session:
         self.divergences = divergences
 
     def _operate_first(self, task: int) -> int:
-        """Operate once, so that numba has compiled; later calls are direct, because `step` has to be quick."""
+        """Operate for the first time, which may compile."""
         if not (task & START or self._has_belief):
             raise ValueError("a session must begin with start(key, z) or load(belief), but got neither")
-        divergences = operation_on(self._kernels, self._given)(task)
         self._operate = operation_on(self._kernels, self._given)
-        return divergences
+        return self._operate(task)
 
     def _do(self, task: int) -> None:
         self.divergences = self._operate(task)

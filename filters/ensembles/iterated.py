@@ -26,7 +26,6 @@ from filters.pages.kernels import member_stages_of as stages_of
 from filters.pages.kernels import member_works_of as works_of
 from filters.pages.page import Page
 from thruster_env.core.checks import at_least
-from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Functions, Shape, number_offsets
@@ -106,7 +105,6 @@ def window_stages(length: int) -> Callable:
     return stages
 
 
-@inlined
 def copy_rows(table, source, target, count):
     """Copy `count` rows from `source` to `target`, the first row first."""
     for i in range(count):
@@ -114,7 +112,6 @@ def copy_rows(table, source, target, count):
             table[target + i, j] = table[source + i, j]
 
 
-@inlined
 def pull_row(table, source, target, slopes, pulls, count, size):
     """Set row target to row source + its covariance with `count` rows of slopes times rows of pulls."""
     mean = 0.0
@@ -150,7 +147,6 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     constants, constants_offset = shape.constants, number_offsets(n, m).constants
     count, size_of_step = filter_offset(shape) + page.own_size, p + shape.constants
 
-    @inlined
     def start(memory, numbers, size):
         row, table, draws = memory
         fill_normals(draws, n * table.shape[1], row[step_offset], FILTER_PRIOR, row[key_0], row[key_1])
@@ -162,7 +158,6 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
             for j in range(table.shape[1]):
                 table[i, j] = 0.0
 
-    @inlined
     def move(memory, source, k, numbers, size):
         """Propagate the members by step k of the window that begins at row `source`: start, then noise."""
         row, table, draws = memory
@@ -179,14 +174,12 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
             propagate(row, u, then, table, draws, size)
         add_process_noise(row, u, then, table, draws, size)
 
-    @inlined
     def run_window(memory, source, numbers, size):
         row, table, _ = memory
         copy_rows(table, source, 0, n)
         for k in range(int(row[steps])):
             move(memory, source, k, numbers, size)
 
-    @inlined
     def drop(memory):
         row, table, _ = memory
         copy_rows(table, window + 2 * n, window + n, rows - 2 * n)
@@ -194,7 +187,6 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
             row[inputs + k] = row[inputs + size_of_step + k]
         row[steps] -= 1.0
 
-    @inlined
     def admit(memory, u, numbers, size):
         """Append a step, whose noise begins at row `iterate`; then inflate."""
         row, table, _ = memory
@@ -210,7 +202,6 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
             for i in range(window, window + rows):
                 stretch_row(table, i, numbers[inflation], size)
 
-    @inlined
     def predict(memory, u, numbers, size):
         row, table, draws = memory
         row[step_offset] += 1.0
@@ -230,7 +221,6 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
                 admit(memory, u, numbers, size)
                 copy_rows(table, window, 0, n)
 
-    @inlined
     def update(memory, z, numbers, size):
         row, table, draws = memory
         look(row, z, numbers, table, draws, size)
@@ -250,7 +240,6 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
             copy_rows(table, iterate, window, rows)
         moments_of(row, row, row, table, draws, size)
 
-    @inlined
     def summarise(memory, size):
         row, table, draws = memory
         moments_of(row, row, row, table, draws, size)

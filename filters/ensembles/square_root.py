@@ -36,7 +36,6 @@ from filters.filter import Filter
 from filters.pages.page import Page
 from thruster_env.core.checks import at_least as check_at_least
 from thruster_env.core.checks import positive
-from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import below, quantile
 
 ROUNDS = 8  # of Newton's method; innovations of up to two standard deviations need six
@@ -236,7 +235,6 @@ class FiniteSizeEnsembleFilter(DeterministicUpdateFilter):
         }
 
 
-@inlined
 def tail_mass(edge, spread, tail, z):
     """The posterior tail below an edge: its log mass without the prior's scale, its mean and standard deviation.
 
@@ -250,7 +248,6 @@ def tail_mass(edge, spread, tail, z):
     return (level + math.log(part) if part > 0.0 else -np.inf), mean, deviation
 
 
-@inlined
 def sort_order(y, order, merged, size):
     """Set `order` (N,) to the indices of y (N,) from the least on, by merging sorted runs in `merged` (N,)."""
     for j in range(size):
@@ -272,7 +269,6 @@ def sort_order(y, order, merged, size):
         width *= 2
 
 
-@inlined
 def ranked_moves(y, v, tail, moves, size):
     """Moves of a channel's y (N,), with R = 1, for a measurement v: to the quantiles of its posterior."""
     order, squares = np.empty(size), 0.0

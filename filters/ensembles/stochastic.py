@@ -21,7 +21,6 @@ from filters.pages.kernels import MembersMemory, Stage, extras_size, members_ker
 from filters.pages.kernels import member_works_of as works_of
 from filters.pages.page import Page
 from thruster_env.core.checks import positive, switch
-from thruster_env.core.compiled import inlined
 from thruster_env.core.streams import FILTER_ROTATION, fill_normals
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Functions, Shape
@@ -132,7 +131,6 @@ class EnsembleKalmanFilter(LocalisedFilter):
 # Random rotations of an ensemble about its mean, which change neither mean nor covariance.
 
 
-@inlined
 def reflect(table, rows, first, size, vector):
     """Reflect each of the first `rows` rows x in the plane normal to v: x -= 2 (x'v / v'v) v.
 
@@ -166,7 +164,6 @@ def rotator(n: int, m: int) -> Callable:
     layout = memory_offsets(n, m)
     step_offset, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
-    @inlined
     def rotate(memory, size):
         row, table, draws = memory
         root = size**0.5
@@ -201,7 +198,6 @@ def with_rotation(kernels: Kernels) -> Kernels:
     """An ensemble's kernels with a random rotation after each update, which keeps mean and covariance."""
     rotate, update_plainly = rotator(kernels.n, kernels.m), kernels.update
 
-    @inlined
     def update(memory, z, numbers, size):
         update_plainly(memory, z, numbers, size)
         rotate(memory, size)
@@ -277,7 +273,6 @@ class DeterministicEnsembleKalmanFilter(LocalisedFilter, DeterministicUpdateFilt
 LEAST = 1e-3  # tapers below are set to zero
 
 
-@inlined
 def row_moments(table, i, size):
     """Mean and sample variance of a row of the members."""
     mean, squares = 0.0, 0.0
@@ -288,7 +283,6 @@ def row_moments(table, i, size):
     return mean, squares / (size - 1)
 
 
-@inlined
 def stretch_row(table, i, factor, size):
     """Multiply a row's deviations from its mean by a factor."""
     mean = 0.0
@@ -298,7 +292,6 @@ def stretch_row(table, i, factor, size):
         table[i, j] = mean + factor * (table[i, j] - mean)
 
 
-@inlined
 def relax_row(table, i, before, part, size):
     """Restore a part of an update's reduction of a row's standard deviation; `before` is the variance before."""
     _, after = row_moments(table, i, size)
@@ -306,7 +299,6 @@ def relax_row(table, i, before, part, size):
         stretch_row(table, i, 1.0 + part * ((before / after) ** 0.5 - 1.0), size)
 
 
-@inlined
 def transform_state(table, i, n, v, z, taper, size):
     """Update state i by the transform filter, with R of each channel divided by its taper."""
     inner, along, near = np.zeros((size, size)), np.zeros(size), False
@@ -340,7 +332,6 @@ def transform_state(table, i, n, v, z, taper, size):
         table[i, j] = updated[j]
 
 
-@inlined
 def gaussian_moves(y, v, tail, moves, size):
     """Moves of a channel's y (N,), with R = 1, for a measurement v, by the adjustment filter."""
     squares = 0.0
@@ -351,7 +342,6 @@ def gaussian_moves(y, v, tail, moves, size):
         moves[j] = gain * v + shrink * y[j]
 
 
-@inlined
 def regress(table, n, y, moves, taper, size):
     """Move states by their regression on a channel's y, from the moves of y."""
     squares = 0.0
@@ -397,7 +387,6 @@ def kernels_by_parts(page: Page, functions: Functions, shape: Shape, moves_of: C
     offsets = page.parameter_offsets(filter_offset(shape))
     taper, relaxation, tail = offsets["taper"], offsets["relaxation"], offsets["tail"]
 
-    @inlined
     def update(memory, z, numbers, size):
         tell(memory, z, numbers, size)
         row, table, draws = memory

@@ -39,7 +39,6 @@ from filters.pages.kernels import (
 from filters.pages.page import ACTING, Equations, PagedModel, RowMemory
 from thruster_env.core.angles import angle_indices, whole_turns, wrapped
 from thruster_env.core.checks import at_least, one_of, short_repr
-from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import Source, lower_pairs
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.shape import Functions, Shape
@@ -101,7 +100,6 @@ def blender(
         return blend
     align, angle_places = part_aligner(parts, x, angles), angle_indices(angles)
 
-    @inlined
     def blend_aligned(row, weights, target):
         align(row, weights)
         blend(row, weights, target)
@@ -117,7 +115,6 @@ def part_aligner(parts: Parts, x_offset: int, angles: tuple[bool, ...]) -> Calla
     """Return `align(row, weights)`: put angles of the vector x of all parts on one branch, around their mean."""
     (_, stride, count), angle_offsets = parts, angle_indices(angles, parts.first + x_offset)
 
-    @inlined
     def align(row, weights):
         for i in angle_offsets:
             s = c = 0.0
@@ -139,7 +136,6 @@ def weigher(parts: Parts, level: int) -> Callable:
     """
     (_, stride, count), first = parts, parts.first + level
 
-    @inlined
     def weigh(row, weights):
         top = -math.inf
         for k in range(count):
@@ -164,7 +160,6 @@ def log_weigher(parts: Parts, level: int) -> Callable:
     """
     (_, stride, count), first = parts, parts.first + level
 
-    @inlined
     def weigh(row, logs, weights):
         top = -math.inf
         for k in range(count):
@@ -183,7 +178,6 @@ def log_weigher(parts: Parts, level: int) -> Callable:
     return weigh
 
 
-@inlined
 def logarithm(weight):
     """The logarithm of a weight, -inf of zero."""
     return math.log(weight) if weight > 0.0 else -math.inf
@@ -196,7 +190,6 @@ def parts_of(extras: np.ndarray, number: int, n: int) -> tuple[np.ndarray, np.nd
     return means.copy(), covs.reshape(number, n, n).copy(), weights.copy()
 
 
-@inlined
 def nothing(memory, inputs, numbers):
     """Do nothing: the function before the first of several."""
 
@@ -270,14 +263,12 @@ def mixture_kernels(
     own_first, end, afresh = filter_offset(shape) + plain.own_size, memory.end, page.afresh
     seen_offset = end - feed
 
-    @inlined
     def begin_afresh(row):
         for k in range(count):
             for i in range(belief):
                 row[first + k * stride + i] = row[i]
 
     def each(work: Callable) -> Callable:
-        @inlined
         def run(row, values, numbers):
             for i in range(values.shape[0]):
                 row[inputs_offset + i] = values[i]
@@ -292,20 +283,17 @@ def mixture_kernels(
 
     predict_each, update_each = each(predict_part), each(update_part)
 
-    @inlined
     def start(memory, numbers, size):
         row, _, _ = memory
         prior(memory, numbers, size)
         for i in range(acting, end):
             row[i] = 0.0
 
-    @inlined
     def start_parts(memory, numbers, size):
         start(memory, numbers, size)
         begin_afresh(memory[0])
         begin(memory[0], memory[0], numbers)
 
-    @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         for i in range(feed):
@@ -317,7 +305,6 @@ def mixture_kernels(
         of_states(row, weights, 0)
         row[step_offset] += 1.0
 
-    @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
         update_each(row, z, numbers)
@@ -325,7 +312,6 @@ def mixture_kernels(
         density(row, z, numbers)
         of_states(row, weights, 0)
 
-    @inlined
     def split_and_update(memory, z, numbers, size):
         row, _, _ = memory
         begin(row, z, numbers)

@@ -22,7 +22,6 @@ from filters.filter import Filter
 from filters.gaussian.mixtures import Parts, blender, log_weigher, logarithm, nothing, parts_of
 from filters.pages.kernels import anything_measured, nothing_to_summarise, stored, works_of
 from thruster_env.core.checks import as_floats, between, one_of, positive, short_repr, vector
-from thruster_env.core.compiled import inlined
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import Shape, number_offsets, starts_of
 from thruster_env.model.state_space import StateSpaceModel
@@ -99,7 +98,6 @@ def _from_prior(
         (first + k * stride, priors[k][0] + state, priors[k][1] + state * (n + 1)) for k in absent.modes
     )
 
-    @inlined
     def complete(row, weights, numbers):
         before(row, weights, numbers)
         for part, mean, variance in offsets:
@@ -115,7 +113,6 @@ def _of_others(before: Callable, absent: Absent, parts: Parts, n: int, blend: Ca
     """Fill in states with their moments in the mixture of the other modes."""
     (states, modes, _), (first, stride, count), moments = absent, parts, scratch + parts.number
 
-    @inlined
     def complete(row, weights, numbers):
         before(row, weights, numbers)
         total = 0.0
@@ -182,19 +179,16 @@ def mode_kernels(
     complete = completer(absent, parts, n, of_states, priors, completing)
     weigh = log_weigher(parts, level)
 
-    @inlined
     def blend(row, weights, numbers, target):
         complete(row, weights, numbers)
         of_states(row, weights, target)
 
     mix = nothing if mixing is None else _mixer(mixing, parts, belief, logs, first_parameter + count, blend)
 
-    @inlined
     def recall(row):
         for j in range(count):
             row[probabilities + j] = math.exp(row[logs + j])
 
-    @inlined
     def start(memory, numbers, size):
         row, _, _ = memory
         for i in range(first, end):
@@ -205,7 +199,6 @@ def mode_kernels(
         start_all(memory, numbers, numbers)
         blend(row, probabilities, numbers, 0)
 
-    @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         mix(memory, u, numbers)
@@ -214,7 +207,6 @@ def mode_kernels(
         blend(row, probabilities, numbers, 0)
         row[step] += 1.0
 
-    @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
         recall(row)
@@ -257,7 +249,6 @@ def _mixer(mixing: Callable, parts: Parts, belief: int, logs: int, transitions: 
     p, mu = input_matrix(Place("numbers", 0), (count,)), input_matrix(Place("rows", ratios), (count,))
     (share,) = works_of(stored(mixing(p, mu), (Place("rows", shares), Place("given", 0))))
 
-    @inlined
     def mix(memory, u, numbers):
         row, _, _ = memory
         for j in range(count):
@@ -299,21 +290,18 @@ def _then(before: tuple, kernels: Kernels, offsets: tuple, stride: int) -> tuple
     start_others, predict_others, update_others = before
     begin, move, correct, restart = kernels.start, kernels.predict, kernels.update, restart_if_lost(kernels)
 
-    @inlined
     def start(memory, inputs, numbers):
         start_others(memory, inputs, numbers)
         row, table, draws = memory
         for offset, first, last in offsets:
             begin((row[offset : offset + stride], table, draws), numbers[first:last], 0)
 
-    @inlined
     def predict(memory, u, numbers):
         predict_others(memory, u, numbers)
         row, table, draws = memory
         for offset, first, last in offsets:
             move((row[offset : offset + stride], table, draws), u, numbers[first:last], 0)
 
-    @inlined
     def update(memory, z, numbers):
         update_others(memory, z, numbers)
         row, table, draws = memory

@@ -20,7 +20,6 @@ from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.horizon.window import HUBER, LOSSES, kept_places, limits, scratch_places, window_works
 from filters.pages.kernels import anything_measured, nothing_to_summarise, page_kernels
 from thruster_env.core.checks import at_least, one_of, positive
-from thruster_env.core.compiled import inlined, not_inlined
 from thruster_env.model.quantities import Bound
 from thruster_env.model.shape import Functions, Shape, number_offsets
 
@@ -65,19 +64,16 @@ def horizon_kernels(
     has_bounds = bool(bounds) or limited
     more = MOST_PASSES if has_bounds else 0
 
-    @inlined
     def copy(target, at, source, first, size):
         for i in range(size):
             target[at + i] = source[first + i]
 
-    @inlined
     def keep_sight(row, numbers, step):
         first = steps + step * end
         copy(row, first + step_layout.R, numbers, r_offset, m * m)
         copy(row, first + step_layout.seen_by, numbers, constants_offset, constants)
         copy(row, first + step_layout.acting, row, acting, feed)
 
-    @inlined
     def keep_motion(row, numbers, step):
         """Store Q, constants and the number of substeps of the motion to the next step."""
         first = steps + step * end
@@ -85,7 +81,6 @@ def horizon_kernels(
         copy(row, first + step_layout.moved_by, numbers, constants_offset, constants)
         row[first + step_layout.substeps] = numbers[substeps]
 
-    @not_inlined
     def forwards(row, numbers, count, free):
         """The forward pass over the first `count` steps, without bounds if `free`; returns the cost of X."""
         then = row[numbers_offset : numbers_offset + numbers_end]
@@ -120,7 +115,6 @@ def horizon_kernels(
                 cost += rows[at.moved_cost]
         return cost
 
-    @not_inlined
     def backwards(row, numbers, count, single):
         """The backward pass, which moves the window's states; returns how many bounds were wrong."""
         wrong = 0
@@ -147,7 +141,6 @@ def horizon_kernels(
                 rows[at.step + i] += step[step_layout.x + i] - rows[at.estimate + i]
         return wrong
 
-    @not_inlined
     def halve(row, numbers, count):
         for j in range(count):
             rows = row[scratch + j * width : scratch + (j + 2) * width]
@@ -156,7 +149,6 @@ def horizon_kernels(
             for i in range(n):
                 step[step_layout.x + i] = rows[at.estimate + i]
 
-    @inlined
     def begin_step(row, numbers, count):
         """Append a step without a measurement; its state is the belief's mean."""
         clip(row, mean)
@@ -171,7 +163,6 @@ def horizon_kernels(
         keep_sight(row, numbers, count)
         row[number] = count + 1.0
 
-    @inlined
     def leave_first(row, numbers, count):
         """Drop the first step: its prediction of the second becomes the arrival cost of that."""
         forwards(row, numbers, 2, True)
@@ -186,13 +177,11 @@ def horizon_kernels(
             row[i] = row[i + end]
         row[number] = count - 1.0
 
-    @inlined
     def add_step(row, numbers, count):
         begin_step(row, numbers, count)
         if count == int(numbers[horizon_offset]):
             leave_first(row, numbers, count + 1)
 
-    @inlined
     def repeat_step(row, numbers, count):
         """Append a step at the same time as the last one, for another measurement."""
         last = steps + (count - 1) * end
@@ -202,7 +191,6 @@ def horizon_kernels(
         row[last + step_layout.substeps] = 0.0
         add_step(row, numbers, count)
 
-    @inlined
     def start(memory, numbers, size):
         row, _, _ = memory
         begin(memory, numbers, size)
@@ -214,7 +202,6 @@ def horizon_kernels(
             row[arrival + n + i] = row[cov + i]
         begin_step(row, numbers, 0)
 
-    @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         count = int(row[number])
@@ -223,7 +210,6 @@ def horizon_kernels(
         predict_belief(memory, u, numbers, size)
         add_step(row, numbers, count)
 
-    @inlined
     def iterate(row, numbers, count):
         """Make passes until all iterations are done and the right bounds hold, then one without bounds, for P."""
         fewest, patience, settled, least, wrong = 1 << 30, PATIENCE, False, math.inf, 0
@@ -242,7 +228,6 @@ def horizon_kernels(
             fewest, patience = (wrong, PATIENCE) if wrong < fewest else (fewest, patience - 1)
             settled = k + 1 == iterations + more or (k + 1 >= iterations and wrong == 0)
 
-    @inlined
     def take(row, z, numbers):
         """Store a measurement with those of the same time; their errors are independent."""
         newest = steps + (int(row[number]) - 1) * end
@@ -268,7 +253,6 @@ def horizon_kernels(
                     joint = numbers[r_offset + i * m + j] if z[j] == z[j] else 0.0
                     row[newest + step_layout.R + i * m + j] = row[newest + step_layout.R + j * m + i] = joint
 
-    @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
         tell(row, z, numbers)

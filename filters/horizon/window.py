@@ -43,7 +43,6 @@ from filters.gaussian import extended
 from filters.pages.kernels import Stage, programs_of, stored
 from filters.pages.page import ACTING, Equations, Page, RowMemory
 from filters.smoothers.rts import propagate_jacobian, represent_jacobian
-from thruster_env.core.compiled import inlined
 from thruster_env.model.quantities import Bound
 from thruster_env.model.shape import Functions, Shape, starts_of
 
@@ -252,7 +251,6 @@ class Limits(NamedTuple):
     update_disturbance_set: Callable  # update_disturbance_set(rows, step, sigma, wrong, single), by the estimate
 
 
-@inlined
 def hold(rows, mean, cov, n, i, value, at):
     """Condition the Gaussian at offsets `mean` and `cov` on component i; store k, s and v from `at` on."""
     s = (1.0 + SLACK) * rows[cov + i * n + i]
@@ -271,7 +269,6 @@ def hold(rows, mean, cov, n, i, value, at):
         rows[cov + k * n + k] = max(rows[cov + k * n + k], 0.0)
 
 
-@inlined
 def force(rows, adjoint, n, at):
     """The multiplier of a component after `hold`."""
     total = rows[at + n + 1] / rows[at + n] if rows[at + n] > 0.0 else 0.0
@@ -280,7 +277,6 @@ def force(rows, adjoint, n, at):
     return total
 
 
-@inlined
 def change_side(step, index, side, wrong, single):
     """Set the bound that holds to `side`, unless changes are `single` and one was made; count wrong bounds."""
     if step[index] == side:
@@ -290,7 +286,6 @@ def change_side(step, index, side, wrong, single):
     return wrong + 1
 
 
-@inlined
 def side_of(value, low, high, spread):
     """The bound at which a free component must be held: -1, 1, or 0 for none."""
     room = ENOUGH * spread
@@ -321,13 +316,11 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
     of_states, of_disturbances = at.holds, at.holds + n * size
     held_states, held_disturbances = step_layout.sides, step_layout.sides + n
 
-    @inlined
     def clip(row, offset):
         if bounded:
             for i in range(n):
                 row[offset + i] = min(max(row[offset + i], lows[i]), highs[i])
 
-    @inlined
     def hold_state(rows, step):
         if bounded:
             for i in range(n):
@@ -336,7 +329,6 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
                     value = (lows[i] if side < 0.0 else highs[i]) - step[step_layout.x + i]
                     hold(rows, at.updated_d, at.updated_cov, n, i, value, of_states + i * size)
 
-    @inlined
     def hold_disturbance(rows, step, sigma):
         if limited:
             for i in range(n):
@@ -347,7 +339,6 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
                     value = side * sigma * rows[at.spread + i]
                     hold(rows, at.noise, at.noise_cov, n, i, value, of_disturbances + i * size)
 
-    @inlined
     def pushed(rows, step, holds, sides, wrong, single):
         """Add the forces of the bounds that hold to the adjoint, and release components whose bounds pull."""
         for i in range(n - 1, -1, -1):
@@ -360,7 +351,6 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
                     wrong = change_side(step, sides + i, 0.0, wrong, single)
         return wrong
 
-    @inlined
     def update_state_set(rows, step, wrong, single):
         if bounded:
             for i in range(n):
@@ -370,11 +360,9 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
                     wrong = change_side(step, held_states + i, side, wrong, single)
         return wrong
 
-    @inlined
     def push_state(rows, step, wrong, single):
         return pushed(rows, step, of_states, held_states, wrong, single) if bounded else wrong
 
-    @inlined
     def update_disturbance_set(rows, step, sigma, wrong, single):
         for i in range(n):
             rows[at.after + i] = rows[at.end + at.before + i]

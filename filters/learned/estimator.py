@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 from filters.estimators.foreign import Output
 from filters.tensors.stages import wrapped_where
 from thruster_env.core.checks import as_floats, at_least, one_of
-from thruster_env.core.compiled import function_fingerprint, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.derivatives import jacobian
 from thruster_env.core.sources import matrix_writer, vector_reader, vector_writer
 from thruster_env.core.threads import one_thread
@@ -126,10 +126,8 @@ def _evaluations(functions: Functions, shape: Shape, interpreting: bool) -> tupl
     scales = vector_reader(n, number_offsets(n, m).scales)
     store_state, store_measurement = vector_writer(n), vector_writer(m)
     store_f_slopes, store_h_slopes = matrix_writer(n, n), matrix_writer(m, n)
-    fingerprint = function_fingerprint(f, f_slopes, h, h_slopes, within=__name__)
 
     def move(x, u, numbers, values, slopes):
-        fingerprint  # noqa: B018 - part of the cache's key
         c, size = constants(numbers), scales(numbers)
         for b in range(x.shape[0]):
             at, v = state(x[b]), control(u[b])
@@ -137,7 +135,6 @@ def _evaluations(functions: Functions, shape: Shape, interpreting: bool) -> tupl
             store_f_slopes(slopes[b].reshape(-1), f_slopes(at, size, v, c))
 
     def measure(x, u, numbers, values, slopes):
-        fingerprint  # noqa: B018 - part of the cache's key
         c, size = constants(numbers), scales(numbers)
         for b in range(x.shape[0]):
             at = state(x[b])

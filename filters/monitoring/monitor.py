@@ -18,10 +18,11 @@ import numpy as np
 
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import as_floats, at_least, one_of, positive, short_repr
-from thruster_env.core.compiled import CompiledOrPython, inlined, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 
 if TYPE_CHECKING:
     from filters.filter import Filter
+    from thruster_env.graphs.loops import Loops
 
 OUTLIER, CUSUM, GLR, VARIANCE, STUCK, MISSING = range(6)
 # Of a channel: both CUSUMs, and the steps at which they left zero; squares and their number; equal readings and
@@ -67,11 +68,11 @@ def step_tests(state, k, innovation, cov, z, limits, raised, since, sizes):
     largest, worst = 0.0, 0
     for i in range(m):
         for test in range(6):
-            raised[test, i] = False
+            raised[test, i] = 0.0
         if not z[i] == z[i]:
             state[i, GONE] += 1.0
             if state[i, GONE] == missing:
-                raised[MISSING, i], since[MISSING, i], sizes[MISSING, i] = True, k - missing + 1.0, missing
+                raised[MISSING, i], since[MISSING, i], sizes[MISSING, i] = 1.0, k - missing + 1.0, missing
             continue
         state[i, GONE] = 0.0
         deviation = cov[i, i] ** 0.5
@@ -83,21 +84,21 @@ def step_tests(state, k, innovation, cov, z, limits, raised, since, sizes):
         state[i, EQUAL] = state[i, EQUAL] + 1.0 if z[i] == state[i, LAST] and state[i, EQUAL] > 0.0 else 1.0
         state[i, LAST] = z[i]
         if state[i, EQUAL] == stuck:
-            raised[STUCK, i], since[STUCK, i], sizes[STUCK, i] = True, k - stuck + 1.0, stuck
+            raised[STUCK, i], since[STUCK, i], sizes[STUCK, i] = 1.0, k - stuck + 1.0, stuck
         for sign, total, began in ((1.0, ABOVE, ABOVE_SINCE), (-1.0, BELOW, BELOW_SINCE)):
             if state[i, total] == 0.0:
                 state[i, began] = k
             state[i, total] = max(0.0, state[i, total] + sign * e - reference)
             if state[i, total] >= cusum:
                 count = k - state[i, began] + 1.0
-                raised[CUSUM, i], since[CUSUM, i] = True, state[i, began]
+                raised[CUSUM, i], since[CUSUM, i] = 1.0, state[i, began]
                 sizes[CUSUM, i] = sign * (state[i, total] / count + reference) * deviation
                 state[i, total] = 0.0
         state[i, SQUARES] += e * e
         state[i, COUNT] += 1.0
         if state[i, COUNT] == block:
             if not low <= state[i, SQUARES] <= high:
-                raised[VARIANCE, i], since[VARIANCE, i] = True, k - block + 1.0
+                raised[VARIANCE, i], since[VARIANCE, i] = 1.0, k - block + 1.0
                 sizes[VARIANCE, i] = state[i, SQUARES] / block
             state[i, SQUARES] = state[i, COUNT] = 0.0
         newest = int(state[i, NEXT])
@@ -112,12 +113,12 @@ def step_tests(state, k, innovation, cov, z, limits, raised, since, sizes):
                 best, length = ratio, j + 1
                 sizes[GLR, i] = sum_of_last / (j + 1.0) * deviation
         if best >= glr * glr:
-            raised[GLR, i], since[GLR, i] = True, k - length + 1.0
+            raised[GLR, i], since[GLR, i] = 1.0, k - length + 1.0
             state[i, FILLED] = 0.0
     if largest > 0.0:
         squared, present = squared_innovation(innovation, cov, z)
         if squared >= limits[7 + present]:
-            raised[OUTLIER, worst], since[OUTLIER, worst], sizes[OUTLIER, worst] = True, k, innovation[worst]
+            raised[OUTLIER, worst], since[OUTLIER, worst], sizes[OUTLIER, worst] = 1.0, k, innovation[worst]
     dead = False
     for i in range(m):
         dead = dead or state[i, EQUAL] >= stuck or state[i, GONE] >= missing
@@ -345,7 +346,7 @@ class Monitor:
         v, s, z = (np.ascontiguousarray(as_floats(array)) for array in (innovations, covs, measurements))
         steps, m = z.shape
         shape = steps, len(TESTS), m
-        raised, since, sizes = np.zeros(shape, dtype=bool), np.zeros(shape), np.zeros(shape)
+        raised, since, sizes = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         state = new_state(m, self.window)
         _compiled(is_interpreting())[1](state, v, s, z, self.limits(m), raised, since, sizes)
         return [
@@ -389,11 +390,11 @@ def _limits(monitor: Monitor, channels: int) -> np.ndarray:
 
 
 @cache
-def _compiled(interpreting: bool) -> tuple[CompiledOrPython, CompiledOrPython]:
+def _compiled(interpreting: bool) -> tuple[Loops, Loops]:
     """`step_tests` and `run_tests`, compiled at their first call; those of `interpreted` are others."""
-    inlined(squared_innovation)
-    inlined(step_tests)
-    return CompiledOrPython(step_tests), CompiledOrPython(run_tests)
+    from thruster_env.graphs.loops import Loops
+
+    return Loops(step_tests), Loops(run_tests)
 
 
 class Watch:
@@ -406,7 +407,7 @@ class Watch:
     def __init__(self, monitor: Monitor, channels: int):
         self.monitor, self._limits = monitor, monitor.limits(channels)
         shape = len(TESTS), channels
-        self._out = np.zeros(shape, dtype=bool), np.zeros(shape), np.zeros(shape)
+        self._out = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         self._state = new_state(channels, monitor.window)
         self.restart()
 
@@ -429,6 +430,7 @@ class Watch:
     def step(self, innovation: np.ndarray, cov: np.ndarray, z: np.ndarray) -> Health:
         """Take the innovation (m,), its covariance (m, m) and the measurement (m,), NaN where there was none."""
         raised, since, sizes = self._out
+        innovation, cov, z = (np.ascontiguousarray(part, dtype=np.float64) for part in (innovation, cov, z))
         tests = self._state, float(self._k), innovation, cov, z, self._limits, raised, since, sizes
         dead = _compiled(is_interpreting())[0](*tests)
         alarms: tuple[Alarm, ...] = ()

@@ -11,7 +11,7 @@ From a page to machine code, in steps:
    (`thruster_env.graphs`).
 3. The program of a stage goes to LLVM as instructions for eight runs, or for one belief on scalars, together with
    the loops around it (`filters.engine`, `thruster_env.graphs.loops`): a batch works on four groups of eight
-   beliefs at a time. numba is needed for stages that are calls.
+   beliefs at a time.
 4. A page of members or particles becomes loops over them; a sum over members ends a loop.
 
 A page traced for a model's sizes is a program without calls; operations of larger models, and of models that

@@ -23,7 +23,6 @@ from filters.algebra.members import covariance, mean, on_branch
 from filters.algebra.operations import present, quotient, slopes_of, wrap
 from filters.engine.belief import Kernels, filter_offset, memory_offsets, row_access
 from filters.pages.page import Equations, NumbersMemory, Page, PagedModel, RowMemory, acting_places
-from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import matrix_reader, vector_reader
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from thruster_env.graphs.graphs import CONDITIONS, Graph, Number, TooLarge, needed_by, uncollected
@@ -309,12 +308,10 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     extras_size = sum(prod(matrix.shape) for matrix in memory.extras.values())
     prior, step_offset, substeps_offset = prior_start(shape), layout.step, shape.offsets.substeps
 
-    @inlined
     def begin_belief(memory, numbers, size):
         prior(memory, numbers, size)
         start_extras(memory[0], numbers, numbers)
 
-    @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         represent(row, u, numbers)
@@ -323,7 +320,6 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
         add_process_noise(row, u, numbers)
         row[step_offset] += 1.0
 
-    @inlined
     def update(memory, z, numbers, size):
         correct(memory[0], z, numbers)
 
@@ -344,7 +340,6 @@ def prior_start(shape: Shape) -> Callable:
     read_mean, read_cov = vector_reader(n, source.prior_mean), matrix_reader(t, t, source.prior_cov)
     _, (store_mean, store_cov), _ = row_access(shape)
 
-    @inlined
     def start(memory, numbers, size):
         row, _, _ = memory
         store_mean(row, read_mean(numbers))
@@ -353,12 +348,10 @@ def prior_start(shape: Shape) -> Callable:
     return start
 
 
-@inlined
 def nothing_to_summarise(memory, size):
     """Do nothing: mean and covariance are the belief itself."""
 
 
-@inlined
 def anything_measured(z):
     """Whether a channel of z is present."""
     for i in range(z.shape[0]):
@@ -508,12 +501,10 @@ def _correction(work: Works, shape: Shape) -> Callable:
     correct, _, draws_noise = work
     step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
-    @inlined
     def update(memory, z, numbers, size):
         row, table, draws = memory
         correct(row, z, numbers, table, draws, size)
 
-    @inlined
     def update_with_noise(memory, z, numbers, size):
         row, table, draws = memory
         fill_normals(draws, m * table.shape[1], row[step], FILTER_MEASUREMENT, row[key_0], row[key_1])
@@ -533,7 +524,6 @@ def predictor(works: dict[str, Works], shape: Shape) -> Callable:
     advance, (add_process_noise, _, drawn) = works["propagate"].work, works["add_process_noise"]
     step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
-    @inlined
     def predict(memory, u, numbers, size):
         row, table, draws = memory
         for _ in range(int(numbers[substeps])):
@@ -552,13 +542,11 @@ def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     draw_prior, moments_of, layout = works["start"].work, works["summarise"].work, memory_offsets(n, m)
     step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
-    @inlined
     def start(memory, numbers, size):
         row, table, draws = memory
         fill_normals(draws, n * table.shape[1], row[step], FILTER_PRIOR, row[key_0], row[key_1])
         draw_prior(row, numbers, numbers, table, draws, size)
 
-    @inlined
     def summarise(memory, size):
         row, table, draws = memory
         moments_of(row, row, row, table, draws, size)

@@ -320,7 +320,7 @@ def _curvature(matrix: Callable, rows: int, columns: int, inputs: str) -> Callab
     )
     names: dict[str, Any] = {"matrix": matrix, "move": scaled_sum(columns), "read": vector_reader(columns)}
     names |= {"np": np, "step_of": step_of, "step_growth": step_growth(columns)}
-    return written_out("curved", f"x, scales, {inputs}", *lines, _loops=True, **names)
+    return written_out("curved", f"x, scales, {inputs}", *lines, **names)
 
 
 def _contraction(rows: int, columns: int) -> Callable:
@@ -333,7 +333,7 @@ def _contraction(rows: int, columns: int) -> Callable:
         "            out[i, j] += dx[k] * curvature[k, i, j]",
         "out",
     )
-    return written_out("slope", "curvature, dx", *lines, _loops=True, np=np)
+    return written_out("slope", "curvature, dx", *lines, np=np)
 
 
 @cache

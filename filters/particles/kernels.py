@@ -50,7 +50,6 @@ from filters.pages.kernels import member_works_of as works_of
 from filters.pages.page import Page, PagedModel, acting_places
 from thruster_env.core.checks import at_least as check_at_least
 from thruster_env.core.checks import finite, positive
-from thruster_env.core.compiled import inlined, not_inlined
 from thruster_env.core.streams import (
     FILTER_KERNEL,
     FILTER_MEASUREMENT,
@@ -164,7 +163,6 @@ def systematic_resampler(rows: int, weights: int, scratch: int) -> Callable:
     """
     sums, parents, new = range(scratch, scratch + SCRATCH_ROWS)
 
-    @inlined
     def resample(table, size, u):
         total = 0.0
         for i in range(size):
@@ -215,32 +213,27 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     (begin, _, drawn), (correct, _, proposed) = works["start"], works["update"]
     choose, moments, predict = works["choose"].work, works["summarise"].work, predictor(works, shape)
 
-    @inlined
     def draw(memory, count, stream):
         row, table, draws = memory
         fill_normals(draws, count * table.shape[1], row[step], stream, row[key_0], row[key_1])
 
-    @inlined
     def set_equal(memory, size):
         row, table, _ = memory
         for j in range(table.shape[1]):
             table[logarithm, j] = -math.log(size)
         row[size_offset] = size
 
-    @inlined
     def start(memory, numbers, size):
         row, table, draws = memory
         draw(memory, drawn, FILTER_PRIOR)
         begin(row, numbers, numbers, table, draws, size)
         set_equal(memory, size)
 
-    @inlined
     def resampled(memory, numbers, size):
         row, table, _ = memory
         offset, _, _, _ = uniform_block(0, row[step], FILTER_MEASUREMENT, row[key_0], row[key_1])
         move(table, size, offset)
 
-    @inlined
     def chosen(memory, numbers, size):
         row, table, draws = memory
         choose(row, row, numbers, table, draws, size)
@@ -251,14 +244,12 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
         renew, spread = works["renew"].work, works["renew"].draws
         choose_first = chosen_anew if resample else nothing
 
-        @not_inlined
         def chosen_anew(memory, numbers, size):
             row, table, draws = memory
             choose_first(memory, numbers, size)
             draw(memory, spread, FILTER_KERNEL)
             renew(row, row, numbers, table, draws, size)
 
-    @inlined
     def predict_chosen(memory, u, numbers, size):
         row, _, _ = memory
         if row[size_offset] < numbers[threshold] * size:
@@ -266,12 +257,10 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
             set_equal(memory, size)
         predict(memory, u, numbers, size)
 
-    @inlined
     def summarise(memory, size):
         row, table, draws = memory
         moments(row, row, row, table, draws, size)
 
-    @inlined
     def tell_nothing(memory, numbers):
         row, _, _ = memory
         for i in range(m):
@@ -284,14 +273,12 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     if page.lookahead:
         foresee = works["foresee"].work
 
-        @inlined
         def first(memory, z, numbers, size):
             row, table, draws = memory
             foresee(row, z, numbers, table, draws, size)
             chosen_anew(memory, numbers, size)
             row[likelihood] -= math.log(size)
 
-    @not_inlined
     def update(memory, z, numbers, size):
         row, table, draws = memory
         if not anything_measured(z):
@@ -314,12 +301,10 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     )
 
 
-@inlined
 def nothing(memory, numbers, size):
     """Do nothing, in place of resampling."""
 
 
-@inlined
 def nothing_foreseen(memory, z, numbers, size):
     """Do nothing, in place of a page's lookahead."""
 

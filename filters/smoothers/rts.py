@@ -36,7 +36,7 @@ from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanF
 from filters.pages.kernels import Stage, as_tuple, programs_of, stored
 from filters.pages.page import Equations, Page, RowMemory
 from thruster_env.core.angles import difference
-from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.threads import spread
 from thruster_env.model.shape import Functions, Shape, number_offsets
 from thruster_env.model.turns import refuse_rotations
@@ -172,22 +172,18 @@ def _smoother(relation: Relation, page: Page, functions: Functions, shape: Shape
     )
     later_offset, width = length - belief, belief + n * n  # after the link: predicted mean, gain, bracket
     link_offset, substeps = later_offset - width, number_offsets(n, shape.m).substeps
-    fingerprint = function_fingerprint(*works, within=__name__)
 
-    @inlined
     def put(row, at, means, covs, b, k):
         for i in range(n):
             row[at + i] = means[b, k, i]
             for j in range(n):
                 row[at + n + i * n + j] = covs[b, k, i, j]
 
-    @inlined
     def copy(target, at, source, first, count):
         for i in range(count):
             target[at + i] = source[first + i]
 
     def smooth(estimates, inputs, numbers, lag, means, out_covs, first, last):
-        fingerprint  # noqa: B018 - part of the cache's key
         filtered, covs, restarted = estimates
         steps = inputs.shape[1]
         u, row, links = np.zeros(inputs.shape[2]), np.zeros(length), np.zeros(steps * width)

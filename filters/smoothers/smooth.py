@@ -26,7 +26,7 @@ from filters.smoothers.rts import passes, relation_of, smooth_backwards
 from filters.starts import warn_of_restarts
 from thruster_env.core.angles import difference, wrapped_where
 from thruster_env.core.checks import at_least, short_repr
-from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.sources import joiner, vector_part, written_out
 from thruster_env.core.threads import spread
 from thruster_env.model.shape import number_offsets
@@ -314,16 +314,13 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
     mean, cov, summarise = layout.mean, layout.cov, kernels.summarise
     feed, acting, pair_acting = len(kernels.acting), layout.extras, pair_offsets.extras
     q_offset, r_offset, pair_r_offset = number_offsets(n, m).q, number_offsets(n, m).r, number_offsets(2 * n, m).r
-    fingerprint = function_fingerprint(start, predict, update, analyse_pair, within=__name__)
 
-    @inlined
     def copy(target, at, source, first):
         for i in range(n):
             for j in range(target.shape[1]):
                 target[at + i, j] = source[first + i, j]
 
     def smooth(now, pair, history, size, data, numbers, lag, out, first, last):
-        fingerprint  # noqa: B018 - part of the cache's key
         keys, inputs, measurements, qs, rs = data
         means, covs, restarts = out
         row, table, _ = now

@@ -305,7 +305,7 @@ def means():
 
 @pytest.mark.slow
 def test_a_model_that_was_edited_is_never_served_from_the_old_cache(tmp_path):
-    """numba's cache looks at the outermost function only; the models of two folders may bear one name, too."""
+    """Machine code is kept by its instructions; the models of two folders may bear one name."""
     root = Path(__file__).parents[2]
     for factor in ("0.5", "0.25"):
         (tmp_path / "own_model.py").write_text(OWN_MODEL.replace("FACTOR", factor))

@@ -8,14 +8,14 @@ import pytest
 from filters import make_filter, smooth, thruster_model
 from filters.engine.belief import memory_offsets
 from filters.ensembles.stochastic import rotator
-from thruster_env.core.compiled import compiled
+from thruster_env.graphs.loops import Loops
 
 N = 9
 
 
 @cache
 def compiled_rotator(n):
-    return compiled(rotator(n, 1))
+    return Loops(rotator(n, 1))
 
 
 def rotated(members, key, step=3):

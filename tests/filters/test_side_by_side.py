@@ -10,7 +10,6 @@ from filters.registry import FILTERS, make_filter
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
-from thruster_env.graphs.machine_code import NotLinked
 from thruster_env.model import simulate
 from thruster_env.model.shape import LANES
 
@@ -47,34 +46,6 @@ def test_filters_need_no_numba(name, monkeypatch):
     entries = ("call",) if kernels.vectors else ("call", "run")
     assert engine._code_one_by_one.__wrapped__(kernels) == entries
     assert not kernels.vectors or engine._code_side_by_side.__wrapped__(kernels) == ("run",)
-
-
-@pytest.mark.slow  # numba compiles the loops of two programs
-def test_numba_compiles_the_same_loops_where_code_cannot_be_linked(monkeypatch):
-    model, (keys, inputs, z) = simulated(BLOCK + 3)
-    z[5, 4] = 1e200  # restarts, too
-    filter_ = ExtendedKalmanFilter(model=model)
-
-    def results():
-        belief = filter_.predict(filter_.init(), [1.0])
-        return *run(filter_, keys, inputs, z), *filter_.update(belief, [0.5])[0]
-
-    linked, refused = results(), []
-
-    def refuse(module, *names, **options):
-        refused.extend(names)
-        raise NotLinked("Symbols not found: [ cos ]")
-
-    monkeypatch.setattr("thruster_env.graphs.loops.code_of", refuse)
-    for build in (engine._code_one_by_one, engine._code_side_by_side, engine._runner):
-        build.cache_clear()
-    filter_ = ExtendedKalmanFilter(model=model)
-    by_numba = results()
-    for build in (engine._code_one_by_one, engine._code_side_by_side, engine._runner):
-        build.cache_clear()
-    assert sorted(set(refused)) == ["call", "run"] and linked[5][5] >= 1
-    for one, other in zip(linked, by_numba, strict=True):
-        np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)
 
 
 def test_what_one_trajectory_loses_no_other_misses():

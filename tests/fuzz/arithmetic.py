@@ -22,9 +22,9 @@ from filters import make_filter, run
 from filters.c.programs import _Single
 from filters.tensors.equations import values_of as tensors_of
 from tests.fuzz.python_interface import _line, _until
-from thruster_env.core.compiled import compiled
 from thruster_env.core.streams import filter_keys
 from thruster_env.graphs.graphs import Graph, Number, needed_by
+from thruster_env.graphs.loops import Loops
 from thruster_env.graphs.programs import (
     Place,
     Program,
@@ -284,7 +284,7 @@ def compiled_arithmetic(rng: np.random.Generator, seconds: float) -> str:
         def call(rows, given, work=work):
             work(rows, rows, given, given)
 
-        run_it, found = compiled(call), np.empty((len(numbers), points.shape[1]))
+        run_it, found = Loops(call), np.empty((len(numbers), points.shape[1]))
         for k in range(points.shape[1]):
             rows = np.empty(len(numbers))
             run_it(rows, np.ascontiguousarray(points[:, k]))

@@ -7,7 +7,6 @@ import weakref
 import numpy as np
 
 from filters import make_filter, run
-from thruster_env.core import compiled
 from thruster_env.core.streams import episode_keys
 from thruster_env.graphs import programs
 from thruster_env.model.simulate import simulate
@@ -47,8 +46,6 @@ def sizes():
     return {
         "texts": len(programs._TEXTS),
         "lines": len(linecache.cache),
-        "marked": len(compiled._marked),
-        "untaught": len(compiled._untaught),
     }
 
 

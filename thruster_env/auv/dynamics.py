@@ -21,14 +21,12 @@ from functools import lru_cache
 import numpy as np
 
 from thruster_env.auv.parameters import VehicleParameters, accelerated, derive_constants, forces, forces_tangent
-from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import runge_kutta
 from thruster_env.core.streams import cosine_and_sine
 
 # Attitude and path of a vehicle: Euler angles, transformations between body and earth, their tangents.
 
 
-@inlined
 def attitude_of(phi, theta):
     """(cos phi, sin phi, cos theta, sin theta)."""
     c_phi, s_phi = cosine_and_sine(phi)
@@ -36,21 +34,18 @@ def attitude_of(phi, theta):
     return c_phi, s_phi, c_theta, s_theta
 
 
-@inlined
 def attitude_tangent(attitude, d_phi, d_theta):
     """Directional derivative of `attitude_of`."""
     c_phi, s_phi, c_theta, s_theta = attitude
     return -s_phi * d_phi, c_phi * d_phi, -s_theta * d_theta, c_theta * d_theta
 
 
-@inlined
 def down(attitude):
     """The direction downwards in the body's axes: (-sin theta, cos theta sin phi, cos theta cos phi)."""
     c_phi, s_phi, c_theta, s_theta = attitude
     return -s_theta, c_theta * s_phi, c_theta * c_phi
 
 
-@inlined
 def down_tangent(attitude, d_attitude):
     """Directional derivative of `down`."""
     c_phi, s_phi, c_theta, s_theta = attitude
@@ -58,7 +53,6 @@ def down_tangent(attitude, d_attitude):
     return -ds_theta, dc_theta * s_phi + c_theta * ds_phi, dc_theta * c_phi + c_theta * dc_phi
 
 
-@inlined
 def angle_rates(attitude, p, q, r):
     """Rates of roll, pitch and yaw [rad/s] of a body that turns with p, q, r [rad/s].
 
@@ -69,7 +63,6 @@ def angle_rates(attitude, p, q, r):
     return p + turning * s_theta, q * c_phi - r * s_phi, turning
 
 
-@inlined
 def angle_rates_tangent(attitude, d_attitude, q, r, dp, dq, dr):
     """Directional derivative of `angle_rates`."""
     c_phi, s_phi, c_theta, s_theta = attitude
@@ -82,7 +75,6 @@ def angle_rates_tangent(attitude, d_attitude, q, r, dp, dq, dr):
     return d_rolling, dq * c_phi + q * dc_phi - dr * s_phi - r * ds_phi, d_turning
 
 
-@inlined
 def _levelled(attitude, u, v, w):
     """A vector in axes that turn with the body's heading only: ahead, to starboard and down."""
     c_phi, s_phi, c_theta, s_theta = attitude
@@ -90,7 +82,6 @@ def _levelled(attitude, u, v, w):
     return u * c_theta + below * s_theta, v * c_phi - w * s_phi, below * c_theta - u * s_theta
 
 
-@inlined
 def in_earth_axes(attitude, psi, u, v, w):
     """Components to the north, to the east and down of a vector (u, v, w) in the body's axes."""
     c_psi, s_psi = cosine_and_sine(psi)
@@ -98,7 +89,6 @@ def in_earth_axes(attitude, psi, u, v, w):
     return ahead * c_psi - aside * s_psi, ahead * s_psi + aside * c_psi, below
 
 
-@inlined
 def in_earth_axes_tangent(attitude, d_attitude, psi, d_psi, velocity, d_velocity):
     """Directional derivative of `in_earth_axes`; the vector and its change are (u, v, w)."""
     u, v, w = velocity
@@ -117,7 +107,6 @@ def in_earth_axes_tangent(attitude, d_attitude, psi, d_psi, velocity, d_velocity
     )
 
 
-@inlined
 def in_body_axes(attitude, psi, north, east, below):
     """Components ahead, to starboard and down in the body's axes of a vector in the earth's."""
     c_phi, s_phi, c_theta, s_theta = attitude
@@ -127,7 +116,6 @@ def in_body_axes(attitude, psi, north, east, below):
     return ahead * c_theta - below * s_theta, aside * c_phi + across * s_phi, across * c_phi - aside * s_phi
 
 
-@inlined
 def in_body_axes_tangent(attitude, d_attitude, psi, d_psi, vector, d_vector):
     """Directional derivative of `in_body_axes`; the vector and its change are (north, east, down)."""
     (north, east, below), (d_north, d_east, d_below) = vector, d_vector
@@ -149,19 +137,16 @@ def in_body_axes_tangent(attitude, d_attitude, psi, d_psi, vector, d_vector):
 # The motion of an underwater vehicle with six, eight or twelve states, its integration and its Jacobians.
 
 
-@inlined
 def velocity_rates(x, u, c):
     """Time derivatives of x = nu; u = (X_prop, K_prop, delta_s, delta_r, phi, theta)."""
     return accelerated(forces(x, down(attitude_of(u[4], u[5])), u, c), c)
 
 
-@inlined
 def velocity_rates_tangent(x, dx, u, c):
     """Directional derivative of `velocity_rates` at x along dx."""
     return accelerated(forces_tangent(x, dx, (0.0, 0.0, 0.0), u, c), c)
 
 
-@inlined
 def motion_rates(x, u, c):
     """Time derivatives of x = (nu, phi, theta); u = (X_prop, K_prop, delta_s, delta_r)."""
     nu, attitude = (x[0], x[1], x[2], x[3], x[4], x[5]), attitude_of(x[6], x[7])
@@ -169,7 +154,6 @@ def motion_rates(x, u, c):
     return accelerated(forces(nu, down(attitude), u, c), c) + (rolling, pitching)
 
 
-@inlined
 def motion_rates_tangent(x, dx, u, c):
     """Directional derivative of `motion_rates` at x along dx."""
     nu, attitude = (x[0], x[1], x[2], x[3], x[4], x[5]), attitude_of(x[6], x[7])
@@ -179,7 +163,6 @@ def motion_rates_tangent(x, dx, u, c):
     return accelerated(force, c) + (d_rolling, d_pitching)
 
 
-@inlined
 def navigation_rates(x, u, c):
     """Time derivatives of x = (nu, phi, theta, psi, x, y, z); u = (X_prop, K_prop, delta_s, delta_r)."""
     nu, attitude = (x[0], x[1], x[2], x[3], x[4], x[5]), attitude_of(x[6], x[7])
@@ -188,7 +171,6 @@ def navigation_rates(x, u, c):
     return accelerated(forces(nu, down(attitude), u, c), c) + turning + path
 
 
-@inlined
 def navigation_rates_tangent(x, dx, u, c):
     """Directional derivative of `navigation_rates` at x along dx."""
     nu, attitude = (x[0], x[1], x[2], x[3], x[4], x[5]), attitude_of(x[6], x[7])
@@ -200,7 +182,6 @@ def navigation_rates_tangent(x, dx, u, c):
     return accelerated(force, c) + turning + path
 
 
-@inlined
 def current_rates(x, u, c):
     """`navigation_rates` in a current; u = (X_prop, K_prop, delta_s, delta_r, north, east, down).
 
@@ -224,7 +205,6 @@ def current_rates(x, u, c):
     )
 
 
-@inlined
 def drifting_rates(x, u, c):
     """`current_rates` with the current as states: x = (nu, phi, theta, psi, x, y, z, north, east).
 
@@ -234,7 +214,6 @@ def drifting_rates(x, u, c):
     return (*current_rates(x, inputs, c), 0.0, 0.0)
 
 
-@inlined
 def drifting_rates_tangent(x, dx, u, c):
     """Directional derivative of `drifting_rates` at x along dx."""
     p, q, r, dp, dq, dr = x[3], x[4], x[5], dx[3], dx[4], dx[5]

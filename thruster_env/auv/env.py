@@ -240,7 +240,8 @@ def vehicle(kinds: tuple, channels: tuple[str, ...], substeps: int, has_torque: 
         (aside, below, *_), piece = off_path(p.pieces, m.piece, x[X], x[Y], x[Z] - m.offset)
         per_plane = where(p.max_plane > 0.0, 1.0 / p.max_plane, 0.0)
         errors = finite(aside), finite(below), finite(x[U] - p.speed)
-        cost = step_cost(*errors, *(angle * per_plane for angle in planes), p.weights)
+        stern, rudder = (angle * per_plane for angle in planes)
+        cost = step_cost(*errors, stern, rudder, p.weights)
         offset = step_depth(p, m.offset, t)
         memory, report = guide(
             p, m, x, inputs, current, (aside, below), piece, offset, readings, flows | sensors, t

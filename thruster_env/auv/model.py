@@ -34,7 +34,6 @@ from thruster_env.auv.plant import (
     suite,
 )
 from thruster_env.core.checks import covariance, one_of, positive
-from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.matrices import scaled
@@ -112,7 +111,7 @@ def transition_of(states: str, method: str, torque_is_input: bool, attitude: str
     source = f"move(x, {tuple_of(forces_of(states, torque_is_input, attitude != 'level'))}, c)"
     return (
         written_out("transition", "x, u, c", source, move=step),
-        written_out("transition_jacobian", "x, u, c", source, _loops=True, move=jacobian),
+        written_out("transition_jacobian", "x, u, c", source, move=jacobian),
     )
 
 
@@ -128,7 +127,6 @@ def forces_of(states: str, torque_is_input: bool, attitude_is_input: bool) -> li
     return inputs
 
 
-@inlined
 def no_outputs(x, c):
     """Nothing: the measurements of a vehicle are its states."""
     return ()

@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import one_of, positive, within
-from thruster_env.core.compiled import inlined
 
 # Forces and moments on an underwater vehicle, once, and the accelerations that they cause.
 #
@@ -59,7 +58,6 @@ mass matrix, the surge acceleration by a unit of surge force.
 """
 
 
-@inlined
 def forces(nu, g, inputs, c):
     """Forces X, Y, Z [N] and moments K, M, N [N m] on a vehicle of velocities nu, without those of acceleration.
 
@@ -85,7 +83,6 @@ def forces(nu, g, inputs, c):
     return surge, sway, heave, roll, pitch, yaw
 
 
-@inlined
 def forces_tangent(nu, d_nu, dg, inputs, c):
     """Directional derivative of `forces` along (d_nu, dg), by the product rule; the inputs are held."""
     u, v, w, p, q, r = nu
@@ -115,7 +112,6 @@ def forces_tangent(nu, d_nu, dg, inputs, c):
     return surge, sway, heave, roll, pitch, yaw
 
 
-@inlined
 def accelerated(force, c):
     """Accelerations d nu/dt = M^-1 F; for y_G = 0 the matrix falls into (u, w, q) and (v, p, r)."""
     x, y, z, k, m, n = force

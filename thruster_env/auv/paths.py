@@ -19,7 +19,6 @@ from thruster_env.auv.dynamics import cruise_thrust, navigation_substep
 from thruster_env.auv.parameters import SEGOROGENI, derive_constants
 from thruster_env.auv.plant import CRUISE_SPEED, SYMBOLS, Plant
 from thruster_env.core.checks import as_floats, between, one_of, positive, short_repr, takes_arguments_of, within
-from thruster_env.core.compiled import inlined
 from thruster_env.env.model_env import remembered
 from thruster_env.env.plant_data import checked_weights
 
@@ -191,7 +190,6 @@ class Task(NamedTuple):
     weights: tuple[float, ...] = DEFAULT_WEIGHTS
 
 
-@inlined
 def step_cost(cross_track, vertical, speed_error, stern, rudder, weights):
     """Cost of a step, minus its reward: w_y e_y^2 + w_z e_z^2 + w_u (u - u_ref)^2 + w_d (delta_s^2 + delta_r^2).
 

@@ -18,19 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.core.compiled import inlined
 from thruster_env.core.sources import Index, Source, written_out
 
 TURN = 2.0 * math.pi
 
 
-@inlined
 def whole_turns(x):
     """Whole turns [rad] to subtract from an angle x [rad], a number or an array, so that it lies in (-pi, pi]."""
     return TURN * np.ceil((x - math.pi) / TURN)
 
 
-@inlined
 def wrapped(x):
     """The angle x [rad] in (-pi, pi], of a number or an array."""
     return x - whole_turns(x)
@@ -107,7 +104,7 @@ def with_wrapped_angles(function: Callable, arguments: str, angles: tuple[bool, 
     source = Source("kept", arguments, result=(len(angles),))
     source.line(f"found = function({arguments})")
     entries = source.vector(len(angles), lambda i: short_way(f"found[{i}]", i, angles))
-    return source.function(entries, function=inlined(function), **NAMES)
+    return source.function(entries, function=function, **NAMES)
 
 
 @cache

@@ -15,7 +15,6 @@ from weakref import WeakSet
 import numpy as np
 
 from thruster_env.core.angles import NAMES, short_way
-from thruster_env.core.compiled import inlined
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import Index, Source, is_array, matrix_of, scaled_sum, tuple_of, written_out
 
@@ -28,7 +27,6 @@ STEEPEST = 1e30  # slope by a complex step: that of a root at zero is 1e50, for 
 _EXACT: WeakSet[Callable] = WeakSet()  # what `complex_step` has returned
 
 
-@inlined
 def step_of(x, scale, far):
     """How far to go from x for a central difference of a function that curves over lengths like `scale`.
 
@@ -79,7 +77,6 @@ def _sides(name: str, rows: int, call: str, width: str, h: str) -> list[str]:
     return lines
 
 
-@inlined
 def all_finite(values):
     """Whether all entries of an array are finite."""
     for i in range(len(values)):
@@ -99,7 +96,6 @@ def _stores(rows: int, entry: Callable) -> list[str]:
     return [f"out[{i}, j] = {entry(i)}" for i in range(rows)]
 
 
-@inlined
 def slope_by_complex_step(y):
     """Im y / h, or 0 where it is that of a root at zero: the slope of a traced root there (`filters.algebra`)."""
     slope = (0j + y).imag / COMPLEX_STEP
@@ -131,8 +127,8 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
         )
         lines = [f"y{j} = function({point}, {arguments})" for j, point in enumerate(points)]
         lines.append(matrix_of(rows, columns, lambda i, j: f"slope(y{j}[{i}])"))
-    names: dict[str, Any] = {"function": inlined(function), "slope": slope_by_complex_step, "np": np}
-    jacobian_ = written_out("jacobian", f"x, {arguments}", *lines, _loops=loops, **names)
+    names: dict[str, Any] = {"function": function, "slope": slope_by_complex_step, "np": np}
+    jacobian_ = written_out("jacobian", f"x, {arguments}", *lines, **names)
     _EXACT.add(jacobian_)
     return jacobian_
 
@@ -186,8 +182,8 @@ def _differences_in_loops(
         f"for j in range({columns}):",
     )
     lines = *start, *(f"    {line}" for line in body)
-    names: dict[str, Any] = {"function": inlined(function), "step_growth": step_growth(columns), **TOOLS}
-    return written_out("jacobian", f"x, scales, {arguments}", *lines, "out", _loops=True, **names)
+    names: dict[str, Any] = {"function": function, "step_growth": step_growth(columns), **TOOLS}
+    return written_out("jacobian", f"x, scales, {arguments}", *lines, "out", **names)
 
 
 @lru_cache(maxsize=64)
@@ -214,7 +210,7 @@ def jacobian(
     """
     signature = f"x, scales, {arguments}"
     if analytic is not None:
-        return written_out("jacobian", signature, f"analytic(x, {arguments})", analytic=inlined(analytic))
+        return written_out("jacobian", signature, f"analytic(x, {arguments})", analytic=analytic)
     if is_array(rows, columns) or is_array(columns):
         return _differences_in_loops(function, rows, columns, arguments, angles)
     lines = ["far = step_growth(x, scales)"]
@@ -228,7 +224,7 @@ def jacobian(
     def slope(i, j):
         return short_way(f"(above{j}[{i}] - below{j}[{i}])", i, angles) + f" / width{j}"
 
-    names: dict[str, Any] = {"function": inlined(function), "step_growth": step_growth(columns), **TOOLS}
+    names: dict[str, Any] = {"function": function, "step_growth": step_growth(columns), **TOOLS}
     return written_out("jacobian", signature, *lines, matrix_of(rows, columns, slope), **names)
 
 
@@ -245,7 +241,6 @@ def runge_kutta(rates: Callable, count: int) -> Callable:
     add = scaled_sum(count)
     rule = f"count of runge_kutta(rates, count) must be the number of states, but got {count}"
 
-    @inlined
     def step(x, u, c):
         if len(x) != count:
             raise ValueError(rule)
@@ -264,7 +259,6 @@ def euler(rates: Callable, count: int) -> Callable:
     """Return `step(x, u, c)`, one step of Euler's method, x + h rates(x, u, c), of length h = c.substep [s]."""
     add = scaled_sum(count)
 
-    @inlined
     def step(x, u, c):
         return add(x, c.substep, rates(x, u, c))
 
@@ -283,7 +277,7 @@ def runge_kutta_jacobian(rates: Callable, rates_tangent: Callable, count: int) -
         rates_tangent: `rates_tangent(x, dx, u, c)`, its directional derivative at x along dx.
         count: number of components of x, which is a tuple.
     """
-    names = {"parts": (0.0, 0.5, 0.5, 1.0), "weights": (1 / 6, 1 / 3, 1 / 3, 1 / 6), "rates": inlined(rates)}
+    names = {"parts": (0.0, 0.5, 0.5, 1.0), "weights": (1 / 6, 1 / 3, 1 / 3, 1 / 6), "rates": rates}
     return _by_directions(
         rates_tangent, count, "point = add(x, parts[stage + 1] * h, rates(point, u, c))", **names
     )
@@ -314,5 +308,5 @@ def _by_directions(rates_tangent: Callable, count: int, next_point: str, **names
         "    out[j, j] += 1.0",
         "out" if is_array(count, count) else matrix_of(count, count, lambda i, j: f"out[{i}, {j}]"),
     )
-    names = {"tangent": inlined(rates_tangent), "add": scaled_sum(count), "np": np, **names}
-    return written_out("jacobian", "x, u, c", *lines, _loops=True, **names)
+    names = {"tangent": rates_tangent, "add": scaled_sum(count), "np": np, **names}
+    return written_out("jacobian", "x, u, c", *lines, **names)

@@ -16,7 +16,6 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from thruster_env.core.checks import positive, short_repr
-from thruster_env.core.compiled import inlined, not_inlined
 from thruster_env.core.sources import Local, Source, is_array
 
 Parameters = TypeVar("Parameters", bound=NamedTuple)
@@ -59,12 +58,6 @@ def observability(a: np.ndarray, c: np.ndarray) -> tuple[int, float]:
 # Products and quotients of large matrices, as loops over arrays of float64 that run along contiguous memory.
 
 
-def called(function):
-    """Mark a function that compiled functions call; see `thruster_env.core.compiled.inlined`."""
-    return inlined(function, into_callers=False)
-
-
-@not_inlined
 def _products_of_rows(a, b, lower):
     """A b', or its lower triangle, in blocks of two rows of a and four of b that share reads.
 
@@ -93,13 +86,11 @@ def _products_of_rows(a, b, lower):
     return out
 
 
-@not_inlined
 def product_of_rows(a, b):
     """A b'."""
     return _products_of_rows(a, b, False)
 
 
-@not_inlined
 def add_product(out, a, b):
     """Add a b to the first rows of an array: four rows of b at a time are added to a row of it."""
     rows, inner, columns = a.shape[0], b.shape[0], b.shape[1]
@@ -115,7 +106,6 @@ def add_product(out, a, b):
                 out[i, j] += x_0 * b[k, j]
 
 
-@called
 def product(a, b):
     """A b."""
     out = np.zeros((a.shape[0], b.shape[1]))
@@ -123,7 +113,6 @@ def product(a, b):
     return out
 
 
-@not_inlined
 def sparse_product(a, b):
     """A b, skipping each four adjacent entries of a that are zero."""
     out = np.zeros((a.shape[0], b.shape[1]))
@@ -146,7 +135,6 @@ def sparse_product(a, b):
     return out
 
 
-@not_inlined
 def deviations(table, first, rows, means, size):
     """Deviations from means (rows,) of `rows` rows of a table, starting at row `first`, and `size` columns."""
     out = np.empty((rows, size))
@@ -156,7 +144,6 @@ def deviations(table, first, rows, means, size):
     return out
 
 
-@called
 def weighted_square_of_rows(d, table, weights):
     """The sum of w d d' over columns d with weights w from a row of a table, exactly symmetric."""
     rows, size = d.shape
@@ -171,7 +158,6 @@ def weighted_square_of_rows(d, table, weights):
     return out
 
 
-@not_inlined
 def square_of_rows(a):
     """A a', exactly symmetric."""
     out = _products_of_rows(a, a, True)
@@ -181,7 +167,6 @@ def square_of_rows(a):
     return out
 
 
-@not_inlined
 def solve_rows(b, factor):
     """B (l l')^-1 for a lower triangular l: forward, then backward substitution for all rows of b at a time."""
     rows, size = b.shape

@@ -23,7 +23,6 @@ OF_ONE_PACKAGE = {
     "nuts": "nutpie",
     "torch": "torch",
 }
-INLINED: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
 
 
 # Objects by "module:object": code, which only a user's own command line or call may have imported.
@@ -192,15 +191,6 @@ class _Import:
 
             loader.exec_module = execute_and_act
         return spec
-
-
-def may_be_inlined(package: str, *below: str) -> None:
-    """Declare, in a package's `__init__`, that its functions inline one another and those of packages below it.
-
-    Cached machine code of such a function is valid as long as no source file of these packages changes. For other
-    packages, only the files of the functions that are called by name are compared.
-    """
-    INLINED[package] = below
 
 
 # How to install what is not in a plain installation: the optional dependencies of pyproject.toml.

@@ -19,8 +19,6 @@ from functools import cache
 
 import numpy as np
 
-from thruster_env.core.compiled import inlined
-
 _shown: Counter[str] = Counter()  # files of texts, with the number of functions made of each
 _MAKERS = (__name__, "thruster_env.core.sources")  # of which the names do not tell anything
 LARGEST_TUPLE = 36  # entries of a vector or matrix that is a tuple: as many have nine sigma points of four states
@@ -41,17 +39,17 @@ def matrix_of(rows: int, columns: int, entry: Callable[[int, int], str]) -> str:
     return tuple_of(tuple_of(entry(i, j) for j in range(columns)) for i in range(rows))
 
 
-def written_out(name: str, arguments: str, *lines: str, _loops: bool = False, **names) -> Callable:
+def written_out(name: str, arguments: str, *lines: str, **names) -> Callable:
     """Make a function from source lines, whose last is the expression it returns; `names` are its globals.
 
     Tracebacks and debuggers show the source, under a name that says who made it, and for which sizes.
     """
-    names["__name__"] = __name__  # without a module, pickling for numba's cache searches all of them
+    names["__name__"] = __name__
     body = "".join(f"    {line}\n" for line in (*lines[:-1], f"return {lines[-1]}"))
     text = f"def {name}({arguments}):\n{body}"
     file = _name_in_tracebacks(name, text)
     exec(compile(text, file, "exec"), names)
-    function = inlined(names[name], into_callers=not _loops)
+    function = names[name]
     _shown[file] += 1
     weakref.finalize(function, _forget, file).atexit = False
     return function
@@ -67,8 +65,7 @@ def _forget(file: str) -> None:
 def _name_in_tracebacks(name: str, text: str) -> str:
     """A file name for a text, under which `linecache` finds it.
 
-    Numba's cache looks up machine code by the function's code, which includes this name. So the name has a digest
-    of the text, and no counter, which would depend on what the process has generated before.
+    The name has a digest of the text, and no counter, which would depend on what the process has generated before.
     """
     frame = sys._getframe(2)
     while frame.f_globals.get("__name__") in _MAKERS and frame.f_back is not None:
@@ -347,7 +344,7 @@ class Source:
     def function(self, result: str = "None", **names) -> Callable:
         """The function, which returns the expression `result`; `names` are its globals."""
         lines = *self._lines, self._rewritten(result)
-        return written_out(self._name, self._arguments, *lines, _loops=self.loops, **self._names, **names)
+        return written_out(self._name, self._arguments, *lines, **self._names, **names)
 
 
 def entrywise(
@@ -358,7 +355,7 @@ def entrywise(
     return source.function(source.entries(shape, entry))
 
 
-# Vectors and matrices as tuples: one form that floats, arrays, tensors and numba all run fast.
+# Vectors and matrices as tuples: one form that floats, arrays, tensors and machine code all run fast.
 
 
 @cache
@@ -411,7 +408,7 @@ def matrix_writer(rows: int, columns: int, start: int = 0) -> Callable:
 def scaled_sum(count: int) -> Callable:
     """Return `add(x, a, y)`: the tuple x + a y for tuples of `count` components and a scalar a."""
     if is_array(count):
-        return written_out("add", "x, a, y", "x + a * y", _loops=True)  # of any type: also of complex numbers
+        return written_out("add", "x, a, y", "x + a * y")  # of any type: also of complex numbers
     return written_out("add", "x, a, y", tuple_of(f"x[{i}] + a * y[{i}]" for i in range(count)))
 
 

@@ -2,8 +2,8 @@
 
 The same key gives the same numbers in a single env, a vector env, a batch and on any number of threads, because a
 draw depends on its index only and never on earlier draws. Every expression works on scalars, on NumPy arrays and
-inside numba. In order: the normal distribution, exponential, sine and cosine as vector code; the streams and their
-draws; keys of episodes; the generators of foreign code.
+in machine code. In order: the normal distribution, exponential, sine and cosine as vector code; the streams and
+their draws; keys of episodes; the generators of foreign code.
 
 Source: Salmon, Moraes, Dror, Shaw (2011), "Parallel random numbers: as easy as 1, 2, 3"; normals by Box and Muller
 (1958).
@@ -25,7 +25,6 @@ import numpy as np
 from thruster_env.core.checks import options as checked_options
 from thruster_env.core.checks import seed as checked_seed
 from thruster_env.core.checks import short_repr
-from thruster_env.core.compiled import inlined, overloaded, when_compiling
 
 HALVINGS = 60  # of an interval of 80 standard deviations, to rounding
 
@@ -33,13 +32,11 @@ HALVINGS = 60  # of an interval of 80 standard deviations, to rounding
 # The normal distribution, for compiled code.
 
 
-@inlined
 def below(z):
     """The normal distribution at z."""
     return 0.5 * math.erfc(-z / 2.0**0.5)
 
 
-@inlined
 def quantile(share):
     """The z below which there is a share in (0, 1) of the normal distribution."""
     low, high = -40.0, 40.0
@@ -61,7 +58,6 @@ NARROW = 1e-4  # standard deviations, up to which the part is taken as uniform
 TERMS = 60  # of the fraction
 
 
-@inlined
 def mills_ratio(a):
     """(1 - Phi(a))/phi(a) of the standard normal distribution: the probability beyond a over the density at a."""
     if a < FAR:
@@ -73,7 +69,6 @@ def mills_ratio(a):
     return 1.0 / rest
 
 
-@inlined
 def truncated_normal(low, high):
     """Mean and variance of a standard normal variable truncated to two bounds, one of which may be infinite.
 
@@ -107,7 +102,6 @@ ROUNDER = 1.5 * 2.0**52  # adding it leaves a whole number in the last bits
 ROUNDER_BITS = int(np.float64(ROUNDER).view(np.int64))
 
 
-@inlined
 def parts(x):
     """The factor e^r and the power k of e^x = e^r 2^k, |r| <= log(2)/2, by its series, to 1e-16."""
     k = np.floor(x * PER_LN_2 + 0.5)
@@ -129,7 +123,6 @@ def parts(x):
     return series, k
 
 
-@inlined
 def exponential(x):
     """e^x for x <= 700, as e^-46 below -46 and for NaN."""
     series, k = parts(x if x > LOWEST else LOWEST)
@@ -142,7 +135,6 @@ def exponential(x):
 _PI, _PER_TURN = math.pi, 0.5 / math.pi
 
 
-@inlined
 def cosine_and_sine_of_turns(turns):
     """cos(2 pi turns) and sin(2 pi turns) for |turns| <= 1/2: Taylor series at half the angle, doubled."""
     a = _PI * turns
@@ -170,7 +162,6 @@ def cosine_and_sine_of_turns(turns):
     return 1.0 - 2.0 * s * s, 2.0 * s * c
 
 
-@overloaded
 def nearest_whole(x):
     """The whole number nearest to x, of a float, an array or a tensor; one instruction in compiled code.
 
@@ -180,16 +171,6 @@ def nearest_whole(x):
     return above - above % 1.0
 
 
-@when_compiling
-def _teach_nearest_whole():
-    from numba.extending import overload
-
-    @overload(nearest_whole, inline="always")
-    def _of_float(x):
-        return lambda x: np.floor(x + 0.5)
-
-
-@inlined
 def cosine_and_sine(angle):
     """The cosine and sine of any angle [rad], of a float, an array or a tensor.
 
@@ -232,7 +213,6 @@ SQRT_HALF_BITS = int(np.float64(np.sqrt(0.5)).view(np.int64))
 _LN_2, _TWO_TO_MINUS_32 = float(np.log(2.0)), 2.0**-32
 
 
-@inlined
 def _round(counter, key):
     # Of each word the low 32 bits count. What lies above them is taken off where it would matter, before a
     # product: there it costs nothing, for vector code multiplies the lower halves of 64 bits anyway.
@@ -242,12 +222,10 @@ def _round(counter, key):
     return (product_1 >> _SHIFT) ^ c1 ^ key[0], product_1, (product_0 >> _SHIFT) ^ c3 ^ key[1], product_0
 
 
-@inlined
 def _bump(key):
     return (key[0] + _WEYL_0) & _LOW, (key[1] + _WEYL_1) & _LOW
 
 
-@inlined
 def philox(counter, key):
     """Four 32-bit words, held in uint64, from a counter of four words and a key of two.
 
@@ -266,7 +244,6 @@ def philox(counter, key):
     return w0 & _LOW, w1 & _LOW, w2 & _LOW, w3 & _LOW
 
 
-@inlined
 def uniform_block(block, step, stream, key_0, key_1):
     """Four uniform numbers in (0, 1), multiples of 2^-32 plus 2^-33, for one block of one step."""
     counter = (np.uint64(block), np.uint64(step), np.uint64(stream), _NONE)
@@ -279,7 +256,6 @@ def uniform_block(block, step, stream, key_0, key_1):
     )
 
 
-@inlined
 def logarithm_of_parts(exponent, m):
     """The logarithm of 2^exponent m, m in [sqrt(1/2), sqrt(2)): log m = 2 artanh((m - 1)/(m + 1)), a series."""
     s = (m - 1.0) / (m + 1.0)
@@ -298,7 +274,6 @@ def logarithm_of_parts(exponent, m):
     return exponent * _LN_2 + 2.0 * s * series
 
 
-@inlined
 def exponent_and_mantissa(x):
     """The exponent e and the mantissa m of x = 2^e m, m in [sqrt(1/2), sqrt(2)), of positive, normal float64."""
     bits = np.float64(x).view(np.int64)
@@ -306,14 +281,12 @@ def exponent_and_mantissa(x):
     return np.float64(exponent), np.int64(bits - (exponent << 52)).view(np.float64)
 
 
-@inlined
 def logarithm(x):
     """Natural logarithm of a positive, normal float64 to 1e-15, without a branch or a library call."""
     exponent, m = exponent_and_mantissa(x)
     return logarithm_of_parts(exponent, m)
 
 
-@inlined
 def polar(log_0, u_1, log_2, u_3):
     """Four standard normals of uniform numbers, of which two are given by their logarithms (Box, Muller)."""
     radius_0, radius_1 = (-2.0 * log_0) ** 0.5, (-2.0 * log_2) ** 0.5
@@ -322,14 +295,12 @@ def polar(log_0, u_1, log_2, u_3):
     return radius_0 * cosine_0, radius_0 * sine_0, radius_1 * cosine_1, radius_1 * sine_1
 
 
-@inlined
 def normal_block(block, step, stream, key_0, key_1):
     """Four independent standard normals (|value| < 6.8) for one block of one step of one stream."""
     u0, u1, u2, u3 = uniform_block(block, step, stream, key_0, key_1)
     return polar(logarithm(u0), u1, logarithm(u2), u3)
 
 
-@overloaded
 def fill_normals(out, count, step, stream, key_0, key_1):
     """Fill a vector with the normals of channels 0, 1, 2, ..., at least `count` of them.
 
@@ -359,17 +330,6 @@ def fill_in_loop(out, count, step, stream, key_0, key_1):
         out[4 * block + 1] = z1
         out[4 * block + 2] = z2
         out[4 * block + 3] = z3
-
-
-@when_compiling
-def _teach_fill_normals():
-    from numba.extending import overload
-
-    options: Any = {"forceinline": True, "no_cfunc_wrapper": True}  # those of `inlined`
-
-    @overload(fill_normals, jit_options=options, strict=False)
-    def _of_arrays(out, count, step, stream, key_0, key_1):
-        return overloaded(fill_in_loop)
 
 
 def draw_key(generator: np.random.Generator) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from thruster_env.core.checks import covariance_root
 from thruster_env.core.checks import options as checked_options
-from thruster_env.core.compiled import function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.results import as_array
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.effects.effects import Moment, unrolled
@@ -296,10 +296,8 @@ def compiled_page(page: Page, shape: Any, single: bool, interpreting: bool) -> I
     width, reported = 1 if single else WIDTH if interpreting else LANES, programs.reported
     start, *steps = (callable_of(part, width, OF_COPIES) for part in (programs.begin, *programs.step))
     move = _repeated(steps, programs.repetitions) if programs.repetitions else steps[0]
-    fingerprint = function_fingerprint(start, *steps, within=__name__)
 
     def step(first, last, memory, numbers, lines, begin, out):
-        fingerprint  # noqa: B018 - part of the cache's key
         for b in range(first, last):
             block = memory[b]
             for j in range(0, block.shape[1], width):
@@ -319,7 +317,6 @@ def compiled_page(page: Page, shape: Any, single: bool, interpreting: bool) -> I
     return InParts(step, shapes, single=single, few=FEW_BLOCKS)
 
 
-@inlined
 def move_lines(block, lines):
     """Put what goes into each line behind the others, and take out what comes out in the next step."""
     for k in range(lines.shape[0]):
@@ -333,7 +330,6 @@ def move_lines(block, lines):
 def _repeated(steps: list[Callable], repetitions: int) -> Callable:
     before, body, after = steps
 
-    @inlined
     def move(copies, numbers):
         before(copies, numbers)
         for _ in range(repetitions):
@@ -525,14 +521,14 @@ def functions_of(
     Raises:
         ValueError: if a channel depends on the input.
     """
-    reads: dict[str, Any] = {f"read_{i}": inlined(channel.read) for i, channel in enumerate(channels)}
+    reads: dict[str, Any] = {f"read_{i}": channel.read for i, channel in enumerate(channels)}
     slopes: dict[str, Any] = {}
     for i, channel in enumerate(channels):
         if channel.slopes is None:
             raise ValueError(
                 f"a channel of a model must not depend on the input, but {channel.quantity.name} does"
             )
-        slopes[f"slopes_{i}"] = inlined(channel.slopes)
+        slopes[f"slopes_{i}"] = channel.slopes
     readings = tuple_of(f"{name}(x, y, (), c)" for name in reads)
     rows = tuple_of(f"{name}(x, dy, c)" for name in slopes)
     observe = written_out("observe", "x, c", "y = outputs(x, c)", readings, outputs=outputs, **reads)

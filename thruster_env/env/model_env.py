@@ -12,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 
 from thruster_env.core.checks import one_of, positive, short_repr
-from thruster_env.core.compiled import function_fingerprint
 from thruster_env.core.sources import is_array, tuple_of, written_out
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS
 from thruster_env.effects.effects import (
@@ -109,8 +108,7 @@ def _called(function: Callable, sizes: tuple[int, ...], form: type | int, count:
         lines.append(f"c = {tuple_of(values)}" if isinstance(form, int) else f"c = Constants({', '.join(values)})")
     lines.append(f"y = function({', '.join(f'v{i}' for i in range(len(sizes) - 1))}, c)")
     lines += [f"found[{k}] = y[{k}]" for k in range(count)]
-    name = f"call_{function_fingerprint(function, within=__name__)[:24]}"  # numba keeps one function of equal code
-    return written_out(name, "given, found, numbers", *lines, "None", function=function, Constants=form)
+    return written_out("call", "given, found, numbers", *lines, "None", function=function, Constants=form)
 
 
 @lru_cache(maxsize=64)

@@ -39,6 +39,10 @@ class Untranslated(TypeError):
     """A function has what cannot be translated."""
 
 
+class OnlyPython(Untranslated):
+    """A user's function runs as Python, for the reason that this says."""
+
+
 def is_known(value: Any) -> bool:
     """Whether a value is an object of Python, and not computed by the instructions."""
     return not isinstance(value, ir.Value | tuple) or isinstance(value, tuple) and all(map(is_known, value))

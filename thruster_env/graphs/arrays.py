@@ -87,8 +87,8 @@ class Memory:
         """Lie on the heap from the beginning of a function to its end."""
         builder, function = arrays._builder, arrays._builder.function
         entry, size = self.pointer.parent, ir.Constant(LONG, 8 * (self.count or 0))
-        made = ir.instructions.CallInstr(entry, arrays.of_c("malloc"), [size], "")
-        self._become(function, made)
+        allocation = ir.instructions.CallInstr(entry, arrays.of_c("malloc"), [size], "")
+        self._become(function, allocation)
         with builder.goto_entry_block():
             self._slot = builder.alloca(POINTER)
             builder.store(self.pointer, self._slot)
@@ -316,8 +316,8 @@ class Arrays:
     def _is_apart(self, out: Array, values: Array) -> bool:
         """Whether two arrays have no memory in common, for sure, or are one."""
         first, second = (self._leads[array.pointer] for array in (out, values))
-        made = [all(isinstance(lead, Memory) for lead in leads) and bool(leads) for leads in (first, second)]
-        return out.pointer is values.pointer and out.steps == values.steps or any(made) and not first & second
+        new = [all(isinstance(lead, Memory) for lead in leads) and bool(leads) for leads in (first, second)]
+        return out.pointer is values.pointer and out.steps == values.steps or any(new) and not first & second
 
     def _by_entries(self, function: Callable, *values: Any) -> Array:
         """The array of a function's values for the entries of arrays, and for numbers."""
@@ -353,11 +353,11 @@ class Arrays:
         """NumPy's `eigh`, by the same function of LAPACK; its matrices are columns after columns."""
         n, builder, of_two = a.shape[0], self._builder, self.numbers.of_two
         vectors, values = self._copied(a), self._new_array(n)
-        whole = of_two("Add", of_two("Mult", 5, n), 3)
+        count = of_two("Add", of_two("Mult", 5, n), 3)
         length = of_two("Add", of_two("Mult", 2, of_two("Mult", n, n)), of_two("Add", of_two("Mult", 6, n), 1))
-        work, whole_work = self._new_array(length), self._new_array(whole)
+        work, whole_work = self._new_array(length), self._new_array(count)
         sizes = [self._slot(INT) for _ in range(4)]
-        for slot, size in zip(sizes, (n, length, whole, 0), strict=True):
+        for slot, size in zip(sizes, (n, length, count, 0), strict=True):
             builder.store(builder.trunc(as_value(size), INT), slot)
         letters = [self._slot(ir.IntType(8)) for _ in "VL"]
         for slot, letter in zip(letters, "VL", strict=True):

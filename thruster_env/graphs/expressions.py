@@ -13,13 +13,21 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 
 from thruster_env.core.compiled import fastmath_of, instead_of
-from thruster_env.core.optimising import WIDE
 from thruster_env.core.results import fill
 from thruster_env.core.streams import fill_normals
-from thruster_env.graphs.arithmetic import BOOL, FUNCTIONS, OF_ENTRIES, Untranslated, as_value, is_known
+from thruster_env.graphs.arithmetic import (
+    BOOL,
+    FUNCTIONS,
+    OF_ENTRIES,
+    OnlyPython,
+    Untranslated,
+    as_value,
+    is_known,
+)
 from thruster_env.graphs.arrays import POINTER, Arrays, Memory
 from thruster_env.graphs.forms import Array, Known, common_form, form_of, value_of
 from thruster_env.graphs.instructions import DOUBLE, LONG, LoopWriter, Writer
+from thruster_env.graphs.machine_code import WIDE
 from thruster_env.graphs.programs import CALLED, OF_MEMBERS, READ_NUMBERS, cut
 
 FILL_NORMALS = "fill_normals"
@@ -32,9 +40,30 @@ class Functions(dict):
     Attributes:
         programs_apart: whether programs are never inlined: within a loop they would take other last digits.
         draws: whether normals are drawn, by machine code that all modules share.
+        natives: functions that are machine code already, by their names.
+        innermost: the function that is translated.
     """
 
     programs_apart, draws = True, False
+    innermost: Any = None
+
+    def __init__(self):
+        super().__init__()
+        self.natives: dict[str, Native] = {}
+
+
+class Native:
+    """A function void f(double *given, double *results) that is machine code already.
+
+    Attributes:
+        address: of it.
+        shape: of the results.
+        as_array: whether these are an array, and no tuple.
+    """
+
+    def __init__(self, address: int, shape: tuple[int, ...], as_array: bool, holder: Any):
+        """See the class; `holder` lives as long, and the code with it."""
+        self.address, self.shape, self.as_array, self._holder = address, shape, as_array, holder
 
 
 class Translated(NamedTuple):
@@ -83,8 +112,10 @@ class Expressions(Arrays):
             return self._evaluate(*function.evaluation, *arguments)
         if (instead := instead_of(function)) is not None:
             if instead.function is None:
-                raise Untranslated(f"a call of {function!r}")
+                raise OnlyPython(instead.reason)
             return self.call(instead.function, arguments)
+        if hasattr(function, "native"):
+            return self._call_native(function, *arguments)
         if hasattr(function, "_fields"):  # a kind of tuple
             return function(*arguments)
         if not isinstance(function, types.FunctionType):
@@ -129,9 +160,11 @@ class Expressions(Arrays):
         builder = ir.IRBuilder(target.append_basic_block("entry"))
         translator = type(self)(builder, self._functions, frozenset(fastmath_of(function)))
         for k, argument in enumerate(target.args):
-            translator._leads[argument] = {("argument", k)}
-        numbers = iter(target.args)
+            if argument.type == POINTER:
+                translator._leads[argument] = {("argument", k)}
+        numbers, caller = iter(target.args), self._functions.innermost
         form, memory, leads = translator.add_body(function, [value_of(form, numbers) for form in forms])
+        self._functions.innermost = caller
         return Translated(target, form, translator.has_loops, memory, leads)
 
     def _value(self, node: ast.expr | None) -> Any:
@@ -185,7 +218,15 @@ class Expressions(Arrays):
         raise Untranslated(f"the attribute {node.attr}")
 
     def _tuple(self, node: ast.Tuple | ast.List) -> tuple:
-        return tuple(self._value(part) for part in node.elts)
+        return tuple(self._values(node.elts))
+
+    def _values(self, nodes: Sequence[ast.expr]) -> list:
+        """The values of expressions, those of a tuple with a star one after the other."""
+        values: list = []
+        for node in nodes:
+            value = self._value(node.value if isinstance(node, ast.Starred) else node)
+            values += self._entries_of(value) if isinstance(node, ast.Starred) else [value]
+        return values
 
     _list = _tuple  # what reads it cannot change it
 
@@ -193,8 +234,8 @@ class Expressions(Arrays):
         if node.keywords:
             raise Untranslated("arguments by name")
         if isinstance(node.func, ast.Attribute) and not is_known(value := self._value(node.func.value)):
-            return self._method(value, node.func.attr, [self._value(argument) for argument in node.args])
-        return self.call(self._value(node.func), [self._value(argument) for argument in node.args])
+            return self._method(value, node.func.attr, self._values(node.args))
+        return self.call(self._value(node.func), self._values(node.args))
 
     def _method(self, value: Any, name: str, arguments: list) -> Any:
         if name == "copy" and isinstance(value, Array) and not arguments:
@@ -358,9 +399,9 @@ class Expressions(Arrays):
 
     def call_by_name(self, name: str, numbers: Sequence, count: int, table: ir.Value | None) -> list[ir.Value]:
         """The `count` results of a function of CALLED for some numbers, and perhaps the array `numbers`."""
-        given, results = self._copied((*numbers,)), self._array_on_stack(count)
+        arguments, results = self._copied((*numbers,)), self._array_on_stack(count)
         tables = [self.array_at(table, (MOST_NUMBERS,))] if name in READ_NUMBERS else []
-        self.call(CALLED[name], [given, results, *tables])
+        self.call(CALLED[name], [arguments, results, *tables])
         return [self._part(results, k) for k in range(count)]
 
     def _evaluate(self, work: Callable, shape: Sequence, sizes: Sequence, vectors: tuple, out: Any = None) -> Any:
@@ -377,6 +418,28 @@ class Expressions(Arrays):
         numbers = [self._part(results, k) for k in range(count)]
         rows = zip(*[iter(numbers)] * shape[-1], strict=True)
         return tuple(numbers) if len(shape) == 1 else tuple(rows)
+
+    def _call_native(self, function: Any, *vectors: Any) -> Any:
+        """The results of a function that is machine code already, in a tuple or an array of its shape."""
+        native, names = function.native, self._functions.natives
+        name = next((name for name, other in names.items() if other is native), f"native_{len(names)}")
+        names[name] = native
+        numbers = [entry for vector in vectors for entry in self._entries_of(vector)]
+        arguments, results = self._copied((*map(self.numbers.as_float, numbers),)), self._new_array(native.shape)
+        kind = ir.FunctionType(ir.VoidType(), [POINTER, POINTER])
+        module = self._builder.module
+        called = module.globals.get(name) or ir.Function(module, kind, name)
+        self._builder.call(called, [arguments.pointer, results.pointer])
+        if native.as_array:
+            return results
+        rows = [self._entries_of(self._part(results, k)) for k in range(native.shape[0])]
+        return tuple(rows) if len(native.shape) == 2 else tuple(row for (row,) in rows)
+
+    def _entries_of(self, value: Any) -> tuple:
+        """The numbers of a vector whose length is known, or of a number."""
+        if isinstance(value, Array):
+            return tuple(self._part(value, k) for k in range(value.shape[0]))
+        return value if isinstance(value, tuple) else (value,)
 
     def _fill_normals(self, out: Array, count: Any, *counter_and_key: Any) -> None:
         if out.steps != (1,):

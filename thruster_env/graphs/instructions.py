@@ -1,8 +1,6 @@
 """Programs as instructions of LLVM, each for as many runs as lie side by side.
 
-numba takes a millisecond to type a line of text, and a program has hundreds. But numba only needs to know that a
-program is called: its instructions go to LLVM directly. They work on vectors with one number of each run, so no
-compiler has to find out whether a loop can be vectorised.
+They work on vectors with one number of each run, so no compiler has to find out whether a loop can be vectorised.
 
 Numbers that are the same for all members are evaluated once, before the loop that needs them. Each lane has its
 own sum, and the loop's end adds the lanes. The table has columns for full vectors: those behind the last member
@@ -22,17 +20,15 @@ from thruster_env.core.streams import ROUNDER, ROUNDER_BITS, SQRT_HALF_BITS
 from thruster_env.graphs.graphs import COMPARISONS, Number
 from thruster_env.graphs.programs import (
     BY_MEMBERS,
-    OF_MEMBERS,
     SIDE_BY_SIDE,
     Body,
     Cut,
     Place,
     Program,
-    cut,
 )
 
 FLAGS = tuple(sorted(FASTMATH))
-EXACT = ("nsz",)  # of what is rounded as Python does: to operations without flags numba adds all
+EXACT = ("nsz",)  # of what is rounded as Python does
 OF_TWO = {"+": "fadd", "-": "fsub", "*": "fmul", "/": "fdiv"}
 OF_LLVM = {"sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos", "abs": "fabs", "pow": "pow"} | {
     name: name for name in ("floor", "ceil", "rint", "copysign")
@@ -41,30 +37,6 @@ IN_LIBRARY = {"arctan": "atan", "arctan2": "atan2", "arcsinh": "asinh", "arccosh
 """Other names than NumPy's in C's library."""
 DOUBLE, LONG = ir.DoubleType(), ir.IntType(64)
 MOST_NUMBERS = 2**40  # the length of an array of which only the pointer is known
-
-
-def teach(work: Callable, program: Program, width: int, names: Sequence[str]) -> None:
-    """Have numba put the instructions of a program in the place of a call of `work`."""
-    from numba.core import types
-    from numba.extending import lower_builtin, type_callable
-
-    @type_callable(work)
-    def of_arrays(context):
-        return eval(f"lambda {', '.join(names)}: none", {"none": types.none})
-
-    @lower_builtin(work, *[types.Array] * len(names))
-    def write(context, builder, signature, arguments):
-        arrays = [
-            context.make_array(kind)(context, builder, a)
-            for kind, a in zip(signature.args, arguments, strict=True)
-        ]
-        data = dict(zip(names, (array.data for array in arrays), strict=True))
-        writer = Writer(context, builder, data, width)
-        if "memory" in data:
-            stride = builder.extract_value(arrays[names.index("memory")].strides, 0)
-            writer.stride = builder.sdiv(stride, ir.Constant(LONG, 8))
-        writer.write(program)
-        return context.get_dummy_value()
 
 
 class Writer:
@@ -271,29 +243,6 @@ def _declared(module: ir.Module, name: str, kind: ir.Type, count: int) -> ir.Fun
 # Loops over the members of an ensemble as instructions of LLVM, for eight members at a time.
 
 INT = ir.IntType(32)
-
-
-def teach_loops(work: Callable, program: Program, width: int, scratch: int) -> None:
-    """Have numba put the instructions of a program with loops in the place of a call of `work`."""
-    from numba.core import types
-    from numba.extending import lower_builtin, type_callable
-
-    @type_callable(work)
-    def of_arrays(context):
-        return eval(f"lambda {', '.join(OF_MEMBERS)}: none", {"none": types.none})
-
-    @lower_builtin(work, *[types.Array] * 5, types.Integer)
-    def write(context, builder, signature, arguments):
-        *kinds, kind = signature.args
-        arrays = [
-            context.make_array(array_type)(context, builder, a)
-            for array_type, a in zip(kinds, arguments[:-1], strict=True)
-        ]
-        columns = builder.extract_value(arrays[OF_MEMBERS.index("table")].shape, 1)
-        size = context.cast(builder, arguments[-1], kind, types.int64)
-        data = dict(zip(OF_MEMBERS, (array.data for array in arrays), strict=False))
-        LoopWriter(context, builder, data, width, columns, size).write(cut(program, scratch))
-        return context.get_dummy_value()
 
 
 class LoopWriter:

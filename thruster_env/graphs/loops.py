@@ -8,7 +8,7 @@
 
 What a function has in its closure is known when it is translated, so sizes are constants. A function that it
 calls is translated once for all calls that differ in numbers alone. Whatever else it contains raises
-`Untranslated`; numba then compiles it. The same function runs as Python. Nothing checks indices: one that is not
+`Untranslated`. The same function runs as Python. Nothing checks indices: one that is not
 known must lie within the array, and counts from its beginning.
 """
 
@@ -19,24 +19,26 @@ import inspect
 import textwrap
 import threading
 import types
+import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 
-from thruster_env.core.compiled import FASTMATH, CompiledOrPython, is_interpreting
-from thruster_env.core.optimising import WIDE
+from thruster_env.core.compiled import FASTMATH, IN_PYTHON, is_interpreting
+from thruster_env.core.modules import error_line
 from thruster_env.core.streams import fill_in_loop
 from thruster_env.core.user_functions import OURS
-from thruster_env.graphs.arithmetic import Untranslated, is_known
+from thruster_env.graphs.arithmetic import OnlyPython, Untranslated, is_known
 from thruster_env.graphs.arrays import LAPACK, POINTER, Memory, of_lapack
 from thruster_env.graphs.expressions import FILL_NORMALS, Expressions, Functions
 from thruster_env.graphs.forms import Array, changing_form, common_form, is_tuple
 from thruster_env.graphs.instructions import DOUBLE, LONG
-from thruster_env.graphs.machine_code import Code, NotLinked, add_builtin, code_folder, code_of, function_of
+from thruster_env.graphs.machine_code import WIDE, Code, NotLinked, add_builtin, code_folder, code_of, function_of
 
 
 class Entry(NamedTuple):
@@ -50,7 +52,7 @@ class Entry(NamedTuple):
 def machine_code_of(
     function: Callable, shapes: Sequence, *, as_builtin: bool = False, unrolled: bool = True
 ) -> Code | None:
-    """Machine code of a function, or None if it cannot be translated or linked; see `add_function`.
+    """Machine code of a function, or None if there is none; see `add_function` and `common_code_of`.
 
     Called from Python as a builtin function it has the last argument of the function, of an array the address; the
     words have the others.
@@ -60,8 +62,10 @@ def machine_code_of(
 
 
 def common_code_of(*entries: Entry, unrolled: bool = True) -> Code | None:
-    """Machine code of functions that share those they call, or None; at most one builtin function and another.
+    """Machine code of functions that share those they call; at most one builtin function and another.
 
+    If there is none, it returns None after a warning: a user's function can neither be traced, translated, nor
+    compiled by numba; or this system's libraries lack a function; or the package has a fault.
     If there are two, programs may become part of the functions that both call.
     """
     module, names, functions = ir.Module(), list[str](), Functions()
@@ -74,14 +78,22 @@ def common_code_of(*entries: Entry, unrolled: bool = True) -> Code | None:
                 target.linkage = "internal"
                 add_builtin(module, "call", target, word_count - 1 - len(entry.shapes[-1] or ()))
             names.append("call" if entry.as_builtin else "run")
-    except TypeError:
-        return None
-    try:
         libraries = [_library_of_normals()] if functions.draws else []
-        symbols = {name: of_lapack(name) for name in LAPACK if name in module.globals}
+        symbols = functions.natives | {name: of_lapack(name) for name in LAPACK if name in module.globals}
         return code_of(module, *names, unrolled=unrolled, libraries=libraries, symbols=symbols)
-    except NotLinked:  # numba brings the function that is lacking
-        return None
+    except OnlyPython as error:
+        reason = str(error)
+    except (TypeError, NameError, AttributeError) as error:
+        fault = "this is a fault of the package and not of the model: please report it"
+        code = functions.innermost.__code__
+        where = (
+            code.co_filename.strip("<>") if code.co_filename.startswith("<") else functions.innermost.__module__
+        )
+        reason = f"{error_line(error)} in {code.co_name} of {where}; {fault}"
+    except (NotLinked, OSError, MemoryError) as error:
+        reason = f"machine code of it could not be made: {error}"
+    warnings.warn(f"{IN_PYTHON}: {reason}", stacklevel=3)
+    return None
 
 
 @cache
@@ -111,7 +123,8 @@ def add_function(
         name: of the function.
         function: of Python.
         shapes: of its arguments: of an array its lengths, None for those that a call tells; None for a whole
-            number; a list for a tuple of such. The words are those of `machine_code.words_of`.
+            number, `float` for a float; a list for a tuple of such, or a named tuple of such. The words are those
+            of `machine_code.words_of`.
         functions: those that the module has already, for functions that are added later.
 
     Raises:
@@ -129,8 +142,12 @@ def add_function(
     def argument_of(shape: Any) -> Any:
         if shape is None:
             return next_word()
-        if isinstance(shape, list):
+        if shape is float:
+            return builder.bitcast(next_word(), DOUBLE)
+        if isinstance(shape, list | Parts):
             return tuple(map(argument_of, shape))
+        if hasattr(shape, "_fields"):
+            return type(shape)(*map(argument_of, shape))
         pointer, lengths = builder.inttoptr(next_word(), POINTER), [next_word() for _ in shape]
         lengths = [b if a is None else a for a, b in zip(shape, lengths, strict=True)]
         return translator.array_at(pointer, lengths)
@@ -162,37 +179,61 @@ def refusal_of(function: Callable, arguments: Sequence) -> str:
 
 
 class Loops:
-    """A function of arrays and whole numbers that is translated at its first call, else compiled, else in Python.
+    """A function of arrays and numbers that is translated at its first call, or runs as Python.
 
-    Its arguments are arrays of float64 in C order, whole numbers, and tuples of these.
+    Its arguments are arrays of float64 in C order, numbers, and tuples of these.
+
+    Attributes:
+        in_python: whether calls run as Python, as far as is known before the first.
     """
 
-    def __init__(self, function: Callable, shapes: Sequence, *, unrolled: bool = True):
-        """Take a function and the shapes of its arguments, see `add_function`."""
+    def __init__(self, function: Callable, shapes: Sequence | None = None, *, unrolled: bool = True):
+        """Take a function and the shapes of its arguments, see `add_function`, by default those of each call."""
         self._function, self._shapes, self._unrolled = function, shapes, unrolled
-        self._run: Any = CompiledOrPython(function) if is_interpreting() else None
+        self.in_python = is_interpreting()
+        self._runs: dict[tuple, Callable] = {}  # by shapes, if these are those of calls
         self._first = threading.Lock()
 
     def __call__(self, *arguments):
         """Call the function."""
-        if self._run is None:
+        if self.in_python:
+            return self._as_python(*arguments)
+        key = tuple(map(_shape_of, arguments)) if self._shapes is None else ()
+        if key not in self._runs:
             with self._first:
-                self._run = self._run or self._first_run()
-        return self._run(*arguments)
+                if key not in self._runs:
+                    self._runs[key] = self._compiled(key)
+        return self._runs[key](*arguments)
 
-    def _first_run(self) -> Callable:
-        code = machine_code_of(self._function, self._shapes, unrolled=self._unrolled)
-        return CompiledOrPython(self._function) if code is None else function_of(code)
+    def _compiled(self, shapes: tuple) -> Callable:
+        code = machine_code_of(self._function, self._shapes or shapes, unrolled=self._unrolled)
+        self.in_python = code is None
+        return self._as_python if code is None else function_of(code, floats=self._shapes is None)
 
-    @property
-    def in_python(self) -> bool:
-        """Whether calls run as Python, as far as is known before the first."""
-        return getattr(self._run, "in_python", False)
+    def _as_python(self, *arguments):
+        with np.errstate(all="ignore"):  # machine code does not warn of overflow either
+            return self._function(*arguments)
 
     @property
     def folder(self) -> Path | None:
         """Where its machine code is kept; None where none is."""
         return None if self.in_python else code_folder()
+
+
+class Parts(tuple):
+    """The shapes of the parts of a tuple, as a list of them; it has a hash."""
+
+    __slots__ = ()
+
+
+def _shape_of(argument: Any) -> Any:
+    """The kind of an argument, of an array without its lengths, see `add_function`."""
+    if isinstance(argument, np.ndarray):
+        return (None,) * argument.ndim
+    if isinstance(argument, tuple):
+        parts = tuple(map(_shape_of, argument))
+        return type(argument)(*parts) if hasattr(argument, "_fields") else Parts(parts)
+    return float if isinstance(argument, float) else None
 
 
 class _Translator(Expressions):
@@ -201,12 +242,14 @@ class _Translator(Expressions):
     def __init__(self, builder: ir.IRBuilder, functions: Functions, flags: frozenset[str]):
         super().__init__(builder, functions, flags)
         self._changing: set[str] = set()  # names of what changes
+        self._written: set[str] = set()  # names of arrays of which parts are assigned to
         self._of_names: dict[str, tuple[Array, Memory]] = {}  # of arrays that change
         self._returns: list[tuple[ir.Block, Any]] = []
 
     def add_body(self, function: types.FunctionType, arguments: Sequence) -> tuple[Any, list[int], list[set]]:
         """Add the body of a function for its arguments; return form, memory and leads of `Translated`."""
-        node, self._function = _definition(function.__code__), function
+        self._function = self._functions.innermost = function
+        node = _definition(function.__code__)
         self.wraps = (function.__module__ or "").partition(".")[0] not in OURS
         if len(arguments) != len(node.args.args):
             raise Untranslated(f"{function.__name__} with arguments by default, or too many")
@@ -214,6 +257,9 @@ class _Translator(Expressions):
         counts = Counter(name for part in ast.walk(node) for name in _assigned(part))
         counts.update(name for name in self._names if name in counts)
         self._changing = {name for name, count in counts.items() if count > 1}
+        parts = (part for part in ast.walk(node) if isinstance(part, ast.Subscript))
+        stores = (part.value for part in parts if isinstance(part.ctx, ast.Store))
+        self._written = {part.id for part in stores if isinstance(part, ast.Name)}
         for name in self._changing & set(self._names):
             self._store(ast.Name(name, ast.Store()), self._names[name])
         entry, body = self._builder.block, self._builder.append_basic_block("body")
@@ -311,7 +357,12 @@ class _Translator(Expressions):
                 self._builder.store(self.numbers.as_float(value), entry.pointer, align=8)
         elif not isinstance(target, ast.Name):
             raise Untranslated("an assignment")
-        elif target.id in self._changing and isinstance(value, Array) and is_known(value.shape):
+        elif (
+            target.id in self._changing
+            and isinstance(value, Array)
+            and is_known(value.shape)
+            and not (target.id in self._written and not self._memory_of(value))
+        ):
             self._store_array(target.id, value)
         elif target.id in self._changing:
             if target.id not in self._slots:
@@ -320,7 +371,7 @@ class _Translator(Expressions):
                 self._slots[target.id] = form, [(self._slot(kind), kind, set()) for kind in kinds]
             form, slots = self._slots[target.id]
             for number, (slot, _, leads) in zip(self._numbers_of(form, value), slots, strict=True):
-                if self._ways_out and self._leads[number]:
+                if self._ways_out and any(isinstance(lead, Memory) for lead in self._leads[number]):
                     raise Untranslated("arrays of unknown size that change in a loop")
                 leads |= self._leads[number]
                 self._builder.store(number, slot)
@@ -369,6 +420,12 @@ class _Translator(Expressions):
         self._forget(statement.target)
 
     def _for_each(self, statement: ast.For, entries: Any) -> None:
+        if isinstance(entries, Array):
+            for at in self._loop(0, entries.shape[0]):
+                self._store(statement.target, self._part(entries, at))
+                self._statements(statement.body)
+            self._forget(statement.target)
+            return
         if type(entries) is not tuple:
             raise Untranslated("a loop that is over no range or tuple")
         after = self._builder.append_basic_block("after")

@@ -1,4 +1,4 @@
-"""Modules of LLVM as machine code in memory, without numba.
+"""Modules of LLVM as machine code in memory.
 
 A module is compiled for this processor once. Its object code is kept in a folder of the user's under a digest of
 its text, of LLVM's version and of the processor, so if a source changes, only programs that changed with it are
@@ -11,6 +11,7 @@ import ctypes
 import hashlib
 import itertools
 import os
+import struct
 import sys
 import threading
 from array import array
@@ -33,6 +34,7 @@ FOLDER = "thruster-env-code"  # within the folder of numba's cache or of the use
 # gives the same code; without LLVM's two schedulers (-disable-post-ra, -enable-misched=false) batches of 8 states
 # take 7 % longer, and compilation hardly less.
 PASSES, SELECTION = 1, 2
+WIDE = '"prefer-vector-width"="512"'  # of a function: else LLVM takes 256 bits on Intel's processors
 DIGEST = hashlib.sha256().digest_size
 LONG, POINTER = ir.IntType(64), ir.IntType(8).as_pointer()
 METH_O = 0x0008  # of Python's C interface: a function of one argument
@@ -50,7 +52,7 @@ if hasattr(os, "register_at_fork"):  # a fork waits, so that no child finds this
         before=_compiling.acquire, after_in_parent=_compiling.release, after_in_child=_compiling.release
     )
 _number = itertools.count()
-_loaded: WeakValueDictionary[str, Code] = WeakValueDictionary()
+_loaded: WeakValueDictionary[tuple, Code] = WeakValueDictionary()
 
 
 class NotLinked(RuntimeError):
@@ -61,11 +63,11 @@ class Code:
     """Machine code in memory, for as long as this object lives."""
 
     def __init__(
-        self, object_code: bytes, names: Iterable[str], libraries: Iterable[Code], symbols: Mapping[str, int]
+        self, object_code: bytes, names: Iterable[str], libraries: Iterable[Code], symbols: Mapping[str, Any]
     ):
         """Link object code; `names` are those of the functions to be called, which may call those of libraries.
 
-        `symbols` are the addresses of further functions.
+        `symbols` are the addresses of further functions, or objects that have one and live as long.
         """
         builder = llvm.JITLibraryBuilder().add_object_img(object_code).add_current_process()
         self.addresses: dict[str, int] = {}
@@ -73,8 +75,9 @@ class Code:
         for library in self._libraries:
             for name, address in library.addresses.items():
                 builder.import_symbol(name, address)
-        for name, address in symbols.items():
-            builder.import_symbol(name, address)
+        self._symbols = dict(symbols)
+        for name, symbol in symbols.items():
+            builder.import_symbol(name, getattr(symbol, "address", symbol))
         for name in names:
             builder.export_symbol(name)
         for symbol in OF_PYTHON:
@@ -92,7 +95,7 @@ def code_of(
     *names: str,
     unrolled: bool = True,
     libraries: Iterable[Code] = (),
-    symbols: Mapping[str, int] | None = None,
+    symbols: Mapping[str, Any] | None = None,
 ) -> Code:
     """Compile a module, or load its object code, unless it is in memory; `names` are the functions to be called.
 
@@ -104,10 +107,11 @@ def code_of(
     """
     text = str(module)
     digest = hashlib.sha256(f"{host()}\n{names} {unrolled}\n{text}".encode()).hexdigest()
+    key = digest, *sorted((name, id(symbol)) for name, symbol in (symbols or {}).items())
     with _compiling:
-        code = _loaded.get(digest)
+        code = _loaded.get(key)
         if code is None:
-            code = _loaded[digest] = Code(
+            code = _loaded[key] = Code(
                 _kept(digest) or _keep(digest, _compiled(text, unrolled)), names, libraries, symbols or {}
             )
     return code
@@ -225,15 +229,15 @@ class _MethodDefinition(ctypes.Structure):
     ]
 
 
-def function_of(code: Code) -> Callable[..., int]:
+def function_of(code: Code, *, floats: bool = False) -> Callable[..., int]:
     """Return `call(*arguments)` of a function i64 run(words), which releases the interpreter lock.
 
-    Its arguments are arrays of float64 in C order, and whole numbers.
+    Its arguments are arrays of float64 in C order, whole numbers, and perhaps floats.
     """
     run = runner_of(code)
 
     def call(*arguments) -> int:
-        words = array("q", words_of(arguments))  # which must live until the function ends
+        words = array("q", words_of(arguments, floats=floats))  # which must live until the function ends
         return run(words.buffer_info()[0])
 
     return call
@@ -259,8 +263,10 @@ def builtin_of(code: Code, *arguments, lengths: Sequence[int] = ()) -> Callable[
     return new(ctypes.addressof(definition), words.buffer_info()[0], (code, words, arguments, definition))
 
 
-def words_of(arguments: Iterable) -> list[int]:
+def words_of(arguments: Iterable, *, floats: bool = False) -> list[int]:
     """Whole numbers, and of each array its address and its lengths; tuples have those of their parts.
+
+    Floats are refused, or become their bits, for code that takes these.
 
     Raises TypeError for an array that is not of float64 in C order, and for another number.
     """
@@ -271,9 +277,11 @@ def words_of(arguments: Iterable) -> list[int]:
                 raise TypeError(f"arrays must be of float64 in C order, but got {argument.dtype}")
             words += address_of(argument), *argument.shape
         elif isinstance(argument, tuple):
-            words += words_of(argument)
+            words += words_of(argument, floats=floats)
         elif isinstance(argument, (int, np.integer)):
             words.append(int(argument))
+        elif floats and isinstance(argument, float):
+            words += struct.unpack("q", struct.pack("d", argument))
         else:
             raise TypeError(f"a number must be a whole one, but got {argument!r}")
     return words

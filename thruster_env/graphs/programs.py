@@ -43,7 +43,6 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from thruster_env.core.compiled import overloaded
 from thruster_env.core.streams import exponent_and_mantissa, uniform_block
 from thruster_env.graphs.folding import as_single
 from thruster_env.graphs.graphs import COMPARISONS, CONDITIONS, REDUCTIONS, Number, needed_by
@@ -170,8 +169,8 @@ def callable_of(program: Program, width: int, arrays: Sequence[str] = ARRAYS, sc
     exec(f"def work({arguments}):\n    run('{digest}', {width}, {arguments})\n", names)
     work = names["work"]
     work.program = program, width, arrays, scratch  # of which `loops` makes instructions
-    calls = [CALLED[number.arguments[0]] for number in program.works if number.operation == "call"]
-    return overloaded(work, lambda work: _teach(work, program, width, arrays, scratch), calls)
+    work.calls = [CALLED[number.arguments[0]] for number in program.works if number.operation == "call"]
+    return work
 
 
 class Text:
@@ -261,17 +260,6 @@ def _called(name: str, count: int, *arguments, **named):
     results = np.empty(count, dtype=np.result_type(*arguments))
     CALLED[name](np.array(arguments), results, *named.values())
     return results
-
-
-def _teach(work: Callable, program: Program, width: int, arrays: Sequence[str], scratch: int) -> None:
-    if arrays == OF_MEMBERS:
-        from thruster_env.graphs.instructions import teach_loops
-
-        teach_loops(work, program, width, scratch)
-    else:
-        from thruster_env.graphs.instructions import teach
-
-        teach(work, program, width, arrays)
 
 
 SUMS = 16  # of one loop: as many vectors, with their terms, fit into the registers

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.core.compiled import function_fingerprint, inlined
+from thruster_env.core.compiled import function_fingerprint
 from thruster_env.graphs.branches import on_every_side
 from thruster_env.graphs.graphs import Number, called, where
 from thruster_env.graphs.programs import CALLED, READ_NUMBERS
@@ -60,9 +60,9 @@ class Table:
 
         Its arguments are the table's place in `numbers` and the numbers given here.
         """
-        name = base = f"{work.__name__}_{function_fingerprint(work, within=__name__)[:24]}"
+        name = base = f"{work.__name__}_{function_fingerprint(work)[:24]}"
         versions = count_from(1)  # functions of equal code may hold different objects
-        while CALLED.setdefault(name, inlined(work)) is not work:
+        while CALLED.setdefault(name, work) is not work:
             name = f"{base}_{next(versions)}"
         READ_NUMBERS.add(name)
         return called(name, count, self.first, *map(self.first.graph.number, numbers))

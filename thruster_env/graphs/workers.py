@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 
-from thruster_env.core.compiled import CompiledOrPython, direct, is_interpreting
-from thruster_env.core.threads import ACTIVE, cores, spread, wait_policy
+from thruster_env.core.compiled import is_interpreting
+from thruster_env.core.threads import ACTIVE, cores, wait_policy
 from thruster_env.graphs.expressions import instruction
 from thruster_env.graphs.instructions import LONG
 from thruster_env.graphs.loops import machine_code_of
@@ -46,7 +46,7 @@ BEHIND = 2  # calls that wait for a helper, with which it gets no more
 class InParts:
     """Calls of work(first, last, *arguments, result) that cover 0 ... count, on all cores if these are many.
 
-    If `graphs.loops` cannot translate the work, numba compiles it; within `interpreted()` it runs as Python.
+    If it is no machine code, or within `interpreted()`, it runs as Python.
     """
 
     def __init__(self, work: Callable, shapes: Sequence, *, few: int = 2, single: bool = False):
@@ -67,19 +67,13 @@ class InParts:
             return None
         return machine_code_of(self._work, (None, None, *self._shapes), as_builtin=self._single, unrolled=False)
 
-    @cached_property
-    def _compiled(self) -> CompiledOrPython:
-        return CompiledOrPython(self._work)
-
     def on(self, count: int, arguments: tuple, lengths: Sequence[int]) -> Callable[[np.ndarray], Any]:
         """`call(result)` with an array of these lengths; the other arrays stay where they are."""
         code, before = self._code, (0, count, *arguments)
         if self._single:
             return lambda result: self.on_result(arguments, result)()
         if code is None:
-            if count < self._few or self.in_python:
-                return partial(self._compiled, *before)
-            return lambda result: spread(lambda a, b: self._compiled(a, b, *arguments, result), count)
+            return lambda result: self._as_python(*before, result)
         words, shared, alone = array("q", [*words_of(before), 0, *lengths]), count >= self._few, runner_of(code)
         at, of_result = words.buffer_info()[0], len(words) - 1 - len(lengths)
 
@@ -94,11 +88,15 @@ class InParts:
         return call
 
     def on_result(self, arguments: tuple, result: np.ndarray) -> Callable[[], Any]:
-        """`call()` of a single one with arrays that all stay where they are; numba has compiled it before."""
+        """`call()` of a single one with arrays that all stay where they are."""
         code, before = self._code, (0, 1, *arguments)
         if code is None:
-            return partial(direct(self._compiled, *before, result), *before, result)
+            return partial(self._as_python, *before, result)
         return partial(builtin_of(code, *before, lengths=result.shape), address_of(result))
+
+    def _as_python(self, *arguments):
+        with np.errstate(all="ignore"):
+            return self._work(*arguments)
 
 
 # The instructions with which several threads share a call.

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from thruster_env.core.checks import as_floats, finite, positive, short_repr
-from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import tuple_of, written_out
@@ -437,14 +436,14 @@ def of_one_step(model: StateSpaceModel) -> StateSpaceModel:
 def with_ratio(function: Callable, form: type, count: int, index: int, inputs: int) -> Callable:
     """`function(x, u, c)` with constant `index` multiplied by the last input, u[inputs]."""
     constants = (f"c[{i}] * u[{inputs}]" if i == index else f"c[{i}]" for i in range(count))
-    names: dict[str, Any] = {"function": inlined(function), "form": form}
+    names: dict[str, Any] = {"function": function, "form": form}
     return written_out("stepped", "x, u, c", f"function(x, u[:{inputs}], form{tuple_of(constants)})", **names)
 
 
 @makes_functions
 def without_ratio(function: Callable, inputs: int) -> Callable:
     """`function(x, u, c)` of the inputs before the last one."""
-    return written_out("seen", "x, u, c", f"function(x, u[:{inputs}], c)", function=inlined(function))
+    return written_out("seen", "x, u, c", f"function(x, u[:{inputs}], c)", function=function)
 
 
 def as_rows(log: Log) -> Log:

@@ -22,7 +22,6 @@ from thruster_env.core.checks import (
     short_repr,
     vector,
 )
-from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import jacobian, runge_kutta
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import tuple_of, written_out
@@ -286,7 +285,7 @@ def _check_constants(constants: Any) -> None:
 @makes_functions
 def _joint_observation(functions: tuple[Callable, ...]) -> Callable:
     """`observe(x, c)` of a function h_i(x, c) a channel; `observe(x, u, c)` if one of them takes the input."""
-    names: dict[str, Any] = {f"h_{i}": inlined(function) for i, function in enumerate(functions)}
+    names: dict[str, Any] = {f"h_{i}": function for i, function in enumerate(functions)}
     arguments = ["x, u, c" if takes_input(function) else "x, c" for function in functions]
     calls = (f"{name}({of_channel})" for name, of_channel in zip(names, arguments, strict=True))
     return written_out("observe", max(arguments, key=len), tuple_of(calls), **names)

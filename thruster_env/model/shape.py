@@ -11,7 +11,6 @@ import numpy as np
 from thruster_env.core import matrices
 from thruster_env.core.angles import with_wrapped_angles
 from thruster_env.core.checks import covariance_root
-from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import jacobian
 from thruster_env.core.equal_functions import first_equal
 from thruster_env.core.sources import tuple_of, written_out
@@ -105,7 +104,7 @@ def for_any_input(function: Callable, shape: Shape, arguments: str = "x") -> Cal
     if shape.feeds:
         return function
     lines = f"function({arguments}, c)"
-    return written_out("seen", f"{arguments}, u, c", lines, function=inlined(function))
+    return written_out("seen", f"{arguments}, u, c", lines, function=function)
 
 
 # Places of a model's numbers in the float64 row that compiled code reads.

@@ -9,12 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import as_floats
-from thruster_env.core.compiled import (
-    function_fingerprint,
-    inlined,
-    instead_of,
-    is_interpreting,
-)
+from thruster_env.core.compiled import instead_of, is_interpreting
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.core.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
 from thruster_env.model.shape import Functions, Shape, constants_reader, for_any_input, number_offsets, padded
@@ -38,7 +33,6 @@ class Truth(NamedTuple):
     measurements: np.ndarray
 
 
-@inlined
 def add_correlated(out, numbers, root, count, draws):
     """Out += L draws, the lower triangular L (count, count) lying by rows at numbers[root]."""
     for i in range(count):
@@ -51,7 +45,6 @@ def noise_step(n: int, m: int):
     """Function disturb(x, draws, step, key, numbers), which adds a step's process noise to an array x (n,)."""
     q_root = number_offsets(n, m).q_root
 
-    @inlined
     def disturb(x, draws, step, key_0, key_1, numbers):
         fill_normals(draws, n, step, PROCESS, key_0, key_1)
         add_correlated(x, numbers, q_root, n, draws)
@@ -73,21 +66,18 @@ def truth_steps(functions: Functions, shape: Shape):
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
     look = for_any_input(observe, shape)
 
-    @inlined
     def begin(x, draws, key_0, key_1, numbers):
         fill_normals(draws, n, 0, INITIAL, key_0, key_1)
         for i in range(n):
             x[i] = numbers[prior_mean + i]
         add_correlated(x, numbers, prior_root, n, draws)
 
-    @inlined
     def advance(x, u, draws, step, key_0, key_1, numbers):
         v, c = control(u), constants(numbers)
         for _ in range(int(numbers[substeps])):
             store_state(x, transition(state(x), v, c))
         disturb(x, draws, step, key_0, key_1, numbers)
 
-    @inlined
     def measure(z, x, u, draws, step, key_0, key_1, numbers):
         store_measurement(z, look(state(x), control(u), constants(numbers)))
         fill_normals(draws, m, step, MEASUREMENT, key_0, key_1)
@@ -105,11 +95,9 @@ def truth_steps_of(model: StateSpaceModel):
 def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
     from thruster_env.graphs.loops import Loops
 
-    fingerprint = function_fingerprint(begin, advance, measure, within=__name__)
     room = padded(max(n, m), GROUP)
 
     def simulate(keys, inputs, numbers, states, measurements):
-        fingerprint  # noqa: B018 - part of the cache's key
         x, z, u, draws = np.zeros(n), np.zeros(m), np.zeros(inputs.shape[2]), np.zeros(room)
         for b in range(keys.shape[0]):
             key_0, key_1 = keys[b, 0], keys[b, 1]
@@ -134,7 +122,7 @@ def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
 def seconds_as_python(model: StateSpaceModel) -> float:
     """The time [s] that f and h of a step take, of a model that runs as Python; 0 for one of machine code.
 
-    Of functions that are not traced numba is asked, which warns if it takes them neither.
+    Functions that are not traced are compiled, or a warning says that they run as Python.
     """
     replacements = [instead_of(function) for function in (model.functions.transition, model.functions.observe)]
     if is_interpreting() or not any(instead is None or instead.reason for instead in replacements):

@@ -2,40 +2,26 @@
 
 from __future__ import annotations
 
-import dis
-import hashlib
-import inspect
+import math
 import traceback
 import types
 import warnings
+import weakref
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thruster_env.core.compiled import (
-    Instead,
-    compiled_in_place_of,
-    fastmath_of,
-    inlined,
-    overloaded,
-)
+from thruster_env.core.compiled import FASTMATH, Instead, compiled_in_place_of, fastmath_of, with_callees
 from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.modules import error_line
 from thruster_env.core.results import array_valued
-from thruster_env.core.sources import is_array, written_out
-from thruster_env.core.user_functions import (
-    codes_in,
-    functions_in,
-    is_copy,
-    is_plain,
-    needs_python,
-    stand_in,
-    stands_for,
-)
+from thruster_env.core.sources import is_array, tuple_of, written_out
+from thruster_env.core.user_functions import functions_in, is_copy, needs_python, stand_in, stands_for
 from thruster_env.graphs.branches import along, on_every_side
 from thruster_env.graphs.graphs import Graph, Number, TooLarge
 from thruster_env.graphs.programs import OF_STEPS, Place, Program, callable_of, program_of, values_of
@@ -254,24 +240,19 @@ def _along(y: np.ndarray, *moves: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     return np.array([0.0 if slope is None else slope for slope in slopes], dtype=object).reshape(y.shape)
 
 
-# A model's functions as others call them: machine code of their graphs where they can be traced, else numba's.
+# A model's functions as others call them: machine code of their graphs, else of their loops.
 #
 #     def f(x, u, c):                                               def f(x, u, c):
 #         pull = [k.force(y) for k, y in zip(SPRINGS, x)]    is         evaluate a program
 #         return tuple(x[i] + c.dt * ...)                               return its results
 #
 # So loops over known numbers, comprehensions, arrays, dataclasses and dictionaries are machine code wherever a
-# model is used. numba compiles the package's own functions, plain loops over large arrays, and what cannot be
-# traced, such as a loop until a value is small, if it can; else the model runs as Python, and one warning names
-# the function, the line, the reason and what to write in its place.
+# model is used. Loops over large arrays and until a value is small are translated by `graphs.loops`. What neither
+# takes numba compiles, in each process anew, if it can; else the model runs as Python, and one warning names the
+# function, the line, the reason and what to write in its place.
 
 
-MOST_CALLED = 3000  # operations of a program: numba compiles loops of more in less time
-ODD = {  # instructions of what numba refuses, or makes no array of
-    *"IMPORT_NAME FORMAT_VALUE FORMAT_SIMPLE BUILD_MAP BUILD_CONST_KEY_MAP".split(),
-    *"BUILD_LIST LIST_APPEND LIST_EXTEND".split(),
-}
-MOST_INLINED = 300  # operations of a program of which each caller has a copy
+MOST_CALLED = 3000  # operations of a program: with more, LLVM takes seconds
 
 
 @makes_functions
@@ -287,7 +268,6 @@ def called_function(
         form: of the constants, their NamedTuple class, or how many there are in a tuple.
         shape: of the result, which is an array if it is large: (count,), or (rows, columns) of a tuple of rows.
     """
-    inlined(function)
 
     def called(*arguments):
         result = in_python(function, arguments)
@@ -298,25 +278,31 @@ def called_function(
     return compiled_in_place_of(called, lambda: _machine_code(function, arguments, sizes, form, shape))
 
 
-def _machine_code(function: Callable, arguments: str, sizes: Sequence[int], form, shape: Sequence[int]) -> Instead:
-    """Machine code of a function's graph, else the function for numba, if that takes it."""
-    parts, for_numba = [*functions_in(function)], array_valued(function, arguments, *shape)
+def _machine_code(
+    function: Callable, arguments: str, sizes: Sequence[int], form, shape: tuple[int, ...]
+) -> Instead:
+    """Machine code of a function's graph, or of its loops, else of numba's."""
+    parts, of_loops = [*functions_in(function)], array_valued(function, arguments, *shape)
     large = is_array(max(sizes[:-1])) or is_array(*shape)
-    if not parts or large and _is_translated(for_numba, sizes, form):
-        return Instead(for_numba, "", frozenset(fastmath_of(function)))
-    if large and all(map(_has_plain_loops, parts)):
-        return Instead(for_numba, "", frozenset(fastmath_of(function)))
+    if (large or not parts) and _is_translated(of_loops, sizes, form):
+        return Instead(of_loops)
     try:
         program = traced_function(function, sizes, form, shape).program()
         if len(program.works) > MOST_CALLED:
             raise TooLarge(f"has {len(program.works)} operations, of which {MOST_CALLED} compile in seconds")
-        key = hashlib.sha256("\n".join(program.text).encode()).hexdigest()
-        return Instead(_evaluation(program, arguments, sizes, shape), key)
+        return Instead(_evaluation(program, arguments, sizes, shape))
     except Exception as error:  # whatever a user's function raises if it gets Numbers
         reason = why_not_traced(function, error)
+    if needs_python(function):
+        return Instead(None, reason)
+    if _is_translated(of_loops, sizes, form):
+        return Instead(of_loops, reason)
     if not isinstance(function, types.FunctionType) and not hasattr(function, "py_func"):
-        return Instead(None, reason=f"{reason}; numba takes no {type(function).__name__}")
-    return Instead(None if needs_python(function) else for_numba, "", frozenset(fastmath_of(function)), reason)
+        return Instead(None, f"{reason}; numba takes no {type(function).__name__}")
+    try:
+        return Instead(_by_numba(function, sizes, form, shape), reason)
+    except Exception as error:  # numba's, of many classes
+        return Instead(None, f"{reason}; numba refuses it: {_reason(error)}")
 
 
 def _is_translated(function: Callable, sizes: Sequence[int], form: type | int) -> bool:
@@ -327,17 +313,6 @@ def _is_translated(function: Callable, sizes: Sequence[int], form: type | int) -
     vectors = [unknown(size, as_array=is_array(size)) for size in before]
     constants = unknown(count, as_array=constants_are_array(form))
     return not refusal_of(function, [*vectors, constants if isinstance(form, int) else form(*constants)])
-
-
-def _has_plain_loops(function: types.FunctionType) -> bool:
-    """Whether numba takes a function, by its code: loops over large arrays are shorter than their graph."""
-    codes = [*codes_in(function.__code__)]
-    later = any(code.co_flags & inspect.CO_GENERATOR for code in codes)
-    odd = any(not ODD.isdisjoint(part.opname for part in dis.get_instructions(code)) for code in codes)
-    cells = (cell.cell_contents for cell in function.__closure__ or ())
-    names = (function.__globals__.get(name) for name in function.__code__.co_names)
-    kinds = types.ModuleType, types.FunctionType, types.BuiltinFunctionType, np.ufunc, type
-    return not (later or odd) and all(is_plain(value) or isinstance(value, kinds) for value in (*cells, *names))
 
 
 def _evaluation(program: Program, arguments: str, sizes: Sequence[int], shape: Sequence[int]) -> Callable:
@@ -353,81 +328,65 @@ def _evaluation(program: Program, arguments: str, sizes: Sequence[int], shape: S
         out[...] = results.reshape(shape)
 
     evaluate.evaluation = work, shape, sizes  # type: ignore[attr-defined]  # of which `loops` makes a call
-    overloaded(evaluate, lambda evaluate: _teach(evaluate, work, program, sizes, shape))
     large = is_array(*shape)
     lines = [f"out = np.empty({shape})", f"evaluate(({arguments}, ), out)"] if large else []
     result = "out" if large else f"evaluate(({arguments}, ))"
-    loops = large or len(program.works) > MOST_INLINED
-    return written_out("of_graph", arguments, *lines, result, _loops=loops, evaluate=evaluate, np=np)
+    return written_out("of_graph", arguments, *lines, result, evaluate=evaluate, np=np)
 
 
-def _teach(
-    evaluate: Callable, work: Callable, program: Program, sizes: Sequence[int], shape: Sequence[int]
-) -> None:
-    """Have numba put a program in the place of a call of `evaluate`, with its arguments on the stack.
+# Functions that numba compiles.
 
-    It takes a tuple of vectors, and returns a tuple of this shape, or writes to an array.
-    """
-    from numba.core import cgutils, types
-    from numba.extending import lower_builtin, type_callable
-    from numba.np.arrayobj import populate_array
+_known: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that others may call
 
-    number, count = types.float64, int(np.prod(shape))
-    result: Any = number
-    for length in reversed(shape):
-        result = types.UniTuple(result, length)
-    vector_at = [(i, j) for i, size in enumerate(sizes) for j in range(size)]
 
-    @type_callable(evaluate)
-    def of_vectors(context):
-        return lambda vectors, out=None: result if out is None else types.none
+def _by_numba(function: Callable, sizes: Sequence[int], form: type | int, shape: tuple[int, ...]) -> Callable:
+    """A function that numba compiles, which raises if numba refuses it; NaN is what it does not return."""
+    import numba
+    from numba.extending import register_jitable
 
-    def component(context, builder, vectors, of_vectors: Any, k: int):
-        """A number of the arguments as float64."""
-        i, j = vector_at[k]
-        vector, of_vector = builder.extract_value(vectors, i), of_vectors.types[i]
-        if kinds := getattr(of_vector, "types", ()):  # of a tuple
-            return context.cast(builder, builder.extract_value(vector, j), kinds[j], number)
-        array, at = context.make_array(of_vector)(context, builder, vector), context.get_constant(types.intp, j)
-        pointer = cgutils.get_item_pointer(context, builder, of_vector, array, [at])
-        return context.cast(
-            builder, context.unpack_value(builder, of_vector.dtype, pointer), of_vector.dtype, number
-        )
+    from thruster_env.graphs.expressions import Native
 
-    def on_stack(context, builder, length: int):
-        size, double = context.get_constant(types.intp, length), context.get_data_type(number)
-        data = cgutils.alloca_once(builder, double, size)
-        return data, lambda k: builder.gep(data, [context.get_constant(types.intp, k)], source_etype=double)
+    plain = getattr(function, "py_func", function)
+    for part in with_callees([plain]):
+        if part not in _known:
+            register_jitable(fastmath=fastmath_of(part))(part)
+            _known.add(part)
+    lines, at = [f"numbers, out = carray(given, {sum(sizes)}), carray(results, {prod(shape)})", "out[:] = nan"], 0
+    arguments = [f"v{i}" for i in range(len(sizes))]
+    for argument, size in zip(arguments, sizes, strict=True):
+        entries = tuple_of(f"numbers[{k}]" for k in range(at, at + size))
+        if argument == arguments[-1]:
+            text = f"Constants(*{entries})" if not isinstance(form, int) else entries
+            as_array = constants_are_array(form)
+        else:
+            text, as_array = entries, is_array(size)
+        lines.append(f"{argument} = numbers[{at}:{at + size}]" if as_array else f"{argument} = {text}")
+        at += size
+    lines.append(f"y = function({', '.join(arguments)})")
+    stores = (f"out[{k}] = y[{']['.join(map(str, i))}]" for k, i in enumerate(np.ndindex(*shape)))
+    names = {"carray": numba.carray, "nan": math.nan, "function": plain, "Constants": form}
+    native = written_out("native", "given, results", *lines, *stores, "None", **names)
+    pointer = numba.types.CPointer(numba.float64)
+    options: Any = {"fastmath": set(FASTMATH), "error_model": "numpy"}
+    code = numba.cfunc(numba.void(pointer, pointer), **options)(native)
 
-    def run(context, builder, vectors, of_vectors: Any, out) -> None:
-        components, at = on_stack(context, builder, len(vector_at))
-        for source, _ in program.reads:
-            builder.store(component(context, builder, vectors, of_vectors, source.at), at(source.at))
-        arrays, kind = [], types.Array(number, 1, "C")
-        for data, length in ((out, count), *2 * [(components, len(vector_at))]):
-            array = context.make_array(kind)(context, builder)
-            size, stride = (context.get_constant(types.intp, of) for of in (length, 8))
-            populate_array(array, data, (size,), (stride,), stride, None)
-            arrays.append(array._getvalue())
-        called = context.typing_context.resolve_value_type(work)
-        signature = called.get_call_type(context.typing_context, (kind,) * 3, {})
-        context.get_function(called, signature)(builder, arrays)
+    def call(*arguments):
+        return function(*arguments)
 
-    @lower_builtin(evaluate, types.BaseTuple)
-    def as_tuple(context, builder, signature, arguments):
-        out, at = on_stack(context, builder, count)
-        run(context, builder, arguments[0], signature.args[0], out)
-        numbers = [builder.load(at(k), typ=context.get_data_type(number)) for k in range(count)]
-        if len(shape) == 2:
-            rows = (numbers[k : k + shape[1]] for k in range(0, count, shape[1]))
-            numbers = [context.make_tuple(builder, result.dtype, row) for row in rows]
-        return context.make_tuple(builder, result, numbers)
+    call.native = Native(code.address, shape, is_array(*shape), code)  # type: ignore[attr-defined, arg-type]
+    return call
 
-    @lower_builtin(evaluate, types.BaseTuple, types.Array)
-    def to_array(context, builder, signature, arguments):
-        out = context.make_array(signature.args[1])(context, builder, arguments[1])
-        run(context, builder, arguments[0], signature.args[0], out.data)
-        return context.get_dummy_value()
+
+def _reason(error: Exception) -> str:
+    # numba frames its reason with lines on where it was; the first that is none of those says what is wrong.
+    frames = *"TypingError During Overload Rejected File >>>".split(), "Failed in", "There are", "- Of which"
+    frames += "With argument", "No impl"
+    lines = [line.strip() for line in str(error).splitlines()]
+    telling = [line for line in lines if len(line) > 3 and not line.startswith(frames)]
+    reason = telling[0] if telling else type(error).__name__
+    calls = [line.removeprefix(">>>").strip() for line in lines if line.startswith(">>>")]
+    unmatched = reason.lower().startswith(("no match", "raised from"))  # where only the call itself is telling
+    return f"it has no {calls[0]}" if unmatched and calls else reason
 
 
 # Why a function is not traced, for those whom that costs time.

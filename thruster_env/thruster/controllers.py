@@ -17,8 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import at_least, finite, positive
-from thruster_env.core.compiled import compiled, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.env.model_env import remembered
+from thruster_env.graphs.loops import Loops
 from thruster_env.thruster.dynamics import (
     Constants,
     driven_substep,
@@ -310,7 +311,6 @@ class Problem(NamedTuple):
     rate: float
 
 
-@inlined
 def predicted_cost(x, voltage, last, reference, problem):
     """Cost of the next step under a voltage [V] after the last one, and the state x after it, without noise."""
     c, top = problem.constants, problem.max_voltage
@@ -321,7 +321,6 @@ def predicted_cost(x, voltage, last, reference, problem):
     return step_cost(error, voltage / top, (voltage - last) / top, *weights), x
 
 
-@inlined
 def _cost_of_plan(x, plan, last, reference, problem):
     total = 0.0
     for voltage in plan:
@@ -331,7 +330,6 @@ def _cost_of_plan(x, plan, last, reference, problem):
     return total
 
 
-@inlined
 def _best_of_grid(x, last, reference, middle, half, problem):
     best, least = middle, np.inf
     for i in range(GRID):
@@ -351,7 +349,6 @@ def _search(states, last, references, out, problem):
         out[i] = _best_of_grid(x, last[i], references[i], best, 2.0 * top / (GRID - 1), problem)
 
 
-@inlined
 def _expand(x, plan, last, reference, problem, changes, slopes, gradient, hessian):
     """Gradient (H,) and Gauss-Newton's Hessian (H, H) of half the cost of a plan (H,), a voltage a step.
 
@@ -389,7 +386,6 @@ def _expand(x, plan, last, reference, problem, changes, slopes, gradient, hessia
             hessian[k - 1, k] -= rate
 
 
-@inlined
 def _hold_at_bounds(plan, gradient, hessian, top):
     """Leave out voltages at the end of the range that would go on beyond it."""
     for j in range(len(plan)):
@@ -400,9 +396,24 @@ def _hold_at_bounds(plan, gradient, hessian, top):
             hessian[j, j] = 1.0
 
 
+def _divide(x, a):
+    """Change x into A^-1 x of a positive definite A, by elimination, which changes A."""
+    for i in range(len(x)):
+        for j in range(i + 1, len(x)):
+            factor = a[j, i] / a[i, i]
+            x[j] -= factor * x[i]
+            for k in range(i, len(x)):
+                a[j, k] -= factor * a[i, k]
+    for i in range(len(x) - 1, -1, -1):
+        for j in range(i + 1, len(x)):
+            x[i] -= a[i, j] * x[j]
+        x[i] /= a[i, i]
+
+
 def _improve(states, last, references, plans, problem):
     horizon, top = plans.shape[1], problem.max_voltage
-    changes, slopes, trial = np.zeros((horizon, 2)), np.zeros(horizon), np.zeros(horizon)
+    changes, slopes = np.zeros((horizon, 2)), np.zeros(horizon)
+    step, trial = np.zeros(horizon), np.zeros(horizon)
     gradient, hessian = np.zeros(horizon), np.zeros((horizon, horizon))
     for i in range(len(states)):
         x, plan = (states[i, 0], states[i, 1]), plans[i]
@@ -410,7 +421,8 @@ def _improve(states, last, references, plans, problem):
         for _ in range(ITERATIONS):
             _expand(x, plan, last[i], references[i], problem, changes, slopes, gradient, hessian)
             _hold_at_bounds(plan, gradient, hessian, top)
-            step, before = np.linalg.solve(hessian, gradient), cost
+            step[:], before = gradient, cost
+            _divide(step, hessian)
             for _ in range(HALVINGS):
                 for j in range(horizon):
                     trial[j] = min(max(plan[j] - step[j], -top), top)
@@ -425,19 +437,8 @@ def _improve(states, last, references, plans, problem):
 
 
 @cache
-def _build(interpreting: bool):
-    fingerprint = function_fingerprint(within=__name__)
-
-    def search(states, last, references, out, problem):
-        fingerprint  # noqa: B018 - part of the cache's key
-        _search(states, last, references, out, problem)
-
-    def improve(states, last, references, plans, problem):
-        fingerprint  # noqa: B018 - part of the cache's key
-        _improve(states, last, references, plans, problem)
-
-    inlined(_search), inlined(_improve)
-    return compiled(search), compiled(improve)
+def _build(interpreting: bool) -> tuple[Loops, Loops]:
+    return Loops(_search), Loops(_improve)
 
 
 def best_voltages(states, last, references, problem: Problem) -> np.ndarray:
@@ -488,7 +489,7 @@ class PredictiveController:
 
     the first of which is applied: model-predictive control. The reference r_{k+1} is held, because the next one is
     unknown. With H = 1, the one-step controller, V_k is the best voltage of a grid, refined once, which no local
-    minimum can trap. Beyond, Gauss-Newton's method starts from it and the last plan (`planning.improve_plans`).
+    minimum can trap. Beyond, Gauss-Newton's method starts from it and the last plan (`improve_plans`).
 
     There is no integral: where the thruster is not the model, an error stays. On an estimate this is certainty
     equivalence. Observations begin with omega_m and U_a, true (see `thruster_env.env.env.ObserveState`) or

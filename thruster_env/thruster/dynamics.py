@@ -7,14 +7,13 @@ Input u = (V_s, U_0): source voltage [V], ambient flow velocity along the thrust
     d U_a/dt     = -(K4/K3) (U_a - U_0) |U_a - U_0| + T/K3
 
 Only the operators + - * / abs and ** occur, so the same source runs on floats, NumPy arrays and torch
-tensors and compiles with numba. Source: Healey et al. (1995), as printed by Nurhadi et al. (2022).
+tensors and compiles. Source: Healey et al. (1995), as printed by Nurhadi et al. (2022).
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from thruster_env.core.compiled import inlined
 from thruster_env.core.derivatives import runge_kutta
 
 # Keeps 1/V finite at rest, where what it multiplies vanishes faster.
@@ -47,7 +46,6 @@ class Constants(NamedTuple):
     substep: float  # time step of one integration step [s]
 
 
-@inlined
 def thrust_and_torque(x, c):
     """Thrust T [N] and propeller torque Q [N m] at state x.
 
@@ -71,7 +69,6 @@ def thrust_and_torque(x, c):
     return per_speed * lean * thrust, per_speed * torque
 
 
-@inlined
 def thrust_and_torque_tangent(x, dx, c):
     """Directional derivatives (dT, dQ) of `thrust_and_torque` at x along dx, by the product rule."""
     omega, flow = x
@@ -96,7 +93,6 @@ def thrust_and_torque_tangent(x, dx, c):
     return per_speed * d_thrust, per_speed * (d_torque - d_log_speed * torque)
 
 
-@inlined
 def rates(x, u, c):
     """Time derivatives (d omega_m/dt [rad/s^2], d U_a/dt [m/s^2]) at state x under input u."""
     omega, flow = x
@@ -109,7 +105,6 @@ def rates(x, u, c):
     )
 
 
-@inlined
 def rates_tangent(x, dx, u, c):
     """Directional derivative of `rates` at x along dx: the Jacobian of the plant times dx."""
     d_thrust, d_torque = thrust_and_torque_tangent(x, dx, c)
@@ -120,14 +115,12 @@ def rates_tangent(x, dx, u, c):
     )
 
 
-@inlined
 def variational_rates(y, u, c):
     """Rates of the state and of a perturbation of it, y = (omega_m, U_a, d omega_m, d U_a)."""
     x = (y[0], y[1])
     return rates(x, u, c) + rates_tangent(x, (y[2], y[3]), u, c)
 
 
-@inlined
 def driven_rates(y, u, c):
     """Rates of the state and of its response to a change dV of the voltage, y = (.., d omega_m, d U_a, dV)."""
     d_omega, d_flow = rates_tangent((y[0], y[1]), (y[2], y[3]), u, c)
@@ -144,7 +137,6 @@ driven_substep = runge_kutta(driven_rates, 5)
 """`driven_substep(y, u, c)`: the same with a perturbation of the voltage, which is held."""
 
 
-@inlined
 def substep_jacobian(x, u, c):
     """Jacobian of `substep` by rows, ((d omega'/d omega, d omega'/d U), (d U'/d omega, d U'/d U))."""
     first = variational_substep((x[0], x[1], 1.0, 0.0), u, c)

@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thruster_env.core.checks import covariance, finite, positive, short_repr
-from thruster_env.core.compiled import inlined
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.matrices import scaled, zero_order_hold
 from thruster_env.core.sources import matrix_of, tuple_of, written_out
@@ -59,25 +58,21 @@ from thruster_env.thruster.plant import Plant, make_plant
 from thruster_env.thruster.rendering import Overlay
 
 
-@inlined
 def transition(x, u, c):
     """One Runge-Kutta step of the thruster under voltage u = (V_s,)."""
     return substep(x, (u[0], c.ambient_velocity), c)
 
 
-@inlined
 def transition_jacobian(x, u, c):
     """Jacobian of `transition` by rows."""
     return substep_jacobian(x, (u[0], c.ambient_velocity), c)
 
 
-@inlined
 def observe(x, c):
     """The quantity that is measured by default: thrust [N]."""
     return (thrust_and_torque(x, c)[0],)
 
 
-@inlined
 def observe_jacobian(x, c):
     """Jacobian of `observe` by rows."""
     by_speed, _ = thrust_and_torque_tangent(x, (1.0, 0.0), c)
@@ -461,8 +456,8 @@ def _functions(channels: tuple[str, ...], lagging: tuple[bool, ...]) -> tuple[Ca
         "substep": substep,
         "substep_jacobian": substep_jacobian,
         "outside": outside,
-        "read": inlined(read),
-        "read_slopes": inlined(read_slopes),
+        "read": read,
+        "read_slopes": read_slopes,
     }
     drive = "v = outside(u[0], c.dead_band_low, c.dead_band_high), c.ambient_velocity"
     move = drive, "s = substep((x[0], x[1]), v, c)"
@@ -507,13 +502,11 @@ def _functions(channels: tuple[str, ...], lagging: tuple[bool, ...]) -> tuple[Ca
 # The thruster in continuous time: its rates and spectral densities, from which follows a model for any dt.
 
 
-@inlined
 def voltage_rates(x, u, c):
     """Time derivatives [rad/s^2, m/s^2] under voltage u = (V_s,), in the ambient flow of the constants."""
     return rates(x, (u[0], c.ambient_velocity), c)
 
 
-@inlined
 def driven_rates(x, u, c):
     """The same behind a dead band."""
     return rates(x, (outside(u[0], c.dead_band_low, c.dead_band_high), c.ambient_velocity), c)

@@ -16,7 +16,6 @@ from thruster_env.core.checks import (
     short_repr,
     within,
 )
-from thruster_env.core.compiled import inlined
 from thruster_env.effects.effects import Effect, dropping_channels
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 from thruster_env.env import plant_data as data_of_plants
@@ -260,7 +259,6 @@ class Task(NamedTuple):
     weights: tuple[float, ...] = DEFAULT_WEIGHTS
 
 
-@inlined
 def step_cost(error, voltage, change, tracking, energy, rate):
     """Cost of a step, minus its reward: of a thrust error [T_max], a voltage and its change [V_max]."""
     return tracking * error * error + energy * voltage * voltage + rate * change * change

@@ -53,7 +53,6 @@ from tuning.problems.assumed import AssumedProblem, within
 from tuning.problems.data import Data
 from tuning.problems.find import built_in
 from tuning.problems.problem import Problem
-from tuning.search.compiling import compile_filters
 from tuning.search.measures import measured
 from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.parameters import R
@@ -461,8 +460,6 @@ def run_tuning(
         if already:
             console.print(f"study {name!r} continues after {already} finished trials")
         with trial_bar(plan, names_of(plan), trials, before, console) as (advance, show_kinds):
-            if not alone and workers == 1 and not already and len(plan.filter_types) > 1:
-                compile_filters(plan, plan.filter_types[:trials], lambda name: show_kinds([f"compiling {name}"]))
             run = partial(run_trials, on_choice=lambda choice: show_kinds([choice.name]))
             if storage is not None and workers > 1:
                 run = partial(run_in_workers, storage=storage, workers=workers)

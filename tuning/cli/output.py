@@ -7,13 +7,11 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 
 from rich.console import Console, RenderableType
 
 from thruster_env.core.files import check_not_read, check_target, write_whole
-from thruster_env.core.modules import when_imported
 from thruster_env.core.text_tables import Unfolded, console
 from tuning.cli.main import PrintedWhole
 
@@ -109,19 +107,6 @@ def progress_of(title: str, out: Path | None = None) -> Iterator[Callable[[str, 
         if out is not None:
             progress_console.print(f"Interrupted: finished work is in {out}, and the same command continues.")
         raise
-
-
-@cache
-def announce_compilation() -> None:
-    """Say on standard error when this process has to compile; later ones find the result in a cache."""
-    text = "compiling numerical code: the first run only, some seconds per filter ..."
-
-    def announce() -> None:
-        from thruster_env.core.compiled import tell_when_compiling
-
-        tell_when_compiling(lambda: progress_console.print(text))
-
-    when_imported("thruster_env.core.compiled", announce)  # which imports NumPy
 
 
 def as_text(data) -> str:

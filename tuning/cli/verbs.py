@@ -34,7 +34,7 @@ from tuning.api.markers import (
     PythonOnly,
 )
 from tuning.api.result import Result, check_page
-from tuning.cli.output import announce_compilation, check_targets, emit
+from tuning.cli.output import check_targets, emit
 
 SHARED = {"preset", "model"}  # of recorded runs, and of tuned files
 CHANGES = {"preset", "augment"}  # of a problem that is named
@@ -110,7 +110,6 @@ def command_of(verb: Callable, **chosen: Any) -> Callable:
         arguments = arguments_of(verb, parts, values)
         written = [*files_of(parts, values, WRITTEN), *([] if page is None else [check_page(page)])]
         check_targets(written, target, read=files_of(parts, values, READ))
-        announce_compilation()
         result = verb(**fixed, **arguments)
         if is_served:
             result.serve()

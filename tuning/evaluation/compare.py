@@ -452,10 +452,7 @@ def timed_runs(filter_: Filter, data: Data, scale) -> tuple[RunMetrics, float]:
     """
     observed = data.seen
     few = observed.filter_keys[:2], observed.inputs[:2, :2], observed.measurements[:2, :3]
-    first = [np.ascontiguousarray(part) for part in few]
-    for part in first:
-        part.setflags(write=False)  # as the data's arrays: numba compiles again for writable ones
-    run(filter_, *first)
+    run(filter_, *few)
     metrics, seconds, started = [], 0.0, time.perf_counter()
     for runs, estimates in estimates_in_parts(filter_, data):
         seconds += time.perf_counter() - started

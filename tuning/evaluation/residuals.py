@@ -17,7 +17,7 @@ from filters.consistency.report import rounded
 from filters.filter import Filter
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import correlation_flaws
-from thruster_env.core.compiled import function_fingerprint, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.model.shape import Functions, Shape, constants_reader, for_any_input, number_offsets
 from thruster_env.model.state_space import StateSpaceModel
@@ -382,10 +382,8 @@ def _steps(functions: Functions, shape: Shape, interpreting: bool):
     substeps = number_offsets(n, m).substeps
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
-    fingerprint = function_fingerprint(transition, observe, within=__name__)
 
     def steps(states, inputs, numbers, expected, outputs):
-        fingerprint  # noqa: B018 - part of the cache's key
         x, z, u, c = np.zeros(n), np.zeros(m), np.zeros(inputs.shape[2]), constants(numbers)
         for b in range(states.shape[0]):
             for i in range(u.shape[0]):

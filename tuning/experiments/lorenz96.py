@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 
 from filters import StateSpaceModel
-from thruster_env.core.compiled import inlined
 from thruster_env.model.quantities import Positions
 from tuning.experiments.benchmark import Benchmark, Published, against_published, noise_free_problem
 
@@ -38,7 +37,6 @@ class Constants(NamedTuple):
     growth: float  # factor on the deviations in one step; 1 is none
 
 
-@inlined
 def rates(x, forcing):
     """x', (n,)."""
     n = x.shape[0]
@@ -51,7 +49,6 @@ def rates(x, forcing):
     return out
 
 
-@inlined
 def slopes_times(x, d):
     """The Jacobian of the rates at x times a matrix d (n, n)."""
     n = x.shape[0]

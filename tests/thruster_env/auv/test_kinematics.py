@@ -9,8 +9,8 @@ from thruster_env.auv.dynamics import (
     in_body_axes,
     in_earth_axes,
 )
-from thruster_env.core.compiled import compiled, function_fingerprint
 from thruster_env.core.streams import cosine_and_sine
+from thruster_env.graphs.loops import Loops
 from tuning.experiments.vehicle.estimators import planar_kinematics
 
 
@@ -69,15 +69,13 @@ def on_tensors(angles):
 
 
 def in_machine_code(angles):
-    fingerprint = function_fingerprint(cosine_and_sine, within=__name__)
 
     def fill(angles, out):
-        fingerprint  # noqa: B018 - part of the cache's key
         for j in range(angles.shape[0]):
             out[0, j], out[1, j] = cosine_and_sine(angles[j])
 
     out = np.empty((2, len(angles)))
-    compiled(fill)(angles, out)
+    Loops(fill)(angles, out)
     return out
 
 

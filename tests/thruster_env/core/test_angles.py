@@ -15,8 +15,9 @@ from filters.gaussian.mixtures import Parts, part_aligner
 from filters.sensitivity import likelihood
 from tests.models import affine, simulated, small
 from thruster_env.core.angles import difference, row_aligner, wrapped, wrapped_where
-from thruster_env.core.compiled import compiled, interpreted
+from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import filter_keys
+from thruster_env.graphs.loops import Loops
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import observation_slopes, transition_slopes
 
@@ -250,11 +251,16 @@ def test_compiled_and_interpreted_agree_across_the_cut():
 
 
 def of_columns(table, size):
-    """A table (rows, size) on one branch, its last row weights, and so a mixture of as many parts, row by row."""
-    align_columns(table, size)
-    row = np.concatenate((table.T.copy().ravel(), table[2]))
-    align_parts(row, 3 * size)
-    return table, row[: 3 * size].reshape(size, 3).T
+    """A table (rows, size) on one branch, its last row weights."""
+    Loops(align_columns)(table, size)
+    return table
+
+
+def of_parts(table, size):
+    """The same as a mixture of as many parts."""
+    row = np.concatenate((table.T.ravel(), table[2]))
+    Loops(align_parts)(row, 3 * size)
+    return row[: 3 * size].reshape(size, 3).T
 
 
 align_columns = row_aligner(0, (False, True), 2)
@@ -267,7 +273,7 @@ def test_a_sample_is_put_on_the_branch_of_its_weighted_circular_mean(compiling):
     angles, weights = 3.0 + rng.normal(scale=0.8, size=50), rng.random(50)
     table = np.array([angles, wrapped(angles), weights])
     with nullcontext() if compiling else interpreted():
-        for found in compiled(of_columns)(table.copy(), 50):
+        for found in (of_columns(table.copy(), 50), of_parts(table, 50)):
             np.testing.assert_array_equal(found[[0, 2]], table[[0, 2]])  # no angle, and the weights
             np.testing.assert_allclose(wrapped(found[1] - angles), 0.0, atol=1e-14)
             middle = np.angle(weights @ np.exp(1j * angles))

@@ -54,7 +54,7 @@ def users(monkeypatch, k):
 @pytest.mark.parametrize("name", ["direct", "attribute", "nested", "listed", "closed", "outer"])
 def test_another_number_in_another_file_is_another_code(monkeypatch, name):
     one, same, other = (getattr(users(monkeypatch, k), name) for k in (2.0, 2.0, 3.0))
-    prints = [function_fingerprint(part, within="thruster_env.core") for part in (one, same, other)]
+    prints = [function_fingerprint(part) for part in (one, same, other)]
     assert prints[0] == prints[1] != prints[2]
 
 

@@ -1,14 +1,18 @@
-"""Why a function runs as Python: a model that numba refuses, a broken function of the package, a full disk."""
+"""Why a function runs as Python: a model that nothing compiles, a broken function of the package, a full disk."""
 
 import functools
 import threading
 import warnings
 
+import numpy as np
 import pytest
 
 from thruster_env.core import compiled
-from thruster_env.core.compiled import CompiledOrPython, Instead, compiled_in_place_of
-from thruster_env.core.sources import Source, written_out
+from thruster_env.core.compiled import Instead, compiled_in_place_of
+from thruster_env.core.sources import Source
+from thruster_env.graphs import loops
+from thruster_env.graphs.loops import Loops
+from thruster_env.model.traced import called_function
 
 FAULT = "a fault of the package and not of the model: please report it"
 
@@ -20,109 +24,97 @@ def broken_maker(n: int):
 
 def called_by_ours(function):
     """A function of ours that calls another one."""
-    inner = written_out("inner", "x", "function(x)", function=function)
 
     def outer(x):
-        return inner(x) + 1.0
+        x[0] = function(x[0]) + 1.0
 
     outer.__module__ = "filters.engine.of_a_test"  # as if it were
     return outer
 
 
-def of_text(x):
-    """A user's function that numba refuses."""
-    return float(f"{x:.3f}")
-
-
-NUMBERS = {"gain": 1.0}
-
-
-def of_dictionary(x):
-    """Another one, which numba compiles later."""
-    return NUMBERS["gain"] * x
+def of_text(x, c):
+    """A user's function that nothing compiles."""
+    return (float(f"{x[0]:.3f}"),)
 
 
 class Times:
-    """A user's object in the place of a function."""
+    """A user's object in the place of a function, which looks numbers up."""
 
-    def __call__(self, x):
+    table = {1.0: 1.0, 2.0: 2.0}
+
+    def __call__(self, x, c):
         """Return x."""
-        return 1.0 * x
+        return (self.table[x[0]],)
 
 
 def warning_of(function) -> str:
     """What is said at the first call, and that there is no more."""
-    run = CompiledOrPython(called_by_ours(function))
+    run = Loops(called_by_ours(function))
     with pytest.warns(UserWarning, match="runs as Python") as caught:
         try:
-            run(2.0)
+            run(np.array([2.0]))
         except NameError as error:
             assert "cov" in str(error)
     (said,) = (str(one.message) for one in caught if "runs as Python" in str(one.message))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", ".*runs as Python")
+        if FAULT not in said:
+            run(np.array([2.0]))
     return said
 
 
 def test_a_broken_function_of_ours_is_a_fault_to_report():
     said = warning_of(broken_maker(3))
     assert said.endswith(FAULT) and "\n" not in said
-    assert "magnitude, written out by" in said and "broken_maker(3)" in said and "'cov' is not defined" in said
+    assert "magnitude" in said and "cov" in said
 
 
-def test_a_broken_outermost_function_is_a_fault_to_report():
-    def outer(x):
-        return x + nowhere  # noqa: F821 - that is the fault
-
-    outer.__module__ = "filters.engine.of_a_test"
-    fault = f"numba refuses outer of filters.engine.of_a_test: .*nowhere.*{FAULT}"
-    with pytest.warns(UserWarning, match=fault), pytest.raises(NameError):
-        CompiledOrPython(outer)(2.0)
-
-
-@pytest.mark.parametrize("function", [of_text, of_dictionary, Times(), functools.partial(of_text)])
+@pytest.mark.parametrize("function", [of_text, Times(), functools.partial(of_text)])
 def test_a_model_that_numba_refuses_is_none(function):
-    said = warning_of(function)
-    assert said.startswith(f"{compiled.IN_PYTHON}: numba refuses it: ") and FAULT not in said
-    assert "runs as Python" in said
+    of_model = called_function(function, "x, c", (1, 0), 0, (1,))
+
+    def first(x):
+        return of_model((x,), ())[0]
+
+    said = warning_of(first)
+    assert said.startswith(f"{compiled.IN_PYTHON}: ") and "cannot be traced" in said and "numba" in said
+    assert FAULT not in said
 
 
 def test_a_disk_without_room_is_neither(monkeypatch):
-    def full(function):
-        def run(*arguments):
-            raise OSError(28, "No space left on device")
+    def full(*arguments, **options):
+        raise OSError(28, "No space left on device")
 
-        return run
-
-    monkeypatch.setattr(compiled, "compiled", full)
+    monkeypatch.setattr(loops, "code_of", full)
+    x = np.array([-2.0])
     with pytest.warns(UserWarning, match="machine code of it could not be made: .*No space left"):
-        assert CompiledOrPython(called_by_ours(abs))(-2.0) == 3.0
+        Loops(called_by_ours(abs))(x)
+    assert x[0] == 3.0
 
 
 def test_what_compiles_is_quiet():
+    x = np.array([-2.0])
     with warnings.catch_warnings():
         warnings.filterwarnings("error", ".*runs as Python")
-        assert CompiledOrPython(called_by_ours(abs))(-2.0) == 3.0
+        Loops(called_by_ours(abs))(x)
+    assert x[0] == 3.0
 
 
 def test_a_second_thread_waits_for_the_machine_code_of_what_it_calls():
     def replaced(x):
         return -x
 
-    def first(x):
-        return replaced(x)
-
-    def second(x):
-        return replaced(x) + 1.0
+    def doubled(x):
+        return 2.0 * x
 
     def find():
         thread.start()  # that compiles while this one traces
         thread.join(0.3)
-        return Instead(lambda x: 2.0 * x)
+        return Instead(doubled)
 
-    results = []
+    one, other = np.array([2.0]), np.array([2.0])
     compiled_in_place_of(replaced, find)
-    thread = threading.Thread(target=lambda: results.append(CompiledOrPython(second)(2.0)))
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", ".*runs as Python")
-        assert CompiledOrPython(first)(2.0) == 4.0
-        thread.join()
-    assert results == [5.0]
+    thread = threading.Thread(target=lambda: Loops(called_by_ours(replaced))(other))
+    Loops(called_by_ours(replaced))(one)
+    thread.join()
+    assert (one[0], other[0]) == (5.0, 5.0)

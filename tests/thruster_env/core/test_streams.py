@@ -9,7 +9,7 @@ from scipy import stats
 
 import thruster_env  # noqa: F401 - registers the env
 from thruster_env.core import streams
-from thruster_env.core.compiled import compiled, function_fingerprint
+from thruster_env.graphs.loops import Loops
 from thruster_env.thruster.env import simulate
 from thruster_env.thruster.plant import make_plant
 
@@ -157,10 +157,8 @@ def test_channels_are_filled_in_the_order_of_the_blocks(count, step):
 
 
 def test_compiled_normals_are_the_interpreted_ones():
-    fingerprint = function_fingerprint(within=__name__)
 
     def fill(out, count, key_0, key_1):
-        fingerprint  # noqa: B018 - part of the cache's key
         for step in range(out.shape[0]):
             streams_fill(out[step], count, step, 3, key_0, key_1)
 
@@ -168,7 +166,7 @@ def test_compiled_normals_are_the_interpreted_ones():
     for key in (KEY, (0.0, 0.0), (4294967295.0, 4294967295.0)):
         expected, out = np.empty((20, 64)), np.empty((20, 64))
         fill(expected, 64, *key)
-        compiled(fill)(out, 64, *key)
+        Loops(fill)(out, 64, *key)
         np.testing.assert_allclose(out, expected, rtol=0, atol=1e-12)
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.fuzz.arithmetic import in_c
-from thruster_env.core.compiled import compiled
 from thruster_env.graphs.branches import along
 from thruster_env.graphs.graphs import Graph
+from thruster_env.graphs.loops import Loops
 from thruster_env.graphs.programs import Place, callable_of, program_of, values_of
 from thruster_env.graphs.tracing import traced
 
@@ -92,7 +92,7 @@ def test_machine_code_and_c_have_the_same_values():
     def call(rows, given):
         work(rows, rows, given, given)
 
-    run_it, found = compiled(call), np.empty(len(numbers))
+    run_it, found = Loops(call), np.empty(len(numbers))
     for k, point in enumerate(POINTS.T):
         run_it(found, np.ascontiguousarray(point))
         np.testing.assert_allclose(found, known[:, k], rtol=1e-12, atol=1e-12)

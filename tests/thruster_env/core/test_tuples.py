@@ -1,9 +1,7 @@
-from functools import partial
-
 import numpy as np
 import pytest
 
-from thruster_env.core.compiled import compiled, function_fingerprint, inlined, interpreted, is_interpreting
+from thruster_env.core.compiled import function_fingerprint, interpreted, is_interpreting
 from thruster_env.core.sources import (
     column_reader,
     column_writer,
@@ -16,6 +14,7 @@ from thruster_env.core.sources import (
     vector_writer,
     written_out,
 )
+from thruster_env.graphs.loops import Loops
 
 ROW = np.arange(10.0, 22.0)
 TABLE = ROW.reshape(3, 4)
@@ -83,7 +82,6 @@ def test_one_function_is_made_for_one_shape():
     assert matrix_reader(2, 2, 1) is not matrix_reader(2, 2)
 
 
-@inlined
 def shuffle(row, table):
     x = scaled_sum_2(read_vector(row), 2.0, read_column(table, 1))
     a = read_matrix(row)
@@ -102,16 +100,14 @@ store_column, store_vector, store_matrix = column_writer(2, 1), vector_writer(2)
 
 
 def test_compiled_readers_and_writers_do_what_the_python_ones_do():
-    fingerprint = function_fingerprint(shuffle, within=__name__)
 
     def run(row, table):
-        fingerprint  # noqa: B018 - part of the cache's key
         shuffle(row, table)
 
     expected_row, expected_table = ROW.copy(), TABLE.copy()
     run(expected_row, expected_table)
     row, table = ROW.copy(), TABLE.copy()
-    compiled(run)(row, table)
+    Loops(run)(row, table)
     np.testing.assert_array_equal(row, expected_row)
     np.testing.assert_array_equal(table, expected_table)
     assert (row != ROW).any() and (table != TABLE).any()
@@ -119,17 +115,17 @@ def test_compiled_readers_and_writers_do_what_the_python_ones_do():
 
 def test_nothing_is_compiled_within_interpreted_even_after_an_error():
     def function(x):
-        return x
+        x[0] += 1.0
 
     with pytest.raises(RuntimeError, match="stop"):
         with interpreted():
             assert is_interpreting()
-            assert compiled(function) is function
+            assert Loops(function).in_python
             with interpreted():
                 pass
-            assert compiled(function) is function
+            assert Loops(function).in_python
             raise RuntimeError("stop")
-    assert not is_interpreting()
+    assert not is_interpreting() and not Loops(function).in_python
 
 
 def test_a_fingerprint_tells_functions_apart_and_is_stable():
@@ -139,6 +135,5 @@ def test_a_fingerprint_tells_functions_apart_and_is_stable():
     def other(x):
         return x + 2.0
 
-    fingerprint = partial(function_fingerprint, within=__name__)
-    assert fingerprint(one) == fingerprint(one, None)
-    assert len({function_fingerprint(*each, within=__name__) for each in ((), (one,), (other,))}) == 3
+    assert function_fingerprint(one) == function_fingerprint(one)
+    assert len({function_fingerprint(*each) for each in ((), (one,), (other,))}) == 3

@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from thruster_env.core.compiled import compiled
 from thruster_env.graphs.branches import along
 from thruster_env.graphs.graphs import Graph, TooLarge, where
+from thruster_env.graphs.loops import Loops
 from thruster_env.graphs.programs import Place, callable_of, program_of, values_of
 from thruster_env.graphs.tracing import traced
 
@@ -58,7 +58,7 @@ def test_instructions_are_what_the_program_says(name, width):
     def call(rows, change, numbers):
         work(rows, change, numbers, numbers)
 
-    compiled(call)(*found[1], numbers)
+    Loops(call)(*found[1], numbers)
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-14)
     np.testing.assert_allclose(found[0][1], rows[:width] * 0.9)

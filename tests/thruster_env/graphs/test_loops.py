@@ -6,7 +6,8 @@ import pytest
 from filters.algebra.matrices import entries_product, input_matrix
 from filters.algebra.members import covariance, mean, variances
 from filters.pages.kernels import Stage, as_programs
-from thruster_env.core.compiled import compiled, interpreted
+from thruster_env.core.compiled import interpreted
+from thruster_env.graphs.loops import Loops
 from thruster_env.graphs.programs import OF_MEMBERS, Place, callable_of, cut
 
 N, COLUMNS, SIZE = 7, 16, 11
@@ -46,7 +47,7 @@ def test_compiled_loops_and_interpreted_ones_are_numpys(page):
         table, rows, nothing = np.full((parts.rows, COLUMNS), np.nan), np.zeros(N * N), np.zeros(0)
         table[: 2 * N, :SIZE] = members  # what lies behind the last member is NaN and counts in no sum
         if mode == "compiled":
-            compiled(once)(rows, nothing, nothing, table, nothing, SIZE)
+            Loops(once)(rows, nothing, nothing, table, nothing, SIZE)
         else:
             with interpreted():
                 once(rows, nothing, nothing, table, nothing, SIZE)

@@ -256,13 +256,14 @@ def test_whole_numbers_are_divided_as_in_python(b):
         assert run(a, b) == divided(a, b)
 
 
-def test_what_cannot_be_linked_is_left_to_numba(monkeypatch):
+def test_what_cannot_be_linked_runs_as_python_and_says_so(monkeypatch):
     def refuse(module, *names, **options):
         raise NotLinked("Symbols not found: [ cos ]")
 
     assert machine_code_of(count_up, [(None,), None]) is not None
     monkeypatch.setattr("thruster_env.graphs.loops.code_of", refuse)
-    assert machine_code_of(count_up, [(None,), None]) is None
+    with pytest.warns(UserWarning, match="could not be made: Symbols not found"):
+        assert machine_code_of(count_up, [(None,), None]) is None
 
 
 def count_up(x, by):

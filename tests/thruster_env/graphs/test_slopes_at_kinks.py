@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from thruster_env.core.compiled import compiled
 from thruster_env.graphs.branches import along
 from thruster_env.graphs.graphs import Graph
+from thruster_env.graphs.loops import Loops
 from thruster_env.graphs.programs import Place, callable_of, program_of, values_of
 from thruster_env.graphs.tracing import traced
 
@@ -70,7 +70,7 @@ def test_machine_code_has_them_too():
     def call(rows, numbers):
         work(rows, rows, numbers, numbers)
 
-    compiled(call)(rows, np.zeros(2))
+    Loops(call)(rows, np.zeros(2))
     np.testing.assert_array_equal(rows.reshape(-1, 2), [expected for _, expected in AT_ZERO.values()])
 
 

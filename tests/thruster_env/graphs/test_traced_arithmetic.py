@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from thruster_env.core.compiled import compiled, fastmath_of
+from thruster_env.core.compiled import fastmath_of
 from thruster_env.graphs.branches import along
 from thruster_env.graphs.graphs import Graph
+from thruster_env.graphs.loops import Loops
 from thruster_env.graphs.programs import Place, callable_of, program_of, values_of
 from thruster_env.graphs.tracing import traced
 
@@ -79,7 +80,7 @@ def test_machine_code_has_what_python_has(numbers):
     def call(rows, given):
         work(rows, rows, given, given)
 
-    run = compiled(call)
+    run = Loops(call)
     for point in POINTS:
         rows = np.empty(len(numbers))
         run(rows, np.array(point))

@@ -28,12 +28,6 @@ def add_index(first, last, values):
         values[i] += i
 
 
-def add_index_by_numba(first, last, values):
-    for i, _ in enumerate(values):  # which is not translated
-        if first <= i < last:
-            values[i] += i
-
-
 @pytest.fixture(scope="module")
 def ask():
     """Have workers add its index to each number, or to some of them."""
@@ -45,20 +39,19 @@ def ask():
     return ask
 
 
-@pytest.mark.parametrize("work, few", [(add_index, 2), (add_index, COUNT + 1), (add_index_by_numba, 2)])
-def test_work_is_done_in_parts_whatever_compiles_it(work, few):
+@pytest.mark.parametrize("few", [2, COUNT + 1])
+def test_work_is_done_in_parts(few):
     for context in (contextlib.nullcontext(), interpreted()):
         with context:
-            values, in_parts = np.zeros(COUNT), InParts(work, [(None,)], few=few)
+            values, in_parts = np.zeros(COUNT), InParts(add_index, [(None,)], few=few)
             call = in_parts.on(COUNT, (), values.shape)
         for result in (values, values, np.zeros(COUNT)):
             call(result)
         assert np.array_equal(values, 2.0 * np.arange(COUNT)) and np.array_equal(result, np.arange(COUNT))
 
 
-@pytest.mark.parametrize("work", [add_index, add_index_by_numba])
-def test_a_single_one_has_quick_calls(work):
-    single, values = InParts(work, [(None,)], single=True), np.full(1, 3.0)
+def test_a_single_one_has_quick_calls():
+    single, values = InParts(add_index, [(None,)], single=True), np.full(1, 3.0)
     single.on(1, (), values.shape)(values)
     single.on_result((), values)()
     assert values == [3.0]

@@ -25,8 +25,9 @@ from filters.pages.kernels import page_kernels
 from filters.pages.page import Page
 from thruster_env.auv.dynamics import angle_rates, attitude_of, in_earth_axes
 from thruster_env.core.angles import difference
-from thruster_env.core.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.streams import cosine_and_sine
+from thruster_env.graphs.loops import Loops
 from thruster_env.model.shape import Functions, Shape, constants_reader, number_offsets
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.experiments.vehicle.papers import FUZZY_HIGH, FUZZY_LOW, papers_model
@@ -43,7 +44,6 @@ EULER = {"integration": "euler"}  # as in the papers; the truth and our other fi
 # Position and yaw that follow from velocities over time, by the full transformation or by yaw alone.
 
 
-@inlined
 def next_attitude(phi, theta, before, after, dt):
     """Roll and pitch [rad] a step later, by Heun's rule; p, q, r [rad/s] were before and are after."""
     rolling, pitching, _ = angle_rates(attitude_of(phi, theta), before[0], before[1], before[2])
@@ -54,11 +54,9 @@ def next_attitude(phi, theta, before, after, dt):
 
 
 @cache
-def _attitude_reckoner(interpreting: bool) -> CompiledOrPython:
-    fingerprint = function_fingerprint(next_attitude, within=__name__)
+def _attitude_reckoner(interpreting: bool) -> Loops:
 
     def reckon(rates, dt, attitudes):
-        fingerprint  # noqa: B018 - part of the cache's key
         for b in range(rates.shape[0]):
             phi = theta = 0.0
             for k in range(1, rates.shape[1]):
@@ -68,7 +66,7 @@ def _attitude_reckoner(interpreting: bool) -> CompiledOrPython:
                 attitudes[b, k, 0] = phi
                 attitudes[b, k, 1] = theta
 
-    return CompiledOrPython(reckon)
+    return Loops(reckon)
 
 
 def reckoned_attitude(velocities: np.ndarray, dt: float) -> np.ndarray:
@@ -123,20 +121,17 @@ def own_attitude_kernels(functions: Functions, shape: Shape) -> Kernels:
     mean, step, extras, substeps = layout.mean, layout.step, layout.extras, source.substeps
     roll, pitch = shape.inputs - 2, shape.inputs - 1
 
-    @inlined
     def start(memory, numbers, size):
         start_filter(memory, numbers, size)
         for i in range(KEPT):
             memory[0][extras + i] = 0.0
 
-    @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         u[roll] = row[extras]
         u[pitch] = row[extras + 1]
         predict_filter(memory, u, numbers, size)
 
-    @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
         update_filter(memory, z, numbers, size)
