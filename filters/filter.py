@@ -15,6 +15,7 @@ import numpy as np
 from filters.engine.belief import Belief, Innovation, Kernels, OwnBelief
 from filters.engine.compile import PREDICT, UPDATE
 from filters.engine.session import GatedSession, Running, Session
+from thruster_env.core.checks import short_repr
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.modules import object_named
 from thruster_env.model.state_space import StateSpaceModel
@@ -249,6 +250,9 @@ class FilterWithPage(Filter):
     @cached_property
     def own_parameters(self) -> tuple[float, ...]:
         """The parameters, one behind the other."""
+        for name, value in self.parameters.items():
+            if np.isnan(value).any():
+                raise ValueError(f"{name} of {self.name} must be a number, but got {short_repr(value)}")
         return tuple(float(number) for value in self.parameters.values() for number in np.ravel(value))
 
     @property

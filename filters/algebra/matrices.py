@@ -70,13 +70,21 @@ class Matrix:
             f" not functions of NumPy, but it calls one with {self!r}"
         )
 
+    def __lt__(self, other):
+        raise TypeError(
+            "a page must choose by operations, choose(exceeds(a, value), b, c), at_least or at_most, "
+            f"but it compares {self!r} with {other!r}"
+        )
+
+    __gt__ = __le__ = __ge__ = __lt__
+
     def __add__(self, other):
-        return add(self, other) if isinstance(other, Matrix) else shifted(self, float(other))
+        return add(self, other) if isinstance(other, Matrix) else shifted(self, _number(other))
 
     __radd__ = __add__
 
     def __sub__(self, other):
-        return subtract(self, other) if isinstance(other, Matrix) else shifted(self, -float(other))
+        return subtract(self, other) if isinstance(other, Matrix) else shifted(self, -_number(other))
 
     def __rsub__(self, other):
         return -self + other
@@ -86,7 +94,7 @@ class Matrix:
 
     def __mul__(self, factor):
         if not isinstance(factor, Matrix):
-            return scale(self, float(factor))
+            return scale(self, _number(factor))
         return entries_product(self, factor) if factor.shape else scale(self, factor)
 
     __rmul__ = __mul__
@@ -98,6 +106,8 @@ class Matrix:
         return reciprocal(self) * other
 
     def __pow__(self, exponent):
+        if len(self.shape) == 2 and exponent < 0:
+            raise TypeError(f"a page must write C S^-1 as divide(C, S), as ** raises each entry, but got {self!r}")
         return power(self, exponent)
 
     def __abs__(self):
@@ -105,6 +115,14 @@ class Matrix:
 
     def __neg__(self):
         return scale(self, -1.0)
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except TypeError:
+        rule = "a page must calculate with numbers and matrices of its own (eye(P) is the identity)"
+        raise TypeError(f"{rule}, but got {value!r}") from None
 
 
 class Operation:
@@ -166,13 +184,29 @@ def same(shape, *shapes):
     return shape
 
 
-@operation(same, symmetric=lambda a, b: a.symmetric and b.symmetric)
+def alike(shape, other):
+    """The shape of two arguments of one shape; TypeError if they differ."""
+    if shape != other:
+        raise TypeError(
+            f"a page must add, subtract and multiply by entries of one shape, but got {shape} and {other}"
+        )
+    return shape
+
+
+def of_product(a, b):
+    """The shape of a product; TypeError if rows and columns do not match."""
+    if not a or not b or a[-1] != b[0]:
+        raise TypeError(f"a page must multiply by @ as many columns as there are rows, but got {a} @ {b}")
+    return *a[:-1], *b[1:]
+
+
+@operation(alike, symmetric=lambda a, b: a.symmetric and b.symmetric)
 def add(a, b):
     """The sum a + b."""
     return a + b
 
 
-@operation(same, symmetric=lambda a, b: a.symmetric and b.symmetric)
+@operation(alike, symmetric=lambda a, b: a.symmetric and b.symmetric)
 def subtract(a, b):
     """The difference a - b."""
     return a - b
@@ -184,7 +218,7 @@ def scale(a, factor):
     return a * factor
 
 
-@operation(same)
+@operation(alike)
 def entries_product(a, b):
     """The products of the entries of two vectors, or of two matrices."""
     return a * b
@@ -220,7 +254,7 @@ def transposed(a):
     return a.T
 
 
-@operation(lambda a, b: (*a[:-1], *b[1:]))
+@operation(of_product)
 def multiply(a, b):
     """The product a b; its derivative is in `operations`, with that of quotients."""
     return a @ b

@@ -244,10 +244,10 @@ def stored(
     stores: dict[int | Place, Matrix] = {}
     for position, value in zip(positions, (*values, *changed.values()), strict=True):
         if isinstance(position, Matrix):
-            if position.symmetric and not value.symmetric or position.shape != value.shape:
-                raise TypeError(
-                    f"a page must return the symmetric part of {value!r}, by sym, and {position.shape}"
-                )
+            if position.shape != value.shape:
+                raise TypeError(f"a page must return {position!r} with its shape, but got {value!r}")
+            if position.symmetric and not value.symmetric:
+                raise TypeError(f"a page must return the symmetric part, sym(P), but got {value!r}")
             position = position.operation
         if value.member and not (isinstance(position, Place) and position.array in BY_MEMBERS):
             raise TypeError(f"a page must return {value!r} of all members, such as a mean, not of each")
@@ -261,16 +261,39 @@ def with_extras(results: Any) -> tuple:
     return values if values and isinstance(values[-1], dict) else (*values, {})
 
 
-def updated(results: Any) -> tuple:
-    """What `update` of a page for one Gaussian belief returns: x, P, v, S, log density, extras that change.
+def pure(function: Callable, *arguments: Any) -> Any:
+    """What a page's function returns; ValueError if a second call returns something else, as by a random draw."""
+    results, again = function(*arguments), function(*arguments)
+    *values, extras = with_extras(results)
+    *same, same_extras = with_extras(again)
+    pairs = zip((*values, *extras.values()), (*same, *same_extras.values()), strict=True)
+    if any(a is not b for a, b in pairs):
+        rule = "must depend on its arguments alone: an ensemble's page is given its random numbers"
+        raise ValueError(f"{function.__name__} of a page {rule}, but two calls differ")
+    return results
+
+
+def updated(results: Any, *before: Matrix, m: int) -> tuple:
+    """What `update` of a page returns: the belief, v, S, the log density, and the extras that change.
+
+    Args:
+        results: x, P, v, S and the log density, or of an ensemble x, v, S and the log density.
+        before: the belief before the update.
+        m: number of measurements.
 
     Raises:
-        ValueError: if it returns another number of values.
+        ValueError: if it returns another number of values, or v, S or the density of another shape.
     """
-    values = with_extras(results)
-    if len(values) != 6:
-        rule = "update of a page must return x, P, the innovation v, its covariance S and its log density"
-        raise ValueError(f"{rule}, and perhaps a dictionary, but it returned {len(values) - 1} values")
+    values, outputs = with_extras(results), ("the innovation v", "its covariance S", "its log density")
+    if len(values) != len(before) + 4:
+        rule = f"update of a page must return {'x, P' if len(before) == 2 else 'x'}, {', '.join(outputs[:2])} and"
+        raise ValueError(
+            f"{rule} {outputs[2]}, and perhaps a dictionary, but it returned {len(values) - 1} values"
+        )
+    for name, value, shape in zip(outputs, values[len(before) :], ((m,), (m, m), ()), strict=False):
+        if not isinstance(value, Matrix) or value.shape != shape:
+            last = ", log_density(v, S, present(z))" if shape == () else ""
+            raise ValueError(f"update of a page must return {name}{last} of shape {shape}, but got {value!r}")
     return values
 
 
@@ -289,12 +312,13 @@ def stages_of(page: Page, memory: RowMemory, model: PagedModel) -> list[Stage]:
     predicted = (x, p) if page.represent is None else [memory.another(matrix) for matrix in begun]
     advanced = page.propagated(model, *predicted, u=memory.u)
     outputs = layout.innovation, layout.innovation_cov, layout.log_likelihood
+    corrected = updated(pure(page.update, model, x, p, memory.z), x, p, m=shape.m)
     return [
         stored((started,), (), memory.extras),
         Stage({}, {}) if page.represent is None else stored(begun, predicted),
         stored(advanced, predicted, memory.extras),
-        stored(page.add_process_noise(model, *predicted), (x, p), memory.extras),
-        stored(updated(page.update(model, x, p, memory.z)), (x, p, *outputs), memory.extras),
+        stored(pure(page.add_process_noise, model, *predicted), (x, p), memory.extras),
+        stored(corrected, (x, p, *outputs), memory.extras),
     ]
 
 
@@ -394,14 +418,14 @@ def member_stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> di
     prior = on_branch(model.prior_mean + model.prior_root @ memory.w, model.state_angles)
     started = page.started(model)
     extras = model.extras = memory.keep(started)
-    updated, *rest, changed = with_extras(page.update(model, x, memory.z, memory.e))
+    moved, *rest, changed = updated(pure(page.update, model, x, memory.z, memory.e), x, m=memory.shape.m)
     of_belief = memory.mean, memory.P
     return {
         "start": stored((prior, started), (x,), extras),
         "propagate": stored(page.propagated(model, x, u=memory.u), (x,), extras),
         "add_process_noise": stored((page.add_process_noise(model, x, memory.w),), (x,)),
-        "analyse": stored((updated,), (x,)),
-        "update": stored((updated, *rest, *moments(model, updated), changed), (x, *outputs, *of_belief), extras),
+        "analyse": stored((moved,), (x,)),
+        "update": stored((moved, *rest, *moments(model, moved), changed), (x, *outputs, *of_belief), extras),
         "summarise": stored(moments(model, x), of_belief),
     }
 
