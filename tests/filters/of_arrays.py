@@ -15,7 +15,7 @@ class OfArrays:
         self.Q, self.R = model.process_noise_cov, model.measurement_noise_cov
         self.Q_root, self.prior_root = covariance_root(self.Q), covariance_root(model.prior_cov)
         self.state_angles, self.measurement_angles = model.shape.state_angles, model.shape.measurement_angles
-        self.extras, self.feed = {}, 0
+        self.extras, self.feed, self.turns = {}, 0, ()
 
     def at(self, constants):
         return OfArrays(self._model, self.own, tuple(constants))

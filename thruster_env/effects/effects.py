@@ -88,7 +88,7 @@ class Effect:
     act: ClassVar[Callable]  # the function above, a staticmethod
     name: ClassVar[str]
     checks: ClassVar[Mapping[str, Callable]] = {}  # `check(name, value)` of an argument returns its stored value
-    loses: ClassVar[bool] = False  # whether measurements may be missing: then their validity is observed
+    loses: ClassVar[bool | None] = False  # whether measurements may be missing; None if it only moves missing ones
 
     def __post_init__(self):
         """Check the arguments."""
@@ -144,6 +144,9 @@ class Registry:
         """Return a class decorator that makes a frozen dataclass an effect of this name."""
 
         def decorate(cls: type[Registered]) -> type[Registered]:
+            known = self.effects.get(name, cls)
+            if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+                raise ValueError(f"an effect must have a name of its own, but {name!r} is {known.__qualname__}")
             cls.name = name
             self.effects[name] = cls
             return cls
@@ -249,17 +252,25 @@ def run_chain(
             if not isinstance(results, tuple) or len(results) != 2 or shape_of(results[0]) != shape_of(value):
                 rule = f"act of {name!r} must return the value, here {_form(value)}, and the memory"
                 raise ValueError(f"{rule}, but got {results!r}")
+            if kind.effect.loses is False and not _same(*(getattr(v, "valid", 1.0) for v in (value, results[0]))):
+                raise ValueError(f"{name!r} must have `loses = True` to lose measurements, but it changes `valid`")
             value, after = results
         except AttributeError as error:
             raise ValueError(f"act of {name!r} must take what its arguments have, but {error}") from error
         except TypeError as error:
             rule = f"act of {name!r} must be a function of numbers, and where(condition, a, b) choose between them"
-            raise ValueError(f"{rule}, but {error}") from error
+            hint = " (memory is None where t.begin is true)" if t.begin and "None" in str(error) else ""
+            raise ValueError(f"{rule}, but {error}{hint}") from error
         if not t.begin and shape_of(after) != shape_of(memory):
             rule = "must have a memory of the same shape in each step as at the start of an episode"
             raise ValueError(f"act of {name!r} {rule}, but got {after!r}")
         memories_after.append(after)
     return value, tuple(memories_after)
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two numbers of a graph are one, or both known and equal."""
+    return a is b or getattr(a, "value", a) == getattr(b, "value", b) is not None
 
 
 def _form(value: Any) -> str:

@@ -200,6 +200,7 @@ class Delay(Effect):
 
     steps: int = 1
     checks = {"steps": _delay_steps}
+    loses = None
 
     def parameters(self, context: Context) -> dict[str, Any]:
         """Steps, the length of the line."""

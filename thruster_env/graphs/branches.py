@@ -87,6 +87,8 @@ def on_every_side(function: Callable[[], Any], graph: Graph) -> Any:
         except Exception as error:
             if len(answers) == len(outer) or not _is_raised_there(error):
                 raise
+            if not graph.may_raise:
+                raise TypeError(f"it must not raise exceptions, but raises {error!r}") from error
             result, failure = RAISED, error
         for k, condition in reversed([*enumerate(asked)]):
             before = {earlier.place: True for earlier in asked[:k]}

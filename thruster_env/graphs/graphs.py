@@ -89,6 +89,7 @@ class Graph:
         self.answers: dict[int, bool] = {}  # what conditions are taken for now, by their places
         self.outcomes = 0  # of decisions that were not the first, as far as a function has been traced
         self.whole: set[int] = set()  # places of numbers that are not taken apart, as along them slopes are taken
+        self.may_raise = True  # whether a branch that raises an exception is NaN, or is refused
         self.exact = False  # whether a model's function is being traced: see `as_written`
         self._made: dict[tuple, Number] = {}
         self._most = most

@@ -149,8 +149,12 @@ def traceable(function: Callable) -> Callable:
             entries[:] = [graph.number(leaf) for leaf in leaves(result)]
             return entries
 
-        results = on_every_side(entries, graph)
-        if any(a is not b for a, b in zip(results, on_every_side(entries, graph), strict=False)):
+        graph.may_raise = False
+        try:
+            results, again = on_every_side(entries, graph), on_every_side(entries, graph)
+        finally:
+            graph.may_raise = True
+        if any(a is not b for a, b in zip(results, again, strict=False)):
             raise TypeError(
                 f"{_name(function)} must depend on its arguments alone, but two calls returned different values: "
                 "t.normals() and t.uniforms() of an effect draw numbers"

@@ -291,6 +291,13 @@ def test_an_effect_of_one_s_own_may_decide_and_keep_what_it_likes(monkeypatch):
     np.testing.assert_allclose(changed, np.where(raw < 0, -1.5 * peak, peak), rtol=1e-12)
 
 
+def raising(e, reading, n, t):
+    """A sensor that refuses negative readings."""
+    if reading.z < 0:
+        raise ValueError("negative")
+    return reading, n
+
+
 GENERATOR = np.random.default_rng(1)  # of the user's own: tracing would freeze what it draws
 
 
@@ -307,6 +314,8 @@ GENERATOR = np.random.default_rng(1)  # of the user's own: tracing would freeze 
             "must be .* must depend on its arguments alone",
         ),
         (lambda e, reading, n, t: (reading.z, n), "must return the value, here a Reading, and the memory"),
+        (raising, "must be .* it must not raise exceptions, but raises ValueError"),
+        (lambda e, reading, n, t: (reading, n + 1), "must be .* where t.begin is true"),
         (lambda e, reading, n, t: reading, "must return the value, here a Reading, and the memory"),
         (lambda e, reading, n, t: (reading._replace(z=e.nothing), n), "must take what its arguments have"),
     ],
