@@ -333,7 +333,10 @@ def test_by_the_command_line(thruster):
     for arguments, line in (
         (("compare", "--filter", "math:pi"), "estimator 'math:pi' must be an estimator, or make one of a model"),
         (("evaluate", "--filter", "nosuch_module:x"), "estimator must be 'module:object' that can be imported"),
-        (("tune", "--filter", f"{HERE}:AtOnce"), "a tuned file must be of a filter of filters.FILTERS"),
+        (
+            ("tune", "--filter", f"{HERE}:AtOnce", "--out", "t.json"),
+            "a tuned file must be of a filter of filters.FILTERS",
+        ),
         (("evaluate", "--filter", f"{HERE}:AtOnce", "--consistency", "a.png"), "of a filter with a covariance"),
     ):
         done = thruster(*arguments)

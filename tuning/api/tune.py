@@ -19,7 +19,7 @@ import optuna
 from optuna.trial import FrozenTrial
 from rich.console import Console
 
-from filters.estimators.foreign import label_of
+from filters.estimators.foreign import is_foreign, label_of
 from filters.registry import filter_type
 from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.files import check_target
@@ -202,7 +202,8 @@ def tune(
         storage: journal file for one host; for several, a database (docs/workers.md). In Python by default none:
             the study ends with the process.
         name: name of the study; by default from the options above.
-        out: tuned file; out/STUDY.json by default. In Python none by default, and True for that one.
+        out: tuned file; out/STUDY.json by default. In Python none by default, and True for that one. A filter of
+            your own has none, as such a file names no code: store its parameters yourself.
         seed: seed of all randomness; the same seed gives the same results.
         progress: whether to show progress; by default only in terminals and notebooks.
         **reading: refused; options of logs belong to `tuning.read_logs`.
@@ -224,6 +225,8 @@ def tune(
         raise ValueError(
             f"filter must be a name or 'module:object', by which trials keep it, but got {short_repr(filter)}"
         )
+    if out is True and is_foreign(filter):
+        out = None  # what a tuned file names is no code
     if out is not None:
         check_keepable(filter)
     sampler, problems = sampler_of(method), problems_of(problem)
