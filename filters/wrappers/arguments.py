@@ -65,7 +65,7 @@ def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | 
     try:
         factory = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError):
-        rule = "model must be a name, 'module:factory' that can be imported, or a StateSpaceModel"
+        rule = "model must be 'module:factory' that can be imported, a model's name, or a StateSpaceModel"
         raise ValueError(f"{rule}, but got {model!r}") from None
     return f"model {model!r}", factory
 
