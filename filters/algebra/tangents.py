@@ -46,8 +46,10 @@ def points_around(model, x, D):
 
 
 def differences(model, Y, y):
-    """The d with move(model, y, d) = y_j for each column of Y, (t, points): y_j - y of numbers."""
-    return apart(Y, y, model.turns) if model.turns else Y - outer(y, ones(Y))
+    """The d with move(model, y, d) = Y of a state, or of each column of Y, (t, points): Y - y of numbers."""
+    if model.turns:
+        return apart(Y, y, model.turns)
+    return Y - y if len(Y.shape) == 1 else Y - outer(y, ones(Y))
 
 
 def reset(model, p, d):
@@ -56,6 +58,14 @@ def reset(model, p, d):
         return p
     G = reset_slopes(d, model.turns)
     return sym(G @ p @ G.T)
+
+
+def reset_back(model, p, d):
+    """G^-1 P G^-1': a covariance about move(model, x, d) in the tangent at x."""
+    if not model.turns:
+        return p
+    J = inverse_reset_slopes(d, model.turns)
+    return sym(J @ p @ J.T)
 
 
 def reset_columns(model, h, d):
@@ -106,6 +116,12 @@ def slopes_of_stored(x, turns):
 def slopes_of_tangent(y, turns):
     """The derivative of difference(x, y) by x at y."""
     return _computed(steps.slopes_of_tangent, turns, y)
+
+
+@operation(lambda d, turns: (d[0], d[0]))
+def inverse_reset_slopes(d, turns):
+    """The inverse of G."""
+    return _computed(steps.inverse_reset_slopes, turns, d)
 
 
 @operation(lambda d, turns: (d[0], d[0]))

@@ -26,6 +26,7 @@ import numpy as np
 from filters.algebra.operations import eye, quotient, sym, wrap
 from filters.algebra.points import root, square, units, without_first
 from filters.algebra.roots import careful
+from filters.algebra.tangents import differences, move, reset, reset_back
 from filters.engine.batch import Estimates
 from filters.engine.belief import memory_offsets
 from filters.filter import Filter, PageFilter
@@ -38,7 +39,7 @@ from filters.pages.page import Equations, Page, RowMemory
 from thruster_env.core.angles import difference
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.threads import spread
-from thruster_env.model.shape import Functions, Shape, number_offsets
+from thruster_env.model.shape import Functions, Shape
 from thruster_env.model.turns import refuse_rotations
 
 ROUNDING = 1e-12  # of angles that were wrapped [rad]
@@ -83,8 +84,9 @@ SCHEDULED = Relation(represent_jacobian, propagate_scheduled_jacobian, link)
 def back(model, x, P, linked, later):
     """Correct the estimate of a step by that of the next one, `later`."""
     (mean, G, C), (later_x, later_P) = linked, later
-    x = wrap(x + G @ wrap(later_x - mean, model.state_angles), model.state_angles)
-    return x, sym(C + sym(G @ later_P @ G.T))
+    change = wrap(differences(model, later_x, mean), model.state_angles)
+    d, later_P = G @ change, reset_back(model, later_P, change)
+    return move(model, x, d), reset(model, sym(C + sym(G @ later_P @ G.T)), d)
 
 
 def smooth_backwards(
@@ -108,7 +110,7 @@ def smooth_backwards(
         lag: number of later measurements, 0 ... K.
         process_noise: rows (Q, its root) of each step, of `filters.engine.batch.noise_rows`; none for the model's.
     """
-    model, angles = filter_.kernel_model, filter_.kernel_model.shape.state_angles
+    model, angles = filter_.kernel_model, filter_.kernel_model.any_shape.state_angles
     # A restarted belief is the prior; a belief may also be the prior without a restart.
     apart = np.abs(difference(estimates.means, model.prior_mean, angles))
     means_alike = (apart <= np.where(angles, ROUNDING, 0.0)).all(axis=-1)
@@ -116,7 +118,7 @@ def smooth_backwards(
     filtered = estimates.means, estimates.covs, is_prior & (estimates.divergences > 0)[:, None]
     numbers = filter_.numbers[None]
     if len(process_noise):
-        numbers, q = np.repeat(numbers, len(process_noise), axis=0), number_offsets(model.n, model.m).q
+        numbers, q = np.repeat(numbers, len(process_noise), axis=0), model.any_shape.offsets.q
         numbers[:, q : q + process_noise.shape[1]] = process_noise
     return passes(filter_, relation)(filtered, inputs, lag, numbers)
 
@@ -127,7 +129,8 @@ def passes(filter_: PageFilter, relation: Relation) -> Callable[..., tuple]:
     It takes a filter's estimates, the inputs, the lag, and the numbers that the filter used: (1, count) for all
     steps or (K, count) for each; those of the filter if None.
     """
-    functions, shape, of_filter = filter_.kernel_model.functions, filter_.kernel_model.shape, filter_.numbers[None]
+    functions, of_filter, model = filter_.kernel_model.functions, filter_.numbers[None], filter_.kernel_model
+    shape = model.any_shape
     run_part = _smoother(relation, filter_.written_page, functions, shape, is_interpreting())
 
     def smoothed(
@@ -164,20 +167,17 @@ def _smoother(relation: Relation, page: Page, functions: Functions, shape: Shape
 
     memory, works, _ = programs_of(page, functions, shape, stages)
     first_step, substep, connect, correct = works
-    n, length, belief, mean_offset = (
-        shape.n,
-        memory.end,
-        shape.n + shape.n**2,
-        memory_offsets(shape.n, shape.m).mean,
-    )
-    later_offset, width = length - belief, belief + n * n  # after the link: predicted mean, gain, bracket
-    link_offset, substeps = later_offset - width, number_offsets(n, shape.m).substeps
+    n, t, length = shape.n, shape.t, memory.end
+    belief, mean_offset = n + t * t, memory_offsets(n, shape.m, t).mean
+    later_offset, width = length - belief, belief + t * t  # after the link: predicted mean, gain, bracket
+    link_offset, substeps = later_offset - width, shape.offsets.substeps
 
     def put(row, at, means, covs, b, k):
         for i in range(n):
             row[at + i] = means[b, k, i]
-            for j in range(n):
-                row[at + n + i * n + j] = covs[b, k, i, j]
+        for i in range(t):
+            for j in range(t):
+                row[at + n + i * t + j] = covs[b, k, i, j]
 
     def copy(target, at, source, first, count):
         for i in range(count):
@@ -204,9 +204,10 @@ def _smoother(relation: Relation, page: Page, functions: Functions, shape: Shape
                 for i in range(belief):
                     total += abs(row[link_offset + i])
                 if restarted[b, k + 1] > 0.0 or not total < 1e300:
-                    for i in range(belief):
-                        row[link_offset + i] = 0.0
-                    copy(row, link_offset + belief, row, mean_offset + n, n * n)
+                    for i in range(t * t):  # a gain of zero, whatever the predicted mean
+                        row[link_offset + n + i] = 0.0
+                    copy(row, link_offset, row, mean_offset, n)
+                    copy(row, link_offset + belief, row, mean_offset + n, t * t)
                 copy(links, k * width, row, link_offset, width)
             for end in range(lag, steps + 1):
                 put(row, later_offset, filtered, covs, b, end)
@@ -220,10 +221,11 @@ def _smoother(relation: Relation, page: Page, functions: Functions, shape: Shape
                     if end == steps or k == end - lag:
                         for i in range(n):
                             means[b, k, i] = row[later_offset + i]
-                            for j in range(n):
-                                out_covs[b, k, i, j] = row[later_offset + n + i * n + j]
+                        for i in range(t):
+                            for j in range(t):
+                                out_covs[b, k, i, j] = row[later_offset + n + i * t + j]
 
-    estimates = [(None, None, n), (None, None, n, n), (None, None)]
+    estimates = [(None, None, n), (None, None, t, t), (None, None)]
     shapes = estimates, (None, None, None), (None, None), None, *estimates[:2], None, None
     from thruster_env.graphs.loops import Loops
 
@@ -266,7 +268,8 @@ RELATIONS: dict[type[Filter], Relation] = {
 def relation_of(filter_: Filter, what: str, alternatives: str = "") -> Relation:
     """The relation of a filter for `smooth_backwards`; ValueError if it has no such smoother."""
     kind = type(filter_)
-    refuse_rotations(filter_.model)
+    if RELATIONS.get(kind) is not LINEARISED:
+        refuse_rotations(filter_.model)
     if filter_.model.bounds:
         raise ValueError(f"{what} needs a model without bounds, but got {filter_.model.bounds}")
     if isinstance(filter_, KalmanFilter) and kind is KalmanFilter and filter_.schedule > 1:

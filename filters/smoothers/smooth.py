@@ -31,6 +31,7 @@ from thruster_env.core.sources import joiner, vector_part, written_out
 from thruster_env.core.threads import spread
 from thruster_env.model.shape import number_offsets
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import refuse_rotations
 
 # The smoother of filters for several models: each pair of successive modes by a step of Rauch, Tung, Striebel.
 #
@@ -511,6 +512,7 @@ class WithSmoother:
         Raises ValueError for another lag, and a filter without a smoother of this kind.
         """
         self._runs, self._lag = runs, at_least("smoothing_lag", lag, 0)
+        refuse_rotations(filter_.model)
         self._relation = relation_of(filter_, "a smoothing_lag")
         assert isinstance(filter_, PageFilter)
         self._filter = filter_

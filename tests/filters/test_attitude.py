@@ -267,6 +267,23 @@ def test_sessions_beliefs_wrapped_envs_and_python_have_the_numbers_of_a_batch(da
     assert env.observation_space.contains(observation)
 
 
+def test_smoothed_attitudes_are_better_and_do_not_depend_on_the_side(data, of_side):
+    """The recursion backwards brings the later P into the tangent of the prediction."""
+    truth, gyro, z = data
+    body, world = (
+        filters.smooth(
+            filters.ExtendedKalmanFilter(model=attitude_model(side)), inputs=gyro[:4, :40], measurements=z[:4, :41]
+        )
+        for side in ("body", "world")
+    )
+    np.testing.assert_allclose(world.means, body.means, atol=1e-12)
+    smoothed, filtered = (
+        errors_of(truth[:4, :41], means) for means in (body.means, of_side["body"].means[:4, :41])
+    )
+    assert np.square(smoothed[..., :3]).mean() < 0.5 * np.square(filtered[..., :3]).mean()
+    np.testing.assert_array_equal(body.covs[:, -1], of_side["body"].covs[:4, 40])
+
+
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 def test_the_filter_in_c_has_the_same_numbers(data, of_side, tmp_path):
     """Its struct begins with seven states and a P of six rows; it compiles without a warning."""
@@ -307,7 +324,7 @@ def test_every_other_path_refuses_them():
     refusals = (
         lambda: filters.ExtendedKalmanFilter(model=model, form="square-root").kernels(),
         lambda: filters.ExtendedKalmanFilter(model=model, form="ud").kernels(),
-        lambda: filters.smooth(filter_, **data),
+        lambda: filters.smooth(filters.UnscentedKalmanFilter(model=model), **data),
         lambda: filters.run(filter_, **data).to_frame(),
         lambda: ForeignFilter(model=model, estimator=Estimator()),
         lambda: filters.torch(filter_),

@@ -200,11 +200,21 @@ def _numbers(n: int, turns: Sequence[Turn]) -> list[tuple[int, int]]:
 
 def reset_slopes(d: Sequence, turns: Sequence[Turn]) -> list[list]:
     """G = d difference(move(x, d + e), move(x, d))/de at e = 0, (t, t): J_r(d) or J_l(d), 1 for numbers."""
+    return _by_rotation(d, turns, rotations.left_jacobian)
+
+
+def inverse_reset_slopes(d: Sequence, turns: Sequence[Turn]) -> list[list]:
+    """The inverse of `reset_slopes`, (t, t)."""
+    return _by_rotation(d, turns, rotations.inverse_left_jacobian)
+
+
+def _by_rotation(d: Sequence, turns: Sequence[Turn], of_rotation: Any) -> list[list]:
+    """The identity with the matrix of d, or of -d for errors of the body, at each rotation."""
     t = len(d)
     result = [[float(i == j) for j in range(t)] for i in range(t)]
     for turn in turns:
         sign = -1.0 if turn.side == "body" else 1.0
         part = [sign * d[turn.tangent + k] for k in range(3)]
-        for i, row in enumerate(rotations.left_jacobian(part)):
+        for i, row in enumerate(of_rotation(part)):
             result[turn.tangent + i][turn.tangent : turn.tangent + 3] = row
     return result
