@@ -418,14 +418,14 @@ def member_stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> di
     prior = on_branch(model.prior_mean + model.prior_root @ memory.w, model.state_angles)
     started = page.started(model)
     extras = model.extras = memory.keep(started)
-    moved, *rest, changed = updated(pure(page.update, model, x, memory.z, memory.e), x, m=memory.shape.m)
+    after, *rest, changed = updated(pure(page.update, model, x, memory.z, memory.e), x, m=memory.shape.m)
     of_belief = memory.mean, memory.P
     return {
         "start": stored((prior, started), (x,), extras),
         "propagate": stored(page.propagated(model, x, u=memory.u), (x,), extras),
         "add_process_noise": stored((page.add_process_noise(model, x, memory.w),), (x,)),
-        "analyse": stored((moved,), (x,)),
-        "update": stored((moved, *rest, *moments(model, moved), changed), (x, *outputs, *of_belief), extras),
+        "analyse": stored((after,), (x,)),
+        "update": stored((after, *rest, *moments(model, after), changed), (x, *outputs, *of_belief), extras),
         "summarise": stored(moments(model, x), of_belief),
     }
 
