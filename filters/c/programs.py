@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from inspect import cleandoc
 from math import prod
 from typing import NamedTuple
@@ -45,11 +45,6 @@ KEYWORDS = frozenset(  # of C99 to C23 and C++20, and tokens that C++ writes as 
     "struct switch template this thread_local throw true try typedef typeid typename typeof typeof_unqual union "
     "unsigned using virtual void volatile wchar_t while xor xor_eq".split()
 )
-HEADERS = frozenset(  # NAME.h would hide them
-    "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdalign stdarg "
-    "stdatomic stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar "
-    "unistd wchar wctype".split()
-)
 MACROS = re.compile(
     "NAN|INFINITY|NULL|EOF|BUFSIZ|FILENAME_MAX|FOPEN_MAX|MB_CUR_MAX|MAXFLOAT|I|DOMAIN|SING|OVERFLOW|UNDERFLOW|PLOSS|"
     "TLOSS|linux|unix|i386|errno|stdin|stdout|stderr|signgam|assert|"
@@ -57,29 +52,6 @@ MACROS = re.compile(
     "(FP|M|MATH|SEEK|EXIT|RAND|TMP|SIZE|PTRDIFF|SIG|WCHAR|WINT|FLT|DBL|LDBL)_[A-Z0-9_]*|"
     "(U?INT(PTR|MAX|(_LEAST|_FAST)?(8|16|32|64))|U?CHAR|U?SHRT|U?INT|U?L?LONG)_[A-Z]+"
 )
-OF_MATH = (  # and with an f or l behind them
-    "acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh drem erf erfc exp exp10 exp2 expm1 "
-    "fabs fdim finite floor fma fmax fmin fmod frexp gamma gamma_r hypot ilogb isinf isnan j0 j1 jn ldexp "
-    "lgamma lgamma_r llrint llround log log10 log1p log2 logb lrint lround modf nan nearbyint nextafter "
-    "nexttoward pow pow10 remainder remquo rint round roundeven scalb scalbln scalbn significand sin sincos "
-    "sinh sqrt tan tanh tgamma trunc y0 y1 yn"
-).split()
-OF_OTHERS = (
-    "fpclassify isfinite isnormal signbit isgreater isgreaterequal isless islessequal islessgreater "
-    "isunordered math_errhandling offsetof abort abs alloca atexit atof atoi atol atoll bcmp bcopy bsearch "
-    "bzero calloc clearerr ctermid div dprintf drand48 ecvt erand48 exit fclose fcvt fdopen feof ferror "
-    "fflush ffs fgetc fgetpos fgets fileno fopen fprintf fputc fputs fread free freopen fscanf fseek fsetpos "
-    "ftell fwrite gcvt getc getchar getdelim getenv getline gets getw index initstate jrand48 labs ldiv llabs "
-    "lldiv lrand48 malloc mblen mbstowcs mbtowc memccpy memchr memcmp memcpy memmove memset mktemp mrand48 "
-    "nrand48 pclose perror popen printf putc putchar putenv puts putw qsort rand random realloc realpath "
-    "remove rename rewind rindex scanf select setbuf setenv setstate setvbuf snprintf sprintf srand srandom "
-    "sscanf stpcpy strcat strchr strcmp strcoll strcpy strcspn strdup strerror strlen strncat strncmp strncpy "
-    "strnlen strpbrk strrchr strsep strsignal strspn strstr strtod strtof strtok strtol strtold strtoll "
-    "strtoul strtoull strxfrm system tempnam tmpfile tmpnam ungetc unsetenv valloc vfprintf vfscanf vprintf "
-    "vscanf vsnprintf vsprintf vsscanf wcstombs wctomb write read"
-).split()
-OF_LIBRARIES = frozenset([*OF_OTHERS, *(name + kind for name in OF_MATH for kind in ("", "f", "l"))])
-FUNCTIONS = "{0}_init", "{0}_predict", "{0}_update", "{0}_test_anew", "{0}_channel"  # of a filter of this name
 
 
 # Which names a filter in C may have: none that C, C++, their libraries or the files themselves use.
@@ -93,24 +65,6 @@ def is_name(text: str) -> bool:
 def is_macro(text: str) -> bool:
     """Whether headers of C replace a name by something else."""
     return bool(MACROS.fullmatch(text))
-
-
-def is_taken(name: str, texts: Iterable[str]) -> bool:
-    """Whether a name is taken: declared by C libraries or the filter's own files, or ending in _t as types do.
-
-    Args:
-        name: of letters, digits and _.
-        texts: the files of the same filter under another name.
-    """
-    if name in OF_LIBRARIES or name in HEADERS or name == "board" or name.endswith("_t") or is_macro(name):
-        return True
-    used = {word for text in texts for word in re.findall(r"[A-Za-z_]\w*", _strip_comments(text))}
-    return not used.isdisjoint([name, *(pattern.format(name) for pattern in FUNCTIONS)])
-
-
-def _strip_comments(text: str) -> str:
-    """C code without its comments, strings and character constants, one of which may be a quote."""
-    return re.sub(r"""/\*.*?\*/|"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])+'""", " ", text, flags=re.S)
 
 
 # A page's stages as programs in C: a model's numbers are constants in them, so that zeros and ones vanish.

@@ -6,16 +6,17 @@ emulator's.
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from filters.c.log_program import log_program
 from filters.c.monitor import TestsWriter
-from filters.c.programs import FilterPrograms, is_name, is_taken, programs_of
+from filters.c.programs import FilterPrograms, is_macro, is_name, programs_of
 from filters.c.writer import EnsembleWriter, Writer
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of
@@ -142,6 +143,54 @@ class CFilter(NamedTuple):
     name: str
     header: str
     source: str
+
+
+HEADERS = frozenset(  # NAME.h would hide them
+    "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdalign stdarg "
+    "stdatomic stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar "
+    "unistd wchar wctype".split()
+)
+OF_MATH = (  # and with an f or l behind them
+    "acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh drem erf erfc exp exp10 exp2 expm1 "
+    "fabs fdim finite floor fma fmax fmin fmod frexp gamma gamma_r hypot ilogb isinf isnan j0 j1 jn ldexp "
+    "lgamma lgamma_r llrint llround log log10 log1p log2 logb lrint lround modf nan nearbyint nextafter "
+    "nexttoward pow pow10 remainder remquo rint round roundeven scalb scalbln scalbn significand sin sincos "
+    "sinh sqrt tan tanh tgamma trunc y0 y1 yn"
+).split()
+OF_OTHERS = (
+    "fpclassify isfinite isnormal signbit isgreater isgreaterequal isless islessequal islessgreater "
+    "isunordered math_errhandling offsetof abort abs alloca atexit atof atoi atol atoll bcmp bcopy bsearch "
+    "bzero calloc clearerr ctermid div dprintf drand48 ecvt erand48 exit fclose fcvt fdopen feof ferror "
+    "fflush ffs fgetc fgetpos fgets fileno fopen fprintf fputc fputs fread free freopen fscanf fseek fsetpos "
+    "ftell fwrite gcvt getc getchar getdelim getenv getline gets getw index initstate jrand48 labs ldiv llabs "
+    "lldiv lrand48 malloc mblen mbstowcs mbtowc memccpy memchr memcmp memcpy memmove memset mktemp mrand48 "
+    "nrand48 pclose perror popen printf putc putchar putenv puts putw qsort rand random realloc realpath "
+    "remove rename rewind rindex scanf select setbuf setenv setstate setvbuf snprintf sprintf srand srandom "
+    "sscanf stpcpy strcat strchr strcmp strcoll strcpy strcspn strdup strerror strlen strncat strncmp strncpy "
+    "strnlen strpbrk strrchr strsep strsignal strspn strstr strtod strtof strtok strtol strtold strtoll "
+    "strtoul strtoull strxfrm system tempnam tmpfile tmpnam ungetc unsetenv valloc vfprintf vfscanf vprintf "
+    "vscanf vsnprintf vsprintf vsscanf wcstombs wctomb write read"
+).split()
+OF_LIBRARIES = frozenset([*OF_OTHERS, *(name + kind for name in OF_MATH for kind in ("", "f", "l"))])
+FUNCTIONS = "{0}_init", "{0}_predict", "{0}_update", "{0}_test_anew", "{0}_channel"  # of a filter of this name
+
+
+def is_taken(name: str, texts: Iterable[str]) -> bool:
+    """Whether a name is taken: declared by C libraries or the filter's own files, or ending in _t as types do.
+
+    Args:
+        name: of letters, digits and _.
+        texts: the files of the same filter under another name.
+    """
+    if name in OF_LIBRARIES or name in HEADERS or name == "board" or name.endswith("_t") or is_macro(name):
+        return True
+    used = {word for text in texts for word in re.findall(r"[A-Za-z_]\w*", _strip_comments(text))}
+    return not used.isdisjoint([name, *(pattern.format(name) for pattern in FUNCTIONS)])
+
+
+def _strip_comments(text: str) -> str:
+    """C code without its comments, strings and character constants, one of which may be a quote."""
+    return re.sub(r"""/\*.*?\*/|"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])+'""", " ", text, flags=re.S)
 
 
 def c_filter(

@@ -229,11 +229,6 @@ def _following(used: PageFilter, model: StateSpaceModel, slopes: ModelSlopes) ->
     return changes
 
 
-def same_functions(first: StateSpaceModel, other: StateSpaceModel) -> bool:
-    """Whether models differ in numbers alone, for which there are slopes."""
-    return (first.functions, first.shape, first.substeps) == (other.functions, other.shape, other.substeps)
-
-
 def _begins(model: StateSpaceModel, starts: Starts) -> np.ndarray:
     """Mean and covariance of each run at its beginning, (B, n + n^2)."""
     free, count = starts.free[:, None], len(starts.free)

@@ -21,13 +21,23 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
-from filters.tensors.stages import Draw, Equation, Stages, normals_of, where
+from filters.tensors.stages import (
+    FULL_TURN,
+    LOW,
+    MULTIPLIERS,
+    ROUNDS,
+    TWO_TO_MINUS_32,
+    Draw,
+    Equation,
+    Stages,
+    where,
+)
 from thruster_env.core.sources import is_array
 from thruster_env.core.user_functions import needs_floats
 from thruster_env.graphs.folding import POSITIVE, as_single
 from thruster_env.graphs.graphs import COMPARISONS, Graph, Number, needed_by
 from thruster_env.graphs.programs import Place
-from thruster_env.model.shape import Shape, constants_are_array
+from thruster_env.model.shape import LANES, Shape, constants_are_array, padded
 from thruster_env.model.traced import MOST, Traced
 
 WORK: dict[str, Callable] = {
@@ -367,6 +377,32 @@ class Numbers(NamedTuple):
     prior_cov: Tensor
     measurement_noise_cov: Tensor
     words: Tensor  # `draws.round_keys`
+
+
+def normals_of(words: Tensor, step: int | Tensor, size: int, like: Tensor) -> Draw:
+    """A function that draws normals (..., rows, size) for `round_keys` (..., 10, 2), those of `filters.run`.
+
+    Products of 32-bit words wrap around in 64 signed bits, of which only the lower halves count.
+    """
+    width = padded(size, LANES)
+
+    def draw(stream: int, rows: int) -> Tensor:
+        block = torch.arange(rows * width // 4, device=words.device)
+        nothing = torch.zeros_like(block)
+        c0, c1, c2, c3 = block, nothing + step, nothing + stream, nothing
+        for k in range(ROUNDS):
+            products = [factor * (c & LOW) for factor, c in zip(MULTIPLIERS, (c0, c2), strict=True)]
+            first, second = (words[..., k, part, None] for part in range(2))
+            c1, c3 = (products[1] >> 32) ^ c1 ^ first, (products[0] >> 32) ^ c3 ^ second
+            c0, c1, c2, c3 = c1, products[1], c3, products[0]
+        uniforms = [((c & LOW).double() + 0.5) * TWO_TO_MINUS_32 for c in (c0, c1, c2, c3)]
+        normals = []
+        for share, turns in (uniforms[:2], uniforms[2:]):
+            radius, angle = (-2.0 * share.log()).sqrt(), FULL_TURN * (turns - 0.5)
+            normals += [radius * angle.cos(), radius * angle.sin()]
+        return torch.stack(normals, -1).unflatten(-2, (rows, -1)).flatten(-2)[..., :size].to(like.dtype)
+
+    return draw
 
 
 class Recursion:

@@ -15,7 +15,7 @@ from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
 from filters.filter import Filter, with_page
 from filters.sensitivity import likelihood
 from filters.tensors.equations import CompiledRecursion, Estimate, Numbers, OfGraph, Recursion, equation_of
-from filters.tensors.stages import EnsembleStages, Stages, root, round_keys, wrapped_where
+from filters.tensors.stages import LOW, ROUNDS, WEYL, EnsembleStages, Stages, root, wrapped_where
 from thruster_env.core.checks import as_floats, one_of, short_repr, switch
 from thruster_env.core.sources import lower_pairs
 from thruster_env.core.streams import filter_keys
@@ -154,6 +154,12 @@ def _symmetric(entries: Tensor, like: Tensor) -> Tensor | None:
     rows, columns = torch.tensor(lower_pairs(len(like)), device=like.device).T
     matrix[rows, columns] = entries
     return 0.5 * (matrix + matrix.mT)  # halves beside the diagonal, for which there are two places
+
+
+def round_keys(key: np.ndarray, device: torch.device) -> Tensor:
+    """The words of all rounds, (..., 10, 2), of keys (..., 2)."""
+    words = np.asarray(key).astype(np.uint64).astype(np.int64)[..., None, :]
+    return torch.as_tensor((words + np.outer(np.arange(ROUNDS), WEYL)) & LOW, device=device)
 
 
 class TensorFilter:

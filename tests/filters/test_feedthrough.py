@@ -30,13 +30,13 @@ from tests.slow import slow_but
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.env.model_env import ModelEnv, ModelVectorEnv
 from thruster_env.env.record import ReplayEnv
-from thruster_env.logs.log import as_rows, in_any_steps
+from thruster_env.logs.log import in_any_steps
 from thruster_env.logs.read import read_log
 from thruster_env.logs.write import EXACT, write_columns, write_log
 from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.simulate import inputs_until, simulate
 from tuning.identification.objective import Objective
-from tuning.problems.log_problem import LogProblem
+from tuning.problems.log_problem import LogProblem, as_rows
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Coordinates, Parameter
 from tuning.reporting.matlab import matlab_function

@@ -13,9 +13,9 @@ from filters.logs.findings import alarms_of
 from filters.monitoring import Monitor
 from tests.filters.test_live import oscillator
 from thruster_env.env.record import ReplayEnv
-from thruster_env.logs.grid import Series, at_own_stamps
+from thruster_env.logs.grid import Series
 from thruster_env.logs.log import Log, in_steps
-from thruster_env.logs.read import read_log
+from thruster_env.logs.read import at_own_stamps, read_log
 from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.quantities import Quantity
 from thruster_env.thruster.model import logged_model, thruster_model

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.policies.setup import TrainingConfiguration, configuration_from_json, make_configuration
+from tuning.policies.saved import configuration_from_json
+from tuning.policies.setup import TrainingConfiguration, make_configuration
 from tuning.thruster.scenario import find_scenario
 
 KILLS = 20

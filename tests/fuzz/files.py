@@ -23,7 +23,8 @@ from tests.tuned_files import write_untuned
 from thruster_env.logs.recorders.registry import fields, read
 from tuning.evaluation.tuned import read_tuned
 from tuning.policies.environments import make_environments
-from tuning.policies.setup import configuration_from_json, make_configuration
+from tuning.policies.saved import configuration_from_json
+from tuning.policies.setup import make_configuration
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study

@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from thruster_env.logs.findings import sentences
-from thruster_env.logs.log import Log, cut_at_gaps
+from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 from thruster_env.logs.write import draw_findings, write_columns, write_log
 from thruster_env.model.affine import affine_model
+from tuning.logs.problem import cut_at_gaps
 from tuning.problems.log_problem import LogProblem
 
 NAMES = ("voltage", "u", r"$\frac$", "[/]", "a,b", 'say "x"', "x;y", "é∞", "n" * 400, "thrust", "1", "t", "=1+1")

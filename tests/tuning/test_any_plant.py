@@ -28,8 +28,8 @@ from tuning.reporting.sections import advice, held_out_section
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import choice_table
 from tuning.reporting.time_figures import estimates_figure, plotted_states
-from tuning.search.objectives import check_objectives, find_objective, nis_ratio
-from tuning.search.plan import Plan
+from tuning.search.objectives import find_objective, nis_ratio
+from tuning.search.plan import Plan, check_objectives
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.thruster.scenario import find_scenario
 

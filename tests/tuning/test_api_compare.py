@@ -18,8 +18,9 @@ from tests.small_problems import UNITS, pair
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
 from thruster_env.model.affine import affine_model
+from tuning.api.compare import default_filters
 from tuning.cli.verbs import described
-from tuning.evaluation.compare import default_filters, known
+from tuning.evaluation.compare import known
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.residuals import model_error
 from tuning.problems.excitation import Steps

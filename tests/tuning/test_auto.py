@@ -21,6 +21,7 @@ from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem, RunsProblem
+from tuning.reporting.sections import trials_of_type
 from tuning.search import trials as tuning_trials
 from tuning.search.among_types import (
     ESTIMATED,
@@ -34,17 +35,9 @@ from tuning.search.among_types import (
     next_in_race,
     noise_by_gradient,
     race_of,
-    trials_of_type,
 )
-from tuning.search.plan import Plan
-from tuning.search.space import (
-    AUTO_FILTER_TYPES,
-    FILTER_TYPE,
-    choice_of,
-    joint_distributions,
-    trial_parameters,
-    untuned_choice,
-)
+from tuning.search.plan import Plan, joint_distributions
+from tuning.search.space import AUTO_FILTER_TYPES, FILTER_TYPE, choice_of, trial_parameters, untuned_choice
 from tuning.search.study import open_study, run_study
 from tuning.search.trials import (
     BUDGET,

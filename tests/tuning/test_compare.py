@@ -12,13 +12,14 @@ from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from thruster_env.model.affine import affine_model
 from tuning.cli.main import main
-from tuning.evaluation.compare import Leaderboard, Row, belief_sentences, compare, contender, sized, winners
+from tuning.evaluation.compare import Leaderboard, Row, compare, contender, sized, winners
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import write_tuned
 from tuning.problems.assumed import beliefs_of, default_belief
 from tuning.problems.data import held_out_seeds
 from tuning.problems.model_problem import ModelProblem
+from tuning.reporting.leaderboard import belief_sentences
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import StudyResult

@@ -14,9 +14,10 @@ from tests.filters.test_sensitivity import pendulum
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.logs.log import Log
 from thruster_env.model import simulate
-from tuning.identification.family import ModelFamily, with_ranges
+from tuning.api.identify import fall_sentence, with_ranges
+from tuning.identification.family import ModelFamily
 from tuning.identification.identify import identify
-from tuning.identification.profiles import fall_sentence, profile_figure, profiles, validate
+from tuning.identification.profiles import profile_figure, profiles, validate
 from tuning.identification.result import covariance, read_values, with_values, write_values
 from tuning.identification.starts import runs_of
 from tuning.problems.data import Data

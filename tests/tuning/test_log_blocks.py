@@ -7,11 +7,11 @@ import pytest
 
 from tests.tuning.test_log_problem import GUESS, MODEL, logs_of
 from thruster_env.logs.findings import Recording
-from thruster_env.logs.log import Log, cut_at_gaps
+from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 from thruster_env.logs.write import write_columns
 from tuning.evaluation.evaluate import evaluate
-from tuning.logs.problem import log_problem, split_runs
+from tuning.logs.problem import cut_at_gaps, log_problem, split_runs
 from tuning.problems.log_parts import parts_of
 from tuning.problems.log_problem import LogProblem
 from tuning.search.space import untuned_choice

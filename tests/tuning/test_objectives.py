@@ -8,14 +8,15 @@ from scipy.stats import chi2, multivariate_normal
 from docs.scripts.tuning_choice import by_objective
 from filters import run
 from tests.linear_problem import LinearProblem
-from tuning.evaluation.evaluate import evaluate
-from tuning.evaluation.runs import RunMetrics, variance_ratios
-from tuning.reporting.page import of_front, of_history
+from tuning.evaluation.evaluate import evaluate, variance_ratios
+from tuning.evaluation.runs import RunMetrics
+from tuning.reporting.page import of_history
 from tuning.reporting.search_figures import draw_history
+from tuning.reporting.sections import of_front, reported_about
 from tuning.reporting.tuning_report import _band_sentence
 from tuning.search.among_types import TypeResult
 from tuning.search.measures import measured
-from tuning.search.objectives import find_objective, nees_ratio, reported, reported_about, reported_name
+from tuning.search.objectives import find_objective, nees_ratio, reported, reported_name
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study

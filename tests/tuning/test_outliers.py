@@ -10,8 +10,8 @@ import tuning
 from tests.linear_problem import LinearProblem
 from tests.tuning.test_log_problem import GUESS, MODEL, R, logs_of
 from tuning.evaluation.held_out import evaluate_held_out, summarised, summary
-from tuning.evaluation.residuals import estimated_from, heavy_tails, tails_of, uneven_nis, uneven_sentence
-from tuning.evaluation.worth import warnings_of
+from tuning.evaluation.residuals import estimated_from, heavy_tails, tails_of, uneven_nis
+from tuning.evaluation.worth import uneven_sentence, warnings_of
 from tuning.likelihood.identifiability import as_data, identify, sentences
 from tuning.problems.log_problem import LogProblem
 from tuning.reporting.choice_words import residual_sentences

@@ -7,7 +7,8 @@ import optuna
 import pytest
 from scipy import stats
 
-from tuning.search.trials import BLOCK, P_THRESHOLD, PairedPruner, critical_rank_sum, positive_rank_sum
+from tuning.search.study import P_THRESHOLD, PairedPruner, critical_rank_sum, positive_rank_sum
+from tuning.search.trials import BLOCK
 
 
 def pruner_of_optuna():

@@ -10,7 +10,8 @@ from tests.linear_problem import LinearProblem
 from tests.tuning.methods.problems import drawn, linear
 from thruster_env.core.compiled import interpreted
 from tuning.evaluation.baselines import log_densities
-from tuning.evaluation.held_out import comparison_as_data, evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
+from tuning.evaluation.tuned import comparison_as_data
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import RunsProblem
 from tuning.reporting.choice_words import (

@@ -36,7 +36,7 @@ from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Parameter
 from tuning.reporting.choice_words import apart, choice_sentences
 from tuning.search import validation
-from tuning.search.among_types import BASELINE, MAXIMUM_LIKELIHOOD
+from tuning.search.among_types import BASELINE, MAXIMUM_LIKELIHOOD, is_local
 from tuning.search.measures import Measured, measured, over
 from tuning.search.parameters import FACTORS, model_parameters
 from tuning.search.plan import (
@@ -50,7 +50,7 @@ from tuning.search.plan import (
 )
 from tuning.search.space import Choice, untuned_choice
 from tuning.search.study import StudyResult, answered_by, open_study, run_study
-from tuning.search.trials import is_local, near
+from tuning.search.trials import near
 from tuning.search.validation import (
     Failure,
     Met,

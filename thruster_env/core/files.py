@@ -48,17 +48,6 @@ def check_target(path: str | Path) -> None:
         raise _refusal(path, error) from None
 
 
-def check_not_read(path: str | Path, read: Iterable[str | Path]) -> None:
-    """Raise ValueError if a file to be written is one of those that are read, links followed."""
-    for source in read:
-        try:
-            same = os.path.samefile(path, source)
-        except OSError:  # one of them is not there
-            continue
-        if same:
-            raise ValueError(f"an output file must not replace an input file, but got {path} for both")
-
-
 def is_private(folder: Path) -> bool:
     """Whether a folder, no link to one, is this user's, and nobody else can read or write it.
 

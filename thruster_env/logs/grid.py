@@ -23,7 +23,7 @@ Without a grid, a row is a time at which any channel has a sample (`at_own_stamp
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import NamedTuple
 
@@ -237,57 +237,7 @@ def _lies_on_grid(times: np.ndarray) -> bool:
     return bool((abs(times - np.round(times)) <= CLOSE_TO_GRID * np.maximum(1.0, abs(times))).all())
 
 
-def at_own_stamps(
-    series: Mapping[str, Series],
-    inputs: Collection[str],
-    offsets: Mapping[str, float],
-    dt: float,
-    end: float,
-    start: float = 0.0,
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """The times (K + 1,) [s] of a log's rows, and each channel at them: inputs (K,), others (K + 1,) with NaN.
-
-    A row is a time at which any channel has a sample; a channel's clock offset is subtracted from its stamps
-    first. The first row has the first stamp of the file, and what was sampled before it or after the last one is
-    left out. Inputs are held from sample to sample, before the first at its value. Nothing is moved, averaged or
-    interpolated.
-
-    Args:
-        series: samples by channel, at times since the first stamp.
-        inputs: channels that are inputs.
-        offsets: clock offsets by channel [s].
-        dt: sample time [s]: stamps that are within a billionth of it, or their rounding, are one.
-        end: the last stamp [s].
-        start: the first stamp [s], as the file has it.
-    """
-    near = closeness(dt, resolution_of(abs(start) + end))
-    shifted = {key: samples.times - offsets.get(key, 0.0) for key, samples in series.items()}
-    stamps = np.sort(np.concatenate([np.zeros(1), *shifted.values()]))
-    stamps = stamps[(stamps >= -near) & (stamps <= end + near)]
-    times = stamps[np.append(True, np.diff(stamps) > near)]
-    times[0] = 0.0
-    columns = {}
-    for key, samples in series.items():
-        if key in inputs:
-            row = np.searchsorted(shifted[key], times[:-1] + near, side="right") - 1
-            columns[key] = samples.values[np.maximum(row, 0)]
-            continue
-        within = (shifted[key] >= -near) & (shifted[key] <= end + near)
-        row = np.searchsorted(times, shifted[key][within] + near, side="right") - 1
-        columns[key] = np.full(len(times), np.nan)
-        columns[key][row] = samples.values[within]  # of two of one time the last
-    return times, columns
-
-
 # Time stamps: dates, as seconds since the first one, and the digits in which times are written.
-
-
-def since_first(dates: np.ndarray) -> np.ndarray:
-    """Seconds since the first of some datetime64 or timedelta64, (rows,), NaN where there is none."""
-    known = dates[~np.isnat(dates)]
-    if not len(known):
-        return np.full(len(dates), np.nan)
-    return (dates - known[0]) / np.timedelta64(1, "s")  # whole ticks are subtracted, so that no digit is lost
 
 
 def seconds_of(cells: Sequence[str]) -> np.ndarray | None:

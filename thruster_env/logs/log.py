@@ -10,7 +10,6 @@ own stamps is then rows of numbers, and whatever takes such rows takes the log.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,8 +23,8 @@ from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.logs.columns import INPUT, MEASUREMENT, STATE
-from thruster_env.logs.findings import STALE, Finding, Recording, Remark, found_in
-from thruster_env.logs.grid import CLOSE_TO_GRID, Series, count_steps, mean_held, resolution_of, sampled, time_text
+from thruster_env.logs.findings import Finding, Recording, found_in
+from thruster_env.logs.grid import Series, count_steps, mean_held, resolution_of, sampled
 from thruster_env.model.continuous import same_dt
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import Shape
@@ -33,9 +32,6 @@ from thruster_env.model.state_space import StateSpaceModel
 
 FEWEST_STEPS = 2
 
-# Of inputs without samples.
-LONG = 0.1  # of the log at its end
-LONGER = 10.0  # than the longest time between two samples of the input
 
 # Of rows that two logs share.
 WINDOW = 20  # rows in a row that are the same; of shorter logs half of them
@@ -250,12 +246,6 @@ def seen_by(model: StateSpaceModel, measurements: np.ndarray) -> np.ndarray:
     return measurements
 
 
-def cut_at_gaps(log: Log, shortest: int = FEWEST_STEPS + 1) -> list[Log]:
-    """The pieces of a log between gaps with at least `shortest` rows, each a log; the log itself without gaps."""
-    long = [(first, rows) for first, rows in log.pieces if rows >= max(shortest, FEWEST_STEPS + 1)]
-    return [log] if len(log.pieces) == 1 else [piece_of(log, first, rows) for first, rows in long]
-
-
 def piece_of(log: Log, first: int, rows: int) -> Log:
     """So many rows of a log from one of them on, which remembers the log."""
     kept_rows, since, source = slice(first, first + rows), first * log.dt, {}
@@ -296,31 +286,6 @@ def _with_column(rows: np.ndarray, column: int, values: np.ndarray) -> np.ndarra
 
 
 # Inputs that are held over a log, or over its end, because they have no samples there.
-
-
-def stale_inputs(inputs: Mapping[str, Series], end: float, dt: float, start: float) -> list[Remark]:
-    """Inputs without a sample after the first row, or in the last part of the log.
-
-    An input whose clock is not that of the measurements looks like this, but so does a constant one that is sent
-    once.
-
-    Args:
-        inputs: samples by channel, at times since row 0 [s].
-        end: time of the last row since row 0 [s].
-        dt: sample time [s].
-        start: time stamp of row 0 [s].
-    """
-    remarks = []
-    for key, samples in inputs.items():
-        name, last = key.partition(":")[2], float(samples.times[-1])
-        if last <= CLOSE_TO_GRID * dt:
-            text = f"{name} has no sample after the first row: it is held at {samples.values[-1]:.6g} in all rows"
-            remarks.append(Remark(STALE, key, text))
-        elif end - last > max(LONG * end, LONGER * float(np.diff(samples.times).max(initial=dt))):
-            begun = time_text(start + last, dt)
-            text = f"{name} has no sample after {begun} s: it is held at {samples.values[-1]:.6g} for the last "
-            remarks.append(Remark(STALE, key, f"{text}{end - last:.4g} s"))
-    return remarks
 
 
 # Whether two recorded runs have rows in common, so that one cannot be held out of training on the other.
@@ -444,15 +409,6 @@ def with_ratio(function: Callable, form: type, count: int, index: int, inputs: i
 def without_ratio(function: Callable, inputs: int) -> Callable:
     """`function(x, u, c)` of the inputs before the last one."""
     return written_out("seen", "x, u, c", f"function(x, u[:{inputs}], c)", function=function)
-
-
-def as_rows(log: Log) -> Log:
-    """A log on its own stamps as one of rows with step ratios; true states and other references are left out."""
-    inputs, measurements = in_steps(log)
-    quantities = (*log.input_quantities, RATIO)
-    fields: dict[str, Any] = {"inputs": inputs, "measurements": measurements, "input_quantities": quantities}
-    fields |= {"references": {}, "referred": {}, "source": {}, "stamps": None, "recording": Recording()}
-    return dataclasses.replace(log, **fields)
 
 
 def in_steps(log: Log) -> tuple[np.ndarray, np.ndarray]:

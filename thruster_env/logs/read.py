@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,20 +22,23 @@ from thruster_env.logs.columns import (
     find_wanted,
     quantities_of,
 )
-from thruster_env.logs.findings import CLOCK, Recording, Remark
+from thruster_env.logs.findings import CLOCK, STALE, Recording, Remark
 from thruster_env.logs.grid import (
+    CLOSE_TO_GRID,
     MOST_HELD,
     TOLERANCE,
     Grid,
     Series,
-    at_own_stamps,
+    closeness,
     follows,
     grid_of,
     in_seconds,
     mean_held,
+    resolution_of,
     sampled,
+    time_text,
 )
-from thruster_env.logs.log import FEWEST_STEPS, Log, stale_inputs
+from thruster_env.logs.log import FEWEST_STEPS, Log
 from thruster_env.logs.recorders.registry import Recorded, check_stamps, format_of
 from thruster_env.logs.table import Table, read_table, table_of
 from thruster_env.model.state_space import StateSpaceModel
@@ -66,6 +69,78 @@ class Description(NamedTuple):
             stamps=self.stamps if other.stamps is None else other.stamps,
             inputs_act=self.inputs_act if other.inputs_act is None else other.inputs_act,
         )
+
+
+def at_own_stamps(
+    series: Mapping[str, Series],
+    inputs: Collection[str],
+    offsets: Mapping[str, float],
+    dt: float,
+    end: float,
+    start: float = 0.0,
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The times (K + 1,) [s] of a log's rows, and each channel at them: inputs (K,), others (K + 1,) with NaN.
+
+    A row is a time at which any channel has a sample; a channel's clock offset is subtracted from its stamps
+    first. The first row has the first stamp of the file, and what was sampled before it or after the last one is
+    left out. Inputs are held from sample to sample, before the first at its value. Nothing is moved, averaged or
+    interpolated.
+
+    Args:
+        series: samples by channel, at times since the first stamp.
+        inputs: channels that are inputs.
+        offsets: clock offsets by channel [s].
+        dt: sample time [s]: stamps that are within a billionth of it, or their rounding, are one.
+        end: the last stamp [s].
+        start: the first stamp [s], as the file has it.
+    """
+    near = closeness(dt, resolution_of(abs(start) + end))
+    shifted = {key: samples.times - offsets.get(key, 0.0) for key, samples in series.items()}
+    stamps = np.sort(np.concatenate([np.zeros(1), *shifted.values()]))
+    stamps = stamps[(stamps >= -near) & (stamps <= end + near)]
+    times = stamps[np.append(True, np.diff(stamps) > near)]
+    times[0] = 0.0
+    columns = {}
+    for key, samples in series.items():
+        if key in inputs:
+            row = np.searchsorted(shifted[key], times[:-1] + near, side="right") - 1
+            columns[key] = samples.values[np.maximum(row, 0)]
+            continue
+        within = (shifted[key] >= -near) & (shifted[key] <= end + near)
+        row = np.searchsorted(times, shifted[key][within] + near, side="right") - 1
+        columns[key] = np.full(len(times), np.nan)
+        columns[key][row] = samples.values[within]  # of two of one time the last
+    return times, columns
+
+
+# Of inputs without samples.
+LONG = 0.1  # of the log at its end
+LONGER = 10.0  # than the longest time between two samples of the input
+
+
+def stale_inputs(inputs: Mapping[str, Series], end: float, dt: float, start: float) -> list[Remark]:
+    """Inputs without a sample after the first row, or in the last part of the log.
+
+    An input whose clock is not that of the measurements looks like this, but so does a constant one that is sent
+    once.
+
+    Args:
+        inputs: samples by channel, at times since row 0 [s].
+        end: time of the last row since row 0 [s].
+        dt: sample time [s].
+        start: time stamp of row 0 [s].
+    """
+    remarks = []
+    for key, samples in inputs.items():
+        name, last = key.partition(":")[2], float(samples.times[-1])
+        if last <= CLOSE_TO_GRID * dt:
+            text = f"{name} has no sample after the first row: it is held at {samples.values[-1]:.6g} in all rows"
+            remarks.append(Remark(STALE, key, text))
+        elif end - last > max(LONG * end, LONGER * float(np.diff(samples.times).max(initial=dt))):
+            begun = time_text(start + last, dt)
+            text = f"{name} has no sample after {begun} s: it is held at {samples.values[-1]:.6g} for the last "
+            remarks.append(Remark(STALE, key, f"{text}{end - last:.4g} s"))
+    return remarks
 
 
 def read_log(

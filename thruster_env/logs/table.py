@@ -23,7 +23,7 @@ from thruster_env.core.checks import as_floats, listed, short_repr
 from thruster_env.core.modules import to_install
 from thruster_env.logs.findings import Remark
 from thruster_env.logs.grid import MISSING as MISSING_TEXT
-from thruster_env.logs.grid import seconds_of, since_first
+from thruster_env.logs.grid import seconds_of
 from thruster_env.logs.recorders.topics import Refused, check_bytes, opened
 
 # What stands for a missing number, in any case of letters.
@@ -33,6 +33,14 @@ DELIMITERS = ",;\t"
 ZIP_END, ZIP_COUNT = 22, 10  # bytes of a zip's last record, and where in it the number of its files stands
 TIME_HEADER = "time_s"  # of an index of dates
 SUFFIXES = (".csv", ".parquet", ".npz")
+
+
+def since_first(dates: np.ndarray) -> np.ndarray:
+    """Seconds since the first of some datetime64 or timedelta64, (rows,), NaN where there is none."""
+    known = dates[~np.isnat(dates)]
+    if not len(known):
+        return np.full(len(dates), np.nan)
+    return (dates - known[0]) / np.timedelta64(1, "s")  # whole ticks are subtracted, so that no digit is lost
 
 
 @dataclass(frozen=True, eq=False)

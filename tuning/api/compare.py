@@ -49,7 +49,6 @@ from tuning.evaluation.compare import (
     Leaderboard,
     Row,
     contender,
-    default_filters,
     fitting,
     sized,
     winners,
@@ -212,6 +211,19 @@ def _draw(axis: Any, board: Leaderboard) -> None:
     gained = f"log L of a run less that of {verbatim(board.rows[0].label)}"
     axis.set_xlabel("score: mean RMSE over scale [-]" if truth else gained)
     axis.set_title(verbatim(board.scenario.name, most=TITLE), fontsize=11)
+
+
+PARTICLES = "pf"
+MOST_STATES = 6  # to which a thousand particles are spread by default: the number needed grows exponentially
+
+
+def default_filters(problems: Sequence[Problem]) -> tuple[list[str], dict[str, str]]:
+    """The filters of a comparison in which none is named, and by label why one is not among them."""
+    n, problem = max(((len(problem.quantities.states), problem.name) for problem in problems), default=(0, ""))
+    if n <= MOST_STATES:
+        return list(DEFAULT_FILTERS), {}
+    why = f"by default particles are for up to {MOST_STATES} states, but {problem} has {n} (--filter {PARTICLES})"
+    return [name for name in DEFAULT_FILTERS if name != PARTICLES], {PARTICLES: why}
 
 
 def compare(

@@ -33,18 +33,10 @@ from tuning.api.markers import (
 from tuning.api.progress import console_for
 from tuning.api.read_logs import recorded_runs
 from tuning.api.result import Result, drawn, frame
-from tuning.identification.family import with_ranges
 from tuning.identification.identify import STARTS, check_excitation
 from tuning.identification.identify import identify as identify_runs
 from tuning.identification.objective import Objective
-from tuning.identification.profiles import (
-    Profile,
-    Validation,
-    fall_sentence,
-    profile_figure,
-    profiles,
-    validate,
-)
+from tuning.identification.profiles import Profile, Validation, profile_figure, profiles, validate
 from tuning.identification.result import Identification
 from tuning.logs.problem import AnyStepFamily, check_offsets, family_of, remarks, split_runs, write_found
 from tuning.logs.read import pairs
@@ -60,6 +52,21 @@ RANGE, START = "ranges (--range)", "start (--start)"
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
+
+
+def fall_sentence(checked: Mapping[str, Validation]) -> list[str]:
+    """A sentence if the log-likelihood of held-out runs fell, in a list; empty if it did not.
+
+    Args:
+        checked: from `validate`, on held-out runs.
+    """
+    start, identified = checked["start"].log_likelihood, checked["identified"].log_likelihood
+    if not identified < start:
+        return []
+    return [
+        f"On the held-out runs the log-likelihood fell by {start - identified:.3g}: there the identified values "
+        "predict no better than those at the start."
+    ]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -242,6 +249,40 @@ class Identified(Result):
         loose = sum(not known for known in self.determined.values())
         verdict = f"{loose} of {len(self.values)} not determined" if loose else "all determined"
         return f"Identified({values}{more}; {verdict}, {len(self.runs)} runs)"
+
+
+def with_ranges(
+    free: Sequence[Parameter], ranges: Mapping[str, tuple[float, float]], start: Mapping[str, float]
+) -> tuple[Parameter, ...]:
+    """Free parameters with other ranges and starts; a range that reaches zero is not logarithmic.
+
+    Raises:
+        ValueError: for a name that is not free, an empty range, or a start outside its range.
+    """
+    names = [parameter.name for parameter in free]
+    for name in (*ranges, *start):
+        if name not in names:
+            raise ValueError(f"ranges and starts must be of free parameters, {', '.join(names)}, but got {name}")
+    parameters = []
+    for parameter in free:
+        low, high = ranges.get(parameter.name, (parameter.low, parameter.high))
+        at = finite(f"the start of {parameter.name}", start.get(parameter.name, parameter.start))
+        if not low < high:
+            raise ValueError(
+                f"the range of {parameter.name} must be from low to high, but got {low:g} and {high:g}"
+            )
+        if not low <= at <= high:
+            raise ValueError(f"the start of {parameter.name} must be within {low:g} and {high:g}, but got {at:g}")
+        parameters.append(
+            replace(
+                parameter,
+                low=low,
+                high=high,
+                log=low > 0 and (parameter.log or parameter.name in ranges),
+                default=at,
+            )
+        )
+    return tuple(parameters)
 
 
 def identify(

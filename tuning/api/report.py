@@ -44,8 +44,8 @@ from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.evaluation.tuned import tuned_content
 from tuning.likelihood.identifiability import identify, sentences, too_many
 from tuning.problems.problem import Problem
-from tuning.reporting.page import Pair, Section, Table, Words, html_page, markdown_page
-from tuning.reporting.search_figures import Sketchbook
+from tuning.reporting.page import Pair, Section, Table, Words, html_page, markdown_page, of_sizes
+from tuning.reporting.search_figures import Sketchbook, draw_sizes
 from tuning.reporting.sections import (
     advice,
     facts_section,
@@ -55,12 +55,11 @@ from tuning.reporting.sections import (
     run_sections,
     score_section,
     search_section,
-    sizes_section,
 )
 from tuning.reporting.subject import Subject, find_subject, is_file, kept_nis
 from tuning.reporting.tables import known_table
 from tuning.search.objectives import nis_ratio
-from tuning.search.plan import at_ends
+from tuning.search.plan import SIZE_SEEDS, at_ends
 from tuning.search.storage import quiet_optuna, storage_text
 from tuning.search.trials import measure
 
@@ -226,6 +225,25 @@ class Pages(NamedTuple):
     sections: list[Section]
     results: list[Table | str]  # tables and sentences, also for Markdown
     comparisons: list[Comparison]
+
+
+def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:
+    """Errors against ensemble size, with the number of seeds of each if they differ."""
+    first = subject.plan.scenarios[0]
+    fresh = first.size_seeds(subject.plan.seed, SIZE_SEEDS)
+    where = f"{first.seed_word} {fresh.start} to {fresh.stop - 1} of {first.name}"
+    caption = f"RMSE with 95 % intervals on {where}, which chose neither Q nor R; dashed is N."
+    size = subject.choice.numbers["ensemble_size"]
+    ratios = [[f"{row.size}", f"{row.ratio.value:.4f}", f"{row.ratio.high:.4f}", f"{row.seeds}"] for row in sizes]
+    explanation = (
+        f"Score relative to the best, paired on the same {first.seed_word}; the largest of several scenarios. "
+        "The smallest N whose upper end is below 1.01 is sufficient"
+    )
+    columns = ["N", "score over the best", "upper end of its 95 % interval", first.seed_word]
+    if len({row.seeds for row in sizes}) == 1:
+        columns, ratios = columns[:-1], [row[:-1] for row in ratios]
+    picture = book.picture(draw_sizes(sizes, size), caption, of_sizes(sizes, size))
+    return Section("Error against ensemble size", [picture, Table(explanation, columns, ratios)])
 
 
 def pages_of(file: str | None, subject: Subject, prefix: str = "p") -> Pages:

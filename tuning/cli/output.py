@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -11,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console, RenderableType
 
-from thruster_env.core.files import check_not_read, check_target, write_whole
+from thruster_env.core.files import check_target, write_whole
 from thruster_env.core.text_tables import Unfolded, console
 from tuning.cli.main import PrintedWhole
 
@@ -45,6 +46,17 @@ def _check_json(target: str | None) -> None:
 
     if Path(target).suffix in (*SUFFIXES, *ENDINGS, ".toml"):
         raise ValueError(f"--json must be no log, nor what is said of one, but got {target!r}")
+
+
+def check_not_read(path: str | Path, read: Iterable[str | Path]) -> None:
+    """Raise ValueError if a file to be written is one of those that are read, links followed."""
+    for source in read:
+        try:
+            same = os.path.samefile(path, source)
+        except OSError:  # one of them is not there
+            continue
+        if same:
+            raise ValueError(f"an output file must not replace an input file, but got {path} for both")
 
 
 def check_targets(targets: Iterable[str | Path | None], json_target: str | None, read: Iterable = ()) -> None:

@@ -58,16 +58,6 @@ from tuning.search.trials import best_trial
 OF_FILE, OF_FILTER, STUDY = "tuned", "own", "study"
 STUDY_TRIALS = 20  # of a comparison's study, if no number is given
 TUNING = "tuning"  # how the progress of such a study begins
-SAID = {
-    "true": "the plant's own (oracle; {option} true)",
-    "scaled": "the scaled default ({option} scaled)",
-    "untuned": "the rule of thumb ({option} untuned)",
-    "given": "those that the model came with ({option} given)",
-    "noise": "noise estimation ({option} noise)",
-    STUDY: "the best trial of a study ({option} study)",
-    OF_FILE: "the tuned ones",
-    OF_FILTER: "those of the filter itself",
-}
 KNOWLEDGE = ("true", "scaled", "untuned", "given", "noise", STUDY)  # of Q and R; `tuning.compare` explains it
 OF_BASELINE = {SCALED: "scaled", RULE: "untuned", GIVEN: "given", NOISE: "noise"}
 VERDICTS = {  # in sentences
@@ -81,8 +71,6 @@ SYMBOLS = {"ambient_velocity": "U_0"}  # for labels
 
 # The filters of a comparison in which none is named.
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")
-PARTICLES = "pf"
-MOST_STATES = 6  # to which a thousand particles are spread by default: the number needed grows exponentially
 
 
 class Known(NamedTuple):
@@ -185,36 +173,6 @@ def _studied(name: Any, problem: Problem, seed: int, trials: int, ensemble_size:
     values = {key: measured(choice, plan, data).value for key, choice in choices.items()}
     source = min(values, key=lambda key: values[key])
     return Known(choices[source], source if kind.has_covariance else "")
-
-
-def noise_sentence(rows: Sequence[Any], option: str = "knows") -> str:
-    """The source of the Q and R of the filters in a comparison, and why; empty if not stated.
-
-    Args:
-        rows: with a label, the source of the filter's Q and R, and a note on it.
-        option: the user's name for the choice among these.
-    """
-    groups: dict[str, list[str]] = {}
-    for row in rows:
-        if row.knows:
-            groups.setdefault(SAID[row.knows].format(option=option), []).append(row.label)
-    if not groups:
-        return ""
-    notes = "".join(dict.fromkeys(f" {row.note}" for row in rows if row.note))
-    if len(groups) == 1:
-        return f"Q and R: {next(iter(groups))}.{notes}"
-    parts = [f"of {', '.join(labels)} {words}" for words, labels in groups.items()]
-    return f"Q and R: {'; '.join(parts)}.{notes}"
-
-
-def belief_sentences(rows: Sequence[Any]) -> list[str]:
-    """The prior of each constant that filters estimate, the same for all filters, a sentence per constant."""
-    beliefs = {name: belief for row in rows for name, belief in row.beliefs.items()}
-    return [
-        f"{name} has a prior mean of {belief.mean:.4g}, a standard deviation of {belief.std:.3g} and a random "
-        f"walk of {belief.walk_std:.3g} per step (standard deviation; all in its own unit)."
-        for name, belief in beliefs.items()
-    ]
 
 
 class Contender(NamedTuple):
@@ -462,15 +420,6 @@ def timed_runs(filter_: Filter, data: Data, scale) -> tuple[RunMetrics, float]:
 
 
 # Which filters can run on all problems of a comparison, which do so by default, and why others do not.
-
-
-def default_filters(problems: Sequence[Problem]) -> tuple[list[str], dict[str, str]]:
-    """The filters of a comparison in which none is named, and by label why one is not among them."""
-    n, problem = max(((len(problem.quantities.states), problem.name) for problem in problems), default=(0, ""))
-    if n <= MOST_STATES:
-        return list(DEFAULT_FILTERS), {}
-    why = f"by default particles are for up to {MOST_STATES} states, but {problem} has {n} (--filter {PARTICLES})"
-    return [name for name in DEFAULT_FILTERS if name != PARTICLES], {PARTICLES: why}
 
 
 def fitting(names: Iterable[Any], problems: Sequence[Problem]) -> tuple[list[Any], dict[str, str]]:

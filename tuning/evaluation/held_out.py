@@ -381,21 +381,6 @@ def _digest_of_sizes(choice: Choice, plan: Plan) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def comparison_as_data(comparison: Comparison) -> dict:
-    """The data of a comparison that a report needs besides the metrics in a tuned file."""
-    by_role = {role: getattr(comparison, role) for role in ROLES}
-    return {
-        "expected_nis": _plain_numbers(comparison.tuned.expected_nis),
-        "median_nees": {
-            role: evaluation and _plain_numbers(evaluation.median_nees) for role, evaluation in by_role.items()
-        },
-        "score_ratios": {name: numbers(ratio) for name, ratio in comparison.ratios.items()},
-        "likelihood_gains": {name: numbers(gain) for name, gain in comparison.likelihood_gains.items()},
-        "over_regression": numbers(comparison.over_regression),
-        "no_scaled_default": "" if comparison.default is None else comparison.default.reason,
-    }
-
-
 def stored_comparison(content: Mapping, choice: Choice, problem: Problem) -> Comparison | None:
     """The held-out comparison on a problem that a tuned file stores; None if it has to be recomputed.
 
@@ -446,7 +431,3 @@ def _summarised(role: str, held_out: Mapping, more: Mapping, problem: Problem) -
     if held_out.get(role) is None:  # also of a file that is older than the role
         return None
     return summarised(held_out[role], problem, more["expected_nis"], more["median_nees"][role])
-
-
-def _plain_numbers(value: float) -> float | None:
-    return None if math.isnan(value) else value

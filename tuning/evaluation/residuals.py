@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.consistency.nees import normalized_squares
-from filters.consistency.report import rounded
 from filters.filter import Filter
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import correlation_flaws
@@ -199,20 +198,6 @@ def _spans(
             spans.append((run, first, last, nis))
     worst = sorted(spans, key=lambda span: -span[3])[:MOST_SPANS]
     return tuple(problem.span_label(run, first, last) for run, first, last, _ in worst)
-
-
-def uneven_sentence(uneven: UnevenNis, channels: int) -> str:
-    """A mean NIS that a few blocks carry, where, and what to do."""
-    blocks = f"{uneven.carrying} of {uneven.blocks} blocks {'carries' if uneven.carrying == 1 else 'carry'}"
-    means = [rounded(channels * mean) for mean in (uneven.mean, uneven.rest)]
-    where = f"in {'; '.join(uneven.spans)}" if uneven.spans else "spread over them"
-    effect = ", so that R or Q is too large for the others" if uneven.rest < 1.0 / LIFTED else ""
-    return (
-        f"{blocks} the mean NIS, {means[0]}; without {'it' if uneven.carrying == 1 else 'them'} it is {means[1]}, "
-        f"where {channels} is right{effect}. The large innovations are of {uneven.channel}, {where}. If that is "
-        "garbage, leave it out (--outliers missing, outliers='missing' in Python, where the findings name it; "
-        "otherwise make these cells of the log empty), or take --filter ekf-robust."
-    )
 
 
 class Residuals(NamedTuple):

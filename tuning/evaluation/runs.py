@@ -145,31 +145,6 @@ def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
     )
 
 
-def variance_ratios(runs: RunMetrics) -> tuple[float, float]:
-    """Variances of NEES and NIS over a run's steps over those of chi-squares, means over runs; NaN for none.
-
-    A chi-square of m degrees of freedom has the variance 2 m; if the number of measured channels varies, its
-    variance is added.
-    """
-    degrees = runs.present[runs.present > 0]
-    nis = _variance_over_steps(runs.nis) / (2.0 * degrees.mean() + degrees.var()) if degrees.size else np.nan
-    if runs.nees is None or runs.mean_squares is None:
-        return np.nan, nis
-    return _variance_over_steps(runs.nees) / (2.0 * runs.mean_squares.shape[1]), nis
-
-
-def _variance_over_steps(values: np.ndarray) -> float:
-    """Variance of values (B, T) over each run's steps that are not NaN, mean over runs that have two of them."""
-    present = ~np.isnan(values)
-    several = present.sum(axis=1) > 1
-    present, counts = present[several], present[several].sum(axis=1)
-    if not counts.size:
-        return np.nan
-    means = np.where(present, values[several], 0.0).sum(axis=1) / counts
-    squares = np.where(present, values[several] - means[:, None], 0.0) ** 2
-    return float((squares.sum(axis=1) / (counts - 1)).mean())
-
-
 def _concatenated(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
     """Parts as one array; None where there is no truth."""
     known = [part for part in parts if part is not None]

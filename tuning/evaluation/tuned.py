@@ -35,14 +35,7 @@ from thruster_env.core.files import write_whole
 from thruster_env.core.modules import is_code
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
-from tuning.evaluation.held_out import (
-    ROLES,
-    Comparison,
-    comparison_as_data,
-    sizes_as_data,
-    summary,
-    versions,
-)
+from tuning.evaluation.held_out import ROLES, Comparison, numbers, sizes_as_data, summary, versions
 from tuning.problems.assumed import augmented, name_and_unknown, suited
 from tuning.problems.digest import is_older
 from tuning.problems.find import built_in, find_given, find_problem, scenario_of
@@ -67,6 +60,25 @@ def write_tuned(
     """Write a tuned file with `tuned_content`, completely or not at all; ValueError if it cannot be written."""
     content = tuned_content(plan, result, comparisons, study_name, method)
     write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
+
+
+def comparison_as_data(comparison: Comparison) -> dict:
+    """The data of a comparison that a report needs besides the metrics in a tuned file."""
+    by_role = {role: getattr(comparison, role) for role in ROLES}
+    return {
+        "expected_nis": _plain_numbers(comparison.tuned.expected_nis),
+        "median_nees": {
+            role: evaluation and _plain_numbers(evaluation.median_nees) for role, evaluation in by_role.items()
+        },
+        "score_ratios": {name: numbers(ratio) for name, ratio in comparison.ratios.items()},
+        "likelihood_gains": {name: numbers(gain) for name, gain in comparison.likelihood_gains.items()},
+        "over_regression": numbers(comparison.over_regression),
+        "no_scaled_default": "" if comparison.default is None else comparison.default.reason,
+    }
+
+
+def _plain_numbers(value: float) -> float | None:
+    return None if math.isnan(value) else value
 
 
 def tuned_content(

@@ -11,7 +11,7 @@ from filters.consistency.time_constants import TimeConstants
 from tuning.evaluation.baselines import GIVEN, NO_RANGES, NOISE, ORACLE, RULE, SCALED, called
 from tuning.evaluation.evaluate import Evaluation, farthest, is_beyond
 from tuning.evaluation.held_out import Comparison
-from tuning.evaluation.residuals import uneven_sentence
+from tuning.evaluation.residuals import LIFTED, UnevenNis
 from tuning.problems.problem import Problem
 from tuning.search.space import TOLERANCE
 
@@ -43,6 +43,20 @@ def tuning_effect(comparison: Comparison, what: str = "the score") -> str:
         verb, by, much = gain(ratios[name], seeds, what).partition(" by ")
         parts.append((verb, f"{by}{much} against the {called(name)}".strip()))
     return _listed(parts)
+
+
+def uneven_sentence(uneven: UnevenNis, channels: int) -> str:
+    """A mean NIS that a few blocks carry, where, and what to do."""
+    blocks = f"{uneven.carrying} of {uneven.blocks} blocks {'carries' if uneven.carrying == 1 else 'carry'}"
+    means = [rounded(channels * mean) for mean in (uneven.mean, uneven.rest)]
+    where = f"in {'; '.join(uneven.spans)}" if uneven.spans else "spread over them"
+    effect = ", so that R or Q is too large for the others" if uneven.rest < 1.0 / LIFTED else ""
+    return (
+        f"{blocks} the mean NIS, {means[0]}; without {'it' if uneven.carrying == 1 else 'them'} it is {means[1]}, "
+        f"where {channels} is right{effect}. The large innovations are of {uneven.channel}, {where}. If that is "
+        "garbage, leave it out (--outliers missing, outliers='missing' in Python, where the findings name it; "
+        "otherwise make these cells of the log empty), or take --filter ekf-robust."
+    )
 
 
 def warnings_of(evaluation: Evaluation, problem: Problem, forget: float | None = None) -> list[str]:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from thruster_env.core.checks import finite, short_repr
+from thruster_env.core.checks import short_repr
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.problem import Parameter, squared
 from tuning.search.parameters import r_name
@@ -121,40 +120,6 @@ def variance_about(name: str, variance: float, unit: str) -> Parameter:
     """A positive variance of a quantity in this unit, within a range about its start."""
     ends = variance / NOISE_FACTOR, variance * NOISE_FACTOR
     return Parameter(name, *ends, squared(unit), default=variance)
-
-
-def with_ranges(
-    free: Sequence[Parameter], ranges: Mapping[str, tuple[float, float]], start: Mapping[str, float]
-) -> tuple[Parameter, ...]:
-    """Free parameters with other ranges and starts; a range that reaches zero is not logarithmic.
-
-    Raises:
-        ValueError: for a name that is not free, an empty range, or a start outside its range.
-    """
-    names = [parameter.name for parameter in free]
-    for name in (*ranges, *start):
-        if name not in names:
-            raise ValueError(f"ranges and starts must be of free parameters, {', '.join(names)}, but got {name}")
-    parameters = []
-    for parameter in free:
-        low, high = ranges.get(parameter.name, (parameter.low, parameter.high))
-        at = finite(f"the start of {parameter.name}", start.get(parameter.name, parameter.start))
-        if not low < high:
-            raise ValueError(
-                f"the range of {parameter.name} must be from low to high, but got {low:g} and {high:g}"
-            )
-        if not low <= at <= high:
-            raise ValueError(f"the start of {parameter.name} must be within {low:g} and {high:g}, but got {at:g}")
-        parameters.append(
-            replace(
-                parameter,
-                low=low,
-                high=high,
-                log=low > 0 and (parameter.log or parameter.name in ranges),
-                default=at,
-            )
-        )
-    return tuple(parameters)
 
 
 def _numbers_of(function: Callable) -> dict[str, float]:

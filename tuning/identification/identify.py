@@ -25,9 +25,9 @@ from tuning.identification.result import (
     Optimum,
     covariance,
     covariances_of,
-    from_nothing,
     identification_of,
     is_narrow,
+    null_of,
     null_tests,
 )
 from tuning.identification.starts import estimates_of, runs_of, starts_of
@@ -111,6 +111,22 @@ def check_excitation(objective: Objective, logs: Sequence[Log], start: np.ndarra
             f"logs must excite the free parameters, but constant inputs do not determine {', '.join(loose)}: "
             "hold these, or record steps"
         )
+
+
+def from_nothing(objective: Objective, start: np.ndarray, stop, tell) -> Ascent | None:
+    """The maximum that is found from that with all effects left out that may be zero; None without any.
+
+    So a further parameter never lowers the log-likelihood.
+    """
+    coordinates = objective.coordinates
+    nulls = [null_of(coordinates, index, start) for index in range(len(start))]
+    fixed = np.array([is_zero for _, is_zero in nulls])
+    if not fixed.any() or fixed.all():
+        return None
+    at = np.where(fixed, [null for null, _ in nulls], start)
+    bounds = coordinates.low, coordinates.high
+    without = climb(objective, at, *bounds, fixed=fixed, stop=stop)
+    return climb(objective, without.at, *bounds, stop=stop, progress=tell)
 
 
 def identify(

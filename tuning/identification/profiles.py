@@ -5,7 +5,7 @@ Validation compares the model's prediction, simulation and likelihood before and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -220,21 +220,6 @@ def validate(
         name: validation_of(objective.model_at(at), objective.data_at(at), unseen, starts)
         for name, at in points.items()
     }
-
-
-def fall_sentence(checked: Mapping[str, Validation]) -> list[str]:
-    """A sentence if the log-likelihood of held-out runs fell, in a list; empty if it did not.
-
-    Args:
-        checked: from `validate`, on held-out runs.
-    """
-    start, identified = checked["start"].log_likelihood, checked["identified"].log_likelihood
-    if not identified < start:
-        return []
-    return [
-        f"On the held-out runs the log-likelihood fell by {start - identified:.3g}: there the identified values "
-        "predict no better than those at the start."
-    ]
 
 
 def _less_predicted(model: StateSpaceModel, runs: Data, estimates: Estimates, hidden: np.ndarray) -> np.ndarray:

@@ -63,22 +63,6 @@ def null_of(coordinates: Coordinates, index: int, start: np.ndarray) -> tuple[fl
     return (0.0 if is_zero else float(start[index])), is_zero
 
 
-def from_nothing(objective: Objective, start: np.ndarray, stop, tell) -> Ascent | None:
-    """The maximum that is found from that with all effects left out that may be zero; None without any.
-
-    So a further parameter never lowers the log-likelihood.
-    """
-    coordinates = objective.coordinates
-    nulls = [null_of(coordinates, index, start) for index in range(len(start))]
-    fixed = np.array([is_zero for _, is_zero in nulls])
-    if not fixed.any() or fixed.all():
-        return None
-    at = np.where(fixed, [null for null, _ in nulls], start)
-    bounds = coordinates.low, coordinates.high
-    without = climb(objective, at, *bounds, fixed=fixed, stop=stop)
-    return climb(objective, without.at, *bounds, stop=stop, progress=tell)
-
-
 def null_tests(
     objective: Objective,
     best: Ascent,

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.differentiated.runs import ModelSlopes, same_functions
+from filters.differentiated.runs import ModelSlopes
 from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.equal_functions import bound_call, captured_numbers, differ_in_numbers_alone, with_numbers
 from thruster_env.graphs.graphs import Number
@@ -26,6 +26,11 @@ from tuning.problems.problem import Coordinates
 
 STEP = 1e-4  # of differences of the model, in coordinates
 FUNCTIONS = "transition", "observe", "transition_jacobian", "observe_jacobian"
+
+
+def same_functions(first: StateSpaceModel, other: StateSpaceModel) -> bool:
+    """Whether models differ in numbers alone, for which there are slopes."""
+    return (first.functions, first.shape, first.substeps) == (other.functions, other.shape, other.substeps)
 
 
 class ParametricModel:

@@ -21,7 +21,7 @@ from filters.tuned_file import check_preset_file, made_with, read_tuned_file, tu
 from thruster_env.core.checks import short_repr
 from thruster_env.env.record import read_for
 from thruster_env.logs.findings import has_outliers, remarks_on
-from thruster_env.logs.log import Log, cut_at_gaps, in_any_steps, piece_of
+from thruster_env.logs.log import FEWEST_STEPS, Log, in_any_steps, piece_of
 from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.clocks import CLOCK, clock_offsets, shifted
@@ -248,6 +248,12 @@ def model_named_in(problem: Problem) -> str | None:
         return None
     model = content["options"].get("model")
     return None if is_model_name(model) else model
+
+
+def cut_at_gaps(log: Log, shortest: int = FEWEST_STEPS + 1) -> list[Log]:
+    """The pieces of a log between gaps with at least `shortest` rows, each a log; the log itself without gaps."""
+    long = [(first, rows) for first, rows in log.pieces if rows >= max(shortest, FEWEST_STEPS + 1)]
+    return [log] if len(log.pieces) == 1 else [piece_of(log, first, rows) for first, rows in long]
 
 
 def split_runs(

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 import os
+import re
+import shutil
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
@@ -36,14 +38,13 @@ from tuning.policies.saved import (
     EVALUATIONS,
     FINAL,
     POLICY,
+    REPLACED,
     SETUP,
     latest_checkpoint,
     load,
-    mend,
     read_configuration,
     read_saved,
     remove,
-    reopen,
     save,
     score,
 )
@@ -226,6 +227,16 @@ class Trained(NamedTuple):
     idle: float = math.nan  # mean return of actions of zero on the episodes of the evaluations; NaN without any
 
 
+def reopen(folder: Path, steps: int) -> None:
+    """Make the final policy of a training its latest checkpoint, at its number of steps, to continue from it."""
+    checkpoint = folder / CHECKPOINTS / f"{steps:09d}"
+    checkpoint.parent.mkdir(exist_ok=True)
+    if checkpoint.exists():  # the same policy, perhaps with its replay buffer
+        remove(folder / FINAL)
+    else:
+        os.replace(folder / FINAL, checkpoint)
+
+
 def train(
     setup: TrainingConfiguration,
     folder: str | Path,
@@ -300,6 +311,31 @@ class _Idle:
     def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
         """Actions (n, p) of zero."""
         return np.zeros((len(observation), *self._shape), dtype=np.float32), state
+
+
+# Names of what is being written: the final one, and what `tempfile` and others put behind it.
+ASIDE = re.compile(rf"\.({re.escape(SETUP)}|{EVALUATIONS}|{FINAL}|{BEST}|\d+)\.(.+)")
+
+
+def mend(folder: Path) -> None:
+    """Remove the incomplete files of a killed process from a training's folder; anything else stays as it is.
+
+    A policy that was about to be replaced is restored if its successor is missing.
+    """
+    if not folder.is_dir():
+        return
+    ours = (folder / SETUP).is_file() or all(ASIDE.fullmatch(path.name) for path in folder.iterdir())
+    for path in [*folder.iterdir(), *(folder / CHECKPOINTS).glob(".*")] if ours else []:
+        match = ASIDE.fullmatch(path.name)
+        if match is None:
+            continue
+        name, end = match.groups()
+        if end == REPLACED and not path.with_name(name).exists():
+            os.replace(path, path.with_name(name))
+        elif path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def _start(folder: Path, setup: TrainingConfiguration) -> Path | None:

@@ -11,9 +11,9 @@ Stable-Baselines3 and this module use pickle.
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -25,19 +25,17 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from thruster_env.core.checks import one_of
+from thruster_env.core.checks import one_of, short_repr
 from thruster_env.render.renderer import OnStep, Played, check_drawing, steps_a_frame, write_video
 from tuning.policies.algorithms import box_of, find_algorithm
 from tuning.policies.controllers import ClassicalPolicy
 from tuning.policies.environments import episode_steps, make_environments, make_single, native_of
-from tuning.policies.setup import Part, TrainingConfiguration, TrainingPlant, configuration_from_json, plant_of
+from tuning.policies.setup import VERSION, Part, TrainingConfiguration, TrainingPlant, plant_of
 from tuning.problems.data import training_seeds
 
 SETUP, POLICY, NORMALISATION, REPLAY = "setup.json", "policy.zip", "normalisation.pkl", "replay.pkl"
 FINAL, BEST, CHECKPOINTS = "final", "best", "checkpoints"
 EVALUATIONS = "evaluations"
-# Names of what is being written: the final one, and what `tempfile` and others put behind it.
-ASIDE = re.compile(rf"\.({re.escape(SETUP)}|{EVALUATIONS}|{FINAL}|{BEST}|\d+)\.(.+)")
 REPLACED, REMOVED = "old", "gone"  # how they end where something is replaced or removed
 
 
@@ -88,27 +86,6 @@ def remove(folder: Path) -> None:
     shutil.rmtree(gone)
 
 
-def mend(folder: Path) -> None:
-    """Remove the incomplete files of a killed process from a training's folder; anything else stays as it is.
-
-    A policy that was about to be replaced is restored if its successor is missing.
-    """
-    if not folder.is_dir():
-        return
-    ours = (folder / SETUP).is_file() or all(ASIDE.fullmatch(path.name) for path in folder.iterdir())
-    for path in [*folder.iterdir(), *(folder / CHECKPOINTS).glob(".*")] if ours else []:
-        match = ASIDE.fullmatch(path.name)
-        if match is None:
-            continue
-        name, end = match.groups()
-        if end == REPLACED and not path.with_name(name).exists():
-            os.replace(path, path.with_name(name))
-        elif path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
-
-
 def find_saved(path: str | Path) -> Path:
     """The folder of a saved policy: the given one, or a training's final policy, else its latest checkpoint.
 
@@ -128,14 +105,27 @@ def latest_checkpoint(folder: Path) -> Path | None:
     return max(checkpoints, key=lambda path: int(path.name), default=None)
 
 
-def reopen(folder: Path, steps: int) -> None:
-    """Make the final policy of a training its latest checkpoint, at its number of steps, to continue from it."""
-    checkpoint = folder / CHECKPOINTS / f"{steps:09d}"
-    checkpoint.parent.mkdir(exist_ok=True)
-    if checkpoint.exists():  # the same policy, perhaps with its replay buffer
-        remove(folder / FINAL)
-    else:
-        os.replace(folder / FINAL, checkpoint)
+def configuration_from_json(text: str, name: str) -> TrainingConfiguration:
+    """The inverse of `TrainingConfiguration.as_json`; `name` is that of the file, for errors.
+
+    Raises:
+        ValueError: if it is not the text of a training configuration, or one of a later version.
+    """
+    try:
+        entries = json.loads(text)
+        version = entries.pop("version")
+        if version > VERSION:
+            raise ValueError(f"{name} must be of version {VERSION} or before, but is of version {version}")
+        if "assumed_plant" in entries:
+            raise KeyError("assumed_plant")
+    except (json.JSONDecodeError, RecursionError, TypeError, KeyError, AttributeError):
+        raise ValueError(f"{name} must hold the configuration of a policy, but got {short_repr(text)}") from None
+    try:
+        return TrainingConfiguration(**entries)
+    except TypeError:  # an entry too many or too few
+        raise ValueError(f"{name} must hold the configuration of a policy, but got {short_repr(text)}") from None
+    except ValueError as error:
+        raise ValueError(f"{error} (in {name})") from None
 
 
 def read_configuration(folder: Path) -> TrainingConfiguration:

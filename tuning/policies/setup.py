@@ -554,26 +554,3 @@ def in_scenario(setup: TrainingConfiguration, scenario: PlantScenario) -> Traini
         env_arguments={**scenario.plant_arguments, **task},
         assumed_plant=plant if setup.assumed_plant is None else setup.assumed_plant,
     )
-
-
-def configuration_from_json(text: str, name: str) -> TrainingConfiguration:
-    """The inverse of `TrainingConfiguration.as_json`; `name` is that of the file, for errors.
-
-    Raises:
-        ValueError: if it is not the text of a training configuration, or one of a later version.
-    """
-    try:
-        entries = json.loads(text)
-        version = entries.pop("version")
-        if version > VERSION:
-            raise ValueError(f"{name} must be of version {VERSION} or before, but is of version {version}")
-        if "assumed_plant" in entries:
-            raise KeyError("assumed_plant")
-    except (json.JSONDecodeError, RecursionError, TypeError, KeyError, AttributeError):
-        raise ValueError(f"{name} must hold the configuration of a policy, but got {short_repr(text)}") from None
-    try:
-        return TrainingConfiguration(**entries)
-    except TypeError:  # an entry too many or too few
-        raise ValueError(f"{name} must hold the configuration of a policy, but got {short_repr(text)}") from None
-    except ValueError as error:
-        raise ValueError(f"{error} (in {name})") from None

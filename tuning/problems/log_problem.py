@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -14,9 +15,9 @@ from filters.starts import MEASUREMENT, STARTS, cov_of_measured_starts
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
-from thruster_env.logs.findings import OUTLIERS, has_outliers, remarks_on
+from thruster_env.logs.findings import OUTLIERS, Recording, has_outliers, remarks_on
 from thruster_env.logs.findings import outliers as rows_of_outliers
-from thruster_env.logs.log import Log, as_rows, in_any_steps, seen_by
+from thruster_env.logs.log import RATIO, Log, in_any_steps, in_steps, seen_by
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
@@ -48,6 +49,15 @@ MEASURED = (
     "Each block begins where its first measurement says: the prior covariance is wide where a measurement sees "
     "the state."
 )
+
+
+def as_rows(log: Log) -> Log:
+    """A log on its own stamps as one of rows with step ratios; true states and other references are left out."""
+    inputs, measurements = in_steps(log)
+    quantities = (*log.input_quantities, RATIO)
+    fields: dict[str, Any] = {"inputs": inputs, "measurements": measurements, "input_quantities": quantities}
+    fields |= {"references": {}, "referred": {}, "source": {}, "stamps": None, "recording": Recording()}
+    return dataclasses.replace(log, **fields)
 
 
 class LogProblem(AssumedProblem):

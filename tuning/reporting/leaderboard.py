@@ -15,7 +15,7 @@ import numpy as np
 from filters.consistency.nees import Interval, slightly
 from thruster_env.core.text_tables import Table
 from thruster_env.model.quantities import Quantity
-from tuning.evaluation.compare import Leaderboard, Row, belief_sentences, noise_sentence, winners
+from tuning.evaluation.compare import OF_FILE, OF_FILTER, STUDY, Leaderboard, Row, winners
 from tuning.evaluation.evaluate import Evaluation, restart_sentences
 from tuning.evaluation.held_out import summary
 from tuning.evaluation.worth import slowest_sentence, without_truth
@@ -204,6 +204,48 @@ def about(value: Interval, digits: int) -> str:
 def unless_blank(value: float, form: str) -> str:
     """A value in a form; empty if there is no value."""
     return "" if isnan(value) else re.sub(r"^-(0(?:\.0*)?)$", r"\1", format(value, form))  # no -0
+
+
+SAID = {
+    "true": "the plant's own (oracle; {option} true)",
+    "scaled": "the scaled default ({option} scaled)",
+    "untuned": "the rule of thumb ({option} untuned)",
+    "given": "those that the model came with ({option} given)",
+    "noise": "noise estimation ({option} noise)",
+    STUDY: "the best trial of a study ({option} study)",
+    OF_FILE: "the tuned ones",
+    OF_FILTER: "those of the filter itself",
+}
+
+
+def noise_sentence(rows: Sequence[Any], option: str = "knows") -> str:
+    """The source of the Q and R of the filters in a comparison, and why; empty if not stated.
+
+    Args:
+        rows: with a label, the source of the filter's Q and R, and a note on it.
+        option: the user's name for the choice among these.
+    """
+    groups: dict[str, list[str]] = {}
+    for row in rows:
+        if row.knows:
+            groups.setdefault(SAID[row.knows].format(option=option), []).append(row.label)
+    if not groups:
+        return ""
+    notes = "".join(dict.fromkeys(f" {row.note}" for row in rows if row.note))
+    if len(groups) == 1:
+        return f"Q and R: {next(iter(groups))}.{notes}"
+    parts = [f"of {', '.join(labels)} {words}" for words, labels in groups.items()]
+    return f"Q and R: {'; '.join(parts)}.{notes}"
+
+
+def belief_sentences(rows: Sequence[Any]) -> list[str]:
+    """The prior of each constant that filters estimate, the same for all filters, a sentence per constant."""
+    beliefs = {name: belief for row in rows for name, belief in row.beliefs.items()}
+    return [
+        f"{name} has a prior mean of {belief.mean:.4g}, a standard deviation of {belief.std:.3g} and a random "
+        f"walk of {belief.walk_std:.3g} per step (standard deviation; all in its own unit)."
+        for name, belief in beliefs.items()
+    ]
 
 
 def report(board: Leaderboard) -> list[Table | str]:

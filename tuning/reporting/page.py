@@ -334,11 +334,6 @@ def of_comparison(comparison: Comparison) -> str:
     return f"Bars with whiskers. {'; '.join(sentences)}."
 
 
-def of_importances(importances: Mapping[str, float]) -> str:
-    """Every importance."""
-    return f"Bars: {', '.join(f'{name} {value:.2f}' for name, value in importances.items())}."
-
-
 def of_slices(trials: Sequence[FrozenTrial]) -> str:
     """Parameters of the best trial, and the range of the trials."""
     done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
@@ -351,19 +346,6 @@ def of_slices(trials: Sequence[FrozenTrial]) -> str:
             tried = [trial.params[name] for trial in done if name in trial.params]
             ranges.append(f"{name} {value:.3g}, tried from {min(tried):.3g} to {max(tried):.3g}")
     return f"Scatter of {len(done)} complete trials. The best has {'; '.join(ranges)}."
-
-
-def of_front(front: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
-    """Both ends of a Pareto front."""
-    ends = sorted(trial.values for trial in front)
-    described = [
-        " and ".join(
-            f"{reported_name(name)} {reported(name, value):.3g}"
-            for name, value in zip(objectives, end, strict=True)
-        )
-        for end in ends
-    ]
-    return f"Pareto front of {len(front)} trials, from {described[0]} to {described[-1]}."
 
 
 def of_sizes(sizes: Sequence[SizeRow], chosen: int) -> str:
@@ -391,20 +373,6 @@ def of_estimates(filters: Mapping[str, Filter], data: Data, index: int, dt: floa
             parts.append(f"{quantities[i].name} {size:.3g} {quantities[i].unit}".rstrip() + share)
         sentences.append(f"{name}: {what} {'; '.join(parts)}")
     return f"{'. '.join(sentences)}."
-
-
-def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) -> str:
-    """Range and mean of every column of values (K, m), and how many are missing."""
-    sentences = []
-    for name, unit, column in zip(names, units, values.T, strict=True):
-        finite = column[np.isfinite(column)]
-        if not finite.size:
-            sentences.append(f"{name}: nothing")
-            continue
-        missing = f", {len(column) - len(finite)} of {len(column)} missing" if len(finite) < len(column) else ""
-        ends = f"from {finite.min():.3g} to {finite.max():.3g} {unit}".rstrip()
-        sentences.append(f"{name} {ends}, mean {finite.mean():.3g}{missing}")
-    return f"{'; '.join(sentences)}."
 
 
 def _against(errors, innovations: np.ndarray, estimates: Estimates):

@@ -11,7 +11,7 @@ from textwrap import fill
 import numpy as np
 from numpy import isfinite
 from optuna import Study
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 
 from filters.consistency.report import rounded, sentences
 from filters.registry import filter_type
@@ -20,7 +20,6 @@ from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison, versions
-from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.worth import all_warnings, tuning_effect
 from tuning.problems.assumed import within
 from tuning.problems.find import built_in
@@ -38,11 +37,7 @@ from tuning.reporting.page import (
     as_parts,
     of_comparison,
     of_estimates,
-    of_front,
     of_history,
-    of_importances,
-    of_series,
-    of_sizes,
     of_slices,
 )
 from tuning.reporting.search_figures import (
@@ -54,18 +49,17 @@ from tuning.reporting.search_figures import (
     draw_front,
     draw_history,
     draw_importance,
-    draw_sizes,
     draw_slices,
     importances,
 )
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import kinds_table
 from tuning.reporting.time_figures import draw_estimates, draw_gains, draw_innovations, draw_signal, gains
-from tuning.search.among_types import filter_types_tried, trials_of_type
-from tuning.search.objectives import NIS_BAND, find_objective, reported_about, reported_name
+from tuning.search.among_types import filter_types_tried
+from tuning.search.objectives import NIS_BAND, find_objective, reported, reported_name
 from tuning.search.parameters import index_pairs
-from tuning.search.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan, range_warning, range_words
-from tuning.search.space import AUTO, Choice
+from tuning.search.plan import TRAINING_SEEDS, Plan, range_warning, range_words
+from tuning.search.space import AUTO, FILTER_TYPE, Choice
 
 MANY_TRIALS = 50
 MOST_ROWS = 40  # of a table of variances
@@ -146,6 +140,29 @@ def held_out_section(
     return Section(f"Before and after, on held-out {subject.plan.scenarios[0].seed_word}", parts)
 
 
+def of_front(front: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
+    """Both ends of a Pareto front."""
+    ends = sorted(trial.values for trial in front)
+    described = [
+        " and ".join(
+            f"{reported_name(name)} {reported(name, value):.3g}"
+            for name, value in zip(objectives, end, strict=True)
+        )
+        for end in ends
+    ]
+    return f"Pareto front of {len(front)} trials, from {described[0]} to {described[-1]}."
+
+
+def trials_of_type(trials: Sequence[FrozenTrial], name: str) -> list[FrozenTrial]:
+    """Trials that chose a filter type; all of them in a study of one type."""
+    return [trial for trial in trials if trial.params.get(FILTER_TYPE, name) == name]
+
+
+def reported_about(name: str) -> str:
+    """One line on what `reported` returns, with its unit."""
+    return find_objective(name).about.removeprefix("negative ").replace(", -log N", ", log N")
+
+
 def search_section(book: Sketchbook, subject: Subject) -> Section:
     """The course of the study: convergence, importances, slices, and the front of two objectives."""
     study, title = subject.study, "The study"
@@ -182,6 +199,11 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
     return Section(title, parts)
 
 
+def of_importances(importances: Mapping[str, float]) -> str:
+    """Every importance."""
+    return f"Bars: {', '.join(f'{name} {value:.2f}' for name, value in importances.items())}."
+
+
 def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Words:
     """Importances, and how they were computed; or how many trials they need."""
     shares = importances(study)
@@ -195,25 +217,6 @@ def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Wor
         f"its values there and those of all trials (PED-ANOVA): {complete} complete trials{pruned}{rough}."
     )
     return book.picture(draw_importance(shares), caption, of_importances(shares))
-
-
-def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:
-    """Errors against ensemble size, with the number of seeds of each if they differ."""
-    first = subject.plan.scenarios[0]
-    fresh = first.size_seeds(subject.plan.seed, SIZE_SEEDS)
-    where = f"{first.seed_word} {fresh.start} to {fresh.stop - 1} of {first.name}"
-    caption = f"RMSE with 95 % intervals on {where}, which chose neither Q nor R; dashed is N."
-    size = subject.choice.numbers["ensemble_size"]
-    ratios = [[f"{row.size}", f"{row.ratio.value:.4f}", f"{row.ratio.high:.4f}", f"{row.seeds}"] for row in sizes]
-    explanation = (
-        f"Score relative to the best, paired on the same {first.seed_word}; the largest of several scenarios. "
-        "The smallest N whose upper end is below 1.01 is sufficient"
-    )
-    columns = ["N", "score over the best", "upper end of its 95 % interval", first.seed_word]
-    if len({row.seeds for row in sizes}) == 1:
-        columns, ratios = columns[:-1], [row[:-1] for row in ratios]
-    picture = book.picture(draw_sizes(sizes, size), caption, of_sizes(sizes, size))
-    return Section("Error against ensemble size", [picture, Table(explanation, columns, ratios)])
 
 
 # Sections of a report on the setup: the score, the model, assumed Q and R, and the facts of the study.
@@ -419,6 +422,20 @@ def _found_by(problem: Problem) -> str:
 
 
 # Sections of a report on one run over time: estimates, measurements, innovations, gain, consistency.
+
+
+def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) -> str:
+    """Range and mean of every column of values (K, m), and how many are missing."""
+    sentences = []
+    for name, unit, column in zip(names, units, values.T, strict=True):
+        finite = column[np.isfinite(column)]
+        if not finite.size:
+            sentences.append(f"{name}: nothing")
+            continue
+        missing = f", {len(column) - len(finite)} of {len(column)} missing" if len(finite) < len(column) else ""
+        ends = f"from {finite.min():.3g} to {finite.max():.3g} {unit}".rstrip()
+        sentences.append(f"{name} {ends}, mean {finite.mean():.3g}{missing}")
+    return f"{'; '.join(sentences)}."
 
 
 def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> list[Section]:

@@ -28,17 +28,7 @@ from tuning.search.objectives import LIKELIHOOD, SCORE, reported
 from tuning.search.parameters import R, model_parameters
 from tuning.search.plan import Plan
 from tuning.search.space import FILTER_TYPE, Choice, ends_of, trial_parameters, untuned_choice, within_ranges
-from tuning.search.trials import (
-    COST,
-    NIS,
-    best_trial,
-    enqueue_new,
-    is_consistent,
-    is_local,
-    is_near,
-    is_over_budget,
-    near,
-)
+from tuning.search.trials import COST, NIS, best_trial, enqueue_new, is_consistent, is_near, is_over_budget, near
 
 # Attributes of studies and trials, whose texts must not change: they are in journals and databases.
 MAXIMUM_LIKELIHOOD = "likeliest noise"  # Q and R have maximum likelihood; of a study what they are
@@ -340,11 +330,6 @@ def filter_types_running(trials: Sequence[FrozenTrial]) -> list[str]:
     return sorted({trial.params[FILTER_TYPE] for trial in running if FILTER_TYPE in trial.params})
 
 
-def trials_of_type(trials: Sequence[FrozenTrial], name: str) -> list[FrozenTrial]:
-    """Trials that chose a filter type; all of them in a study of one type."""
-    return [trial for trial in trials if trial.params.get(FILTER_TYPE, name) == name]
-
-
 def _row(name: str, trials: list[FrozenTrial]) -> TypeResult:
     best, over = best_trial(trials), sum(map(is_over_budget, trials))
     costs = [trial.user_attrs[COST] for trial in ([best] if best else trials) if COST in trial.user_attrs]
@@ -365,6 +350,11 @@ def enqueue_what_is_left(study: optuna.Study, plan: Plan) -> None:
     if finished and plan.rescales:
         _enqueue_rescaled(study, plan, finished[-1])
     enqueue_next_type(study, plan)
+
+
+def is_local(plan: Plan, number: int) -> bool:
+    """Whether the trial after this number is to be near the best: every second one of "tpe" with one objective."""
+    return plan.sampler == "tpe" and len(plan.objectives) == 1 and number % 2 == 1
 
 
 def enqueue_after(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:

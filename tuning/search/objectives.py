@@ -9,12 +9,11 @@ Robotics: Science and Systems (`mse`, `log-score`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple
 
-from thruster_env.core.checks import one_of, short_repr
+from thruster_env.core.checks import one_of
 from tuning.evaluation.evaluate import Evaluation, mse
-from tuning.problems.problem import Problem
 
 NIS_BAND = (0.8, 1.25)  # of the mean NIS over its expected value: a constrained study calls this consistent
 MOST_PRICE = 0.05  # of the score, that a mean NIS within its band may cost
@@ -122,30 +121,6 @@ def reported(name: str, value: float) -> float:
 def reported_name(name: str) -> str:
     """The name of what `reported` returns."""
     return {LIKELIHOOD: "log L", LOG_SCORE: "log score"}.get(name, name)
-
-
-def reported_about(name: str) -> str:
-    """One line on what `reported` returns, with its unit."""
-    return find_objective(name).about.removeprefix("negative ").replace(", -log N", ", log N")
-
-
-def check_objectives(names: Iterable[str], problem: Problem) -> None:
-    """Raise ValueError if an objective needs the truth, or a derived output, that a problem does not have."""
-    for name in names:
-        objective = find_objective(name)
-        if TRUTH in objective.needs and problem.scale is None:
-            free = ", ".join(known for known, objective in OBJECTIVES.items() if TRUTH not in objective.needs)
-            raise ValueError(
-                f"an objective on {problem.name}, which has no truth, must be one of {free}, "
-                f"but got {short_repr(name)}"
-            )
-        outputs = tuple(problem.model().outputs) if objective.output else ()
-        if objective.output and objective.output not in outputs:
-            has = ", ".join(f"{OUTPUT}{symbol}" for symbol in outputs) or "none"
-            raise ValueError(
-                f"an objective on a derived output of {problem.name} must be one of {has}, "
-                f"but got {short_repr(name)}"
-            )
 
 
 def penalised(value: float, evaluation: Evaluation) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -527,19 +527,6 @@ def filter_parameters(kind: FilterType, process_noise: bool) -> list[Parameter]:
         parameters = [Parameter("N", low, high, integer=True, place=FilterParameter("ensemble_size"))]
     numbers = FILTER_PARAMETERS if process_noise else FILTER_PARAMETERS | WITHOUT_NOISE
     return parameters + [parameter for number, parameter in numbers.items() if number in known]
-
-
-def default_numbers(kind: FilterType, process_noise: bool) -> dict[str, Any]:
-    """The values of these parameters in the untuned filter."""
-    parameters = filter_parameters(kind, process_noise)
-    if kind.is_foreign:
-        return {parameter.name: parameter.start for parameter in parameters}
-    size = {"ensemble_size": ensemble_sizes_of(kind).untuned} if kind.has_ensemble else {}
-    return size | {
-        parameter.name: getattr(kind.filter_class, parameter.name)
-        for parameter in parameters
-        if parameter.name != "N"
-    }
 
 
 def _own_of_user(kind: type[Filter], number: str, low: float, high: float) -> Parameter:

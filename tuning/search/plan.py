@@ -5,12 +5,12 @@ It also states the ranges of its parameters in words, and warns of parameters th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from math import log
 from typing import Any, NamedTuple
 
 import optuna
-from optuna.distributions import BaseDistribution, IntDistribution
+from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
 
 from filters.registry import filter_type
 from filters.tuned_file import NOISE
@@ -21,18 +21,18 @@ from tuning.problems.check import checked_problem, data_of
 from tuning.problems.data import Data, estimates_on
 from tuning.problems.digest import digest_of
 from tuning.problems.problem import Argument, Parameter, Problem
-from tuning.search.objectives import COVARIANCE, LOG_SCORE, Objective, check_objectives, find_objective
+from tuning.search.objectives import COVARIANCE, LOG_SCORE, OBJECTIVES, OUTPUT, TRUTH, Objective, find_objective
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, filter_parameters, index_pairs
 from tuning.search.space import (
     AUTO,
     AUTO_FILTER_TYPES,
+    FILTER_TYPE,
     TOLERANCE,
     Choice,
     choice_of,
     fits,
     forgetting,
     has_search_space,
-    joint_distributions,
     joint_parameters,
     raised_noise,
     reachable,
@@ -47,6 +47,36 @@ MOST_OPTIONS = 3  # in a sentence
 FEW = 50  # steps, along which a user's estimator is identified
 WIDER = 1e4  # factor by which a range is widened, on the advice of a report
 NEAR_END = 0.01  # of a range, on its scale: what ends so near to an end has ended there
+
+
+def check_objectives(names: Iterable[str], problem: Problem) -> None:
+    """Raise ValueError if an objective needs the truth, or a derived output, that a problem does not have."""
+    for name in names:
+        objective = find_objective(name)
+        if TRUTH in objective.needs and problem.scale is None:
+            free = ", ".join(known for known, objective in OBJECTIVES.items() if TRUTH not in objective.needs)
+            raise ValueError(
+                f"an objective on {problem.name}, which has no truth, must be one of {free}, "
+                f"but got {short_repr(name)}"
+            )
+        outputs = tuple(problem.model().outputs) if objective.output else ()
+        if objective.output and objective.output not in outputs:
+            has = ", ".join(f"{OUTPUT}{symbol}" for symbol in outputs) or "none"
+            raise ValueError(
+                f"an objective on a derived output of {problem.name} must be one of {has}, "
+                f"but got {short_repr(name)}"
+            )
+
+
+def joint_distributions(filter_types: Sequence[str], problem: Problem, **options) -> dict[str, BaseDistribution]:
+    """The ranges of `joint_parameters`, as Optuna takes them; of several filter types, "filter" comes first."""
+    space: dict[str, BaseDistribution] = {}
+    if len(filter_types) > 1:
+        space[FILTER_TYPE] = CategoricalDistribution(filter_types)
+    return space | {
+        key: parameter.distribution
+        for key, parameter in joint_parameters(filter_types, problem, **options).items()
+    }
 
 
 class Plan(NamedTuple):

@@ -27,13 +27,13 @@ from filters.consistency.time_constants import (
 )
 from filters.estimators.foreign import ForeignFilter, estimator_named, is_trained
 from filters.filter import Filter
-from filters.registry import FILTERS, filter_type, make_filter
+from filters.registry import FILTERS, FilterType, filter_type, make_filter
 from filters.tuned_file import NOISE, PRIOR
 from tuning.problems.assumed import constants_in, rows_argument
 from tuning.problems.problem import Parameter, Problem
 from tuning.search.parameters import (
     FilterParameter,
-    default_numbers,
+    ensemble_sizes_of,
     filter_parameters,
     has_process_noise,
     model_parameters,
@@ -83,6 +83,19 @@ def oracle_choice(name: str, problem: Problem) -> Choice | None:
     return None if problem.true is None else _choice(name, problem, problem.true)
 
 
+def default_numbers(kind: FilterType, process_noise: bool) -> dict[str, Any]:
+    """The values of these parameters in the untuned filter."""
+    parameters = filter_parameters(kind, process_noise)
+    if kind.is_foreign:
+        return {parameter.name: parameter.start for parameter in parameters}
+    size = {"ensemble_size": ensemble_sizes_of(kind).untuned} if kind.has_ensemble else {}
+    return size | {
+        parameter.name: getattr(kind.filter_class, parameter.name)
+        for parameter in parameters
+        if parameter.name != "N"
+    }
+
+
 def _choice(name: str, problem: Problem, model: Mapping[str, Any]) -> Choice:
     return Choice(name, dict(model), default_numbers(filter_type(name), has_process_noise(problem)))
 
@@ -121,17 +134,6 @@ def joint_parameters(filter_types: Sequence[str], problem: Problem, **options) -
             of_filter = isinstance(parameter.place, FilterParameter) and len(filter_types) > 1
             by_name[f"{name} {parameter.name}" if of_filter else parameter.name] = parameter
     return by_name
-
-
-def joint_distributions(filter_types: Sequence[str], problem: Problem, **options) -> dict[str, BaseDistribution]:
-    """The ranges of `joint_parameters`, as Optuna takes them; of several filter types, "filter" comes first."""
-    space: dict[str, BaseDistribution] = {}
-    if len(filter_types) > 1:
-        space[FILTER_TYPE] = CategoricalDistribution(filter_types)
-    return space | {
-        key: parameter.distribution
-        for key, parameter in joint_parameters(filter_types, problem, **options).items()
-    }
 
 
 def _is_of(name: str | None, key: str) -> bool:

@@ -11,10 +11,8 @@ import io
 import math
 import pickle
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
-from itertools import accumulate
+from functools import partial
 from numbers import Real
 from statistics import geometric_mean
 from types import MappingProxyType
@@ -47,8 +45,6 @@ from tuning.search.plan import Plan
 from tuning.search.space import FILTER_TYPE, Choice, suggest
 
 BLOCK = 8  # seeds between two decisions whether to prune
-P_THRESHOLD = 0.1  # p-value of Wilcoxon's signed-rank test below which a trial is pruned
-MOST_EXACT = 50  # differences for which Optuna's test is the exact one
 RUNS, STEPS = 32, 200  # of each timed call
 FEWEST, MOST = 3, 15  # timed calls, of which the median is taken ...
 ENOUGH_SECONDS = 0.1  # ... and which end early after this time
@@ -57,71 +53,6 @@ COST = "microseconds a step"  # trial attribute
 CONSISTENCY = "mean NIS outside its band"  # name of the constraint; at most zero is inside
 NIS = "mean NIS over the number of channels"
 NEAR = 2e-5  # relative difference of parameters, above which trials are certainly not equal
-
-
-class PairedPruner(optuna.pruners.WilcoxonPruner):
-    """Optuna's pruner, whose test is a comparison of two whole numbers in all but rare cases.
-
-    Without ties the p-value of the signed-rank test depends on the sum of ranks alone, so the sum from which it is
-    below the threshold is known beforehand. Optuna decides where there are ties or values that are not finite.
-    """
-
-    def __init__(self):
-        """Take the threshold, and no decision before the first block."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            super().__init__(p_threshold=P_THRESHOLD, n_startup_steps=BLOCK)
-
-    def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
-        """Whether a trial of a study that minimises is significantly worse than its best one, and in the mean."""
-        complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        complete.sort(key=lambda finished: finished.values[0])  # so that few are asked for their constraints
-        best_so_far = next(filter(_is_feasible, complete), None)
-        if best_so_far is None:
-            return False
-        values, best = trial.intermediate_values, best_so_far.intermediate_values
-        if not values or not best or not values.keys() <= best.keys() or not _all_finite(values, best):
-            return super().prune(study, trial)
-        if len(values) >= BLOCK and _mean(best) >= _mean(values):
-            return False
-        differences = [value - best[step] for step, value in values.items()]
-        sizes = {abs(difference) for difference in differences}
-        if not BLOCK <= len(differences) <= MOST_EXACT or len(sizes) < len(differences) or 0.0 in sizes:
-            return super().prune(study, trial)
-        return positive_rank_sum(differences) >= critical_rank_sum(len(differences), P_THRESHOLD)
-
-
-def positive_rank_sum(differences: Sequence[float]) -> int:
-    """Sum of the ranks of positive differences, ranked by size from 1; of differences without ties."""
-    return sum(rank for rank, difference in enumerate(sorted(differences, key=abs), start=1) if difference > 0)
-
-
-@cache
-def critical_rank_sum(count: int, threshold: float) -> int:
-    """The smallest sum of ranks of positive differences whose one-sided p-value is below a threshold.
-
-    p(r) = P(R >= r), where R is the sum of a random subset of 1 ... count, all subsets being equally likely.
-
-    Source: Wilcoxon (1945), "Individual comparisons by ranking methods", Biometrics Bulletin 1(6).
-    """
-    subsets = [1]  # number of subsets with each sum
-    for rank in range(1, count + 1):
-        longer = subsets + [0] * rank
-        subsets = [n + (longer[r - rank] if r >= rank else 0) for r, n in enumerate(longer)]
-    beyond = accumulate(reversed(subsets))  # number with this sum or a larger one, from the largest sum downwards
-    return len(subsets) - sum(number < threshold * 2**count for number in beyond)
-
-
-def _is_feasible(trial: FrozenTrial) -> bool:
-    return all(value <= 0 for value in trial.constraints.values())
-
-
-def _all_finite(*values: dict[int, float]) -> bool:
-    return all(math.isfinite(value) for trial_values in values for value in trial_values.values())
-
-
-def _mean(values: dict[int, float]) -> float:
-    return sum(values.values()) / len(values)
 
 
 def microseconds_a_step(filter_: Filter, data: Data) -> float:
@@ -148,11 +79,6 @@ def _part(data: Data, runs: int, steps: int) -> tuple[np.ndarray, ...]:
 def over_budget(microseconds: float, budget: float) -> float:
     """Logarithm of the cost over the budget; at most zero within the budget, as Optuna expects it."""
     return math.log(microseconds / budget)
-
-
-def make_pruner(plan: Plan) -> optuna.pruners.BasePruner:
-    """A paired test over seeds, or no pruning; two objectives are never pruned."""
-    return PairedPruner() if plan.prune and len(plan.objectives) == 1 else optuna.pruners.NopPruner()
 
 
 def run_trial(
@@ -489,35 +415,6 @@ def make_sampler(
     return makers[name](seed=seed)
 
 
-def give_sampler(study: optuna.Study, make: Callable[[int], optuna.samplers.BaseSampler], present: int) -> None:
-    """Give a study the sampler of index 0 or, if another process also runs trials of it, one with its own index.
-
-    Processes that open a study at the same number of trials would propose the same trials. But trials have
-    different
-    numbers: only the process with the first sampled trial finds no earlier trial of another process. Every other
-    process takes the number of its own trial as its index.
-
-    Args:
-        study: the study whose trials this process runs.
-        make: makes the sampler of an index.
-        present: number of trials in the study before this process added any.
-    """
-    first, own_numbers = make(0), set()
-    proceed = first.before_trial
-
-    def look(_: optuna.Study, trial: FrozenTrial) -> None:
-        own_numbers.add(trial.number)
-        if "fixed_params" not in trial.system_attrs:  # nothing is sampled in an enqueued trial
-            first.before_trial = proceed  # type: ignore[method-assign]  # of this sampler alone
-            begun = (t.number for t in study.get_trials(deepcopy=False)[present:] if t.state != TrialState.WAITING)
-            if any(number < trial.number and number not in own_numbers for number in begun):
-                study.sampler = make(trial.number)
-        (proceed if study.sampler is first else study.sampler.before_trial)(study, trial)
-
-    first.before_trial = look  # type: ignore[method-assign, assignment]  # of this sampler alone
-    study.sampler = first
-
-
 def _grid(distribution: BaseDistribution) -> list:
     """Values over the range of a parameter, evenly spaced on its own scale."""
     if isinstance(distribution, CategoricalDistribution):
@@ -532,11 +429,6 @@ def _grid(distribution: BaseDistribution) -> list:
 
 
 # Every second trial of the default sampler is near the best one, so that wide ranges do not slow the search.
-
-
-def is_local(plan: Plan, number: int) -> bool:
-    """Whether the trial after this number is to be near the best: every second one of "tpe" with one objective."""
-    return plan.sampler == "tpe" and len(plan.objectives) == 1 and number % 2 == 1
 
 
 def near(best: Mapping, space: Mapping[str, BaseDistribution], plan: Plan, number: int) -> dict:

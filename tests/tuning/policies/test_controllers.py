@@ -10,8 +10,7 @@ pytest.importorskip("sb3_contrib")
 
 from tests.learners import COPIES, LIMIT, learn, setup_of, short_episodes  # noqa: F401 - some are fixtures
 from tuning.policies.environments import make_environments
-from tuning.policies.saved import classical_policy, find_saved, load, score
-from tuning.policies.setup import configuration_from_json
+from tuning.policies.saved import classical_policy, configuration_from_json, find_saved, load, score
 from tuning.problems.data import held_out_seeds
 
 SEEDS = list(range(10, 10 + COPIES))

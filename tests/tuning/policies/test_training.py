@@ -14,8 +14,15 @@ from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, sho
 from tuning.policies.algorithms import ALGORITHMS, OBSERVATION_SETS
 from tuning.policies.environments import make_environments
 from tuning.policies.learn import VALIDATION_EPISODES, _episodes_after
-from tuning.policies.saved import CHECKPOINTS, FINAL, find_saved, load, read_configuration, score
-from tuning.policies.setup import configuration_from_json
+from tuning.policies.saved import (
+    CHECKPOINTS,
+    FINAL,
+    configuration_from_json,
+    find_saved,
+    load,
+    read_configuration,
+    score,
+)
 from tuning.problems.data import held_out_seeds
 
 

@@ -13,7 +13,8 @@ pytest.importorskip("sb3_contrib")
 from tests.fuzz.checkpoints import kill_training
 from tests.learners import contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures
 from tuning.experiments import policies as comparison
-from tuning.policies.saved import BEST, CHECKPOINTS, FINAL, SETUP, find_saved, mend
+from tuning.policies.learn import mend
+from tuning.policies.saved import BEST, CHECKPOINTS, FINAL, SETUP, find_saved
 
 
 class Killed(BaseException):

@@ -14,8 +14,8 @@ from tests.learners import SMALL, contents, copied, learn, setup_of, short_episo
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.policies.algorithms import check_installed
 from tuning.policies.environments import make_environments
-from tuning.policies.saved import FINAL, find_saved, load, play
-from tuning.policies.setup import configuration_from_json, make_configuration
+from tuning.policies.saved import FINAL, configuration_from_json, find_saved, load, play
+from tuning.policies.setup import make_configuration
 from tuning.thruster.scenario import find_scenario
 
 

@@ -11,16 +11,8 @@ pytest.importorskip("sb3_contrib")
 import thruster_env.auv  # noqa: F401 - registers the envs
 from tests.learners import COPIES, SMALL, learn
 from tuning.policies.environments import make_environments, make_single
-from tuning.policies.saved import classical_policy, find_saved, load, run_episodes, score
-from tuning.policies.setup import (
-    PLANTS,
-    TASKS,
-    Part,
-    configuration_from_json,
-    in_scenario,
-    make_configuration,
-    plant_of,
-)
+from tuning.policies.saved import classical_policy, configuration_from_json, find_saved, load, run_episodes, score
+from tuning.policies.setup import PLANTS, TASKS, Part, in_scenario, make_configuration, plant_of
 from tuning.problems.data import held_out_seeds
 from tuning.problems.find import find_problem
 

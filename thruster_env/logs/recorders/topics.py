@@ -172,33 +172,6 @@ def columns_of(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 # Transforms between frames: messages that hold arrays of them give one topic for each pair of frames.
 
 
-def array_of_transforms(defined: dict, kind: str) -> str:
-    """The only field of a type of messages, if it is an array of transforms; empty for other types.
-
-    Source: ROS, tf2_msgs/TFMessage, tf/tfMessage, geometry_msgs/TransformStamped.
-    """
-    fields: Sequence[Any] = defined[kind][1] if kind in defined else ()
-    if len(fields) != 1 or not _has_frames(dict(defined.get(STAMPED, ((), ()))[1]), defined):
-        return ""
-    ((name, (node, what)),) = fields
-    is_array = node.name in ("ARRAY", "SEQUENCE") and what[0][0].name == "NAME"
-    return name if is_array and what[0][1] == STAMPED else ""
-
-
-def _has_frames(fields: Mapping, defined: dict) -> bool:
-    """Whether a message has a header, the child's frame and a transform, and nothing else."""
-    if set(fields) != {"header", "child_frame_id", "transform"}:
-        return False
-    child, (node, transform) = fields["child_frame_id"], fields["transform"]
-    is_text = child[0].name == "BASE" and child[1][0] == "string"
-    return fields["header"][1] == HEADER_TYPE and is_text and node.name == "NAME" and transform in defined
-
-
-def wants_pairs(wanted: Wanted, topic: str) -> bool:
-    """Whether a column is wanted that may belong to a pair of frames of a topic."""
-    return wanted is not None and any(column.startswith(f"{topic}/") for column in wanted)
-
-
 class Pairs:
     """Names of the topics of pairs of frames: TOPIC/PARENT/CHILD, without slashes at the beginning of a frame."""
 
