@@ -18,7 +18,7 @@ from docs.scripts import by_name
 from filters.models import named_model
 from thruster_env.core.text_tables import markdown_table
 
-SETS, CHOICES = 200, 30  # of each model, for intervals, and for the choice among models
+SETS, CHOICES = 100, 18  # of each model, for intervals, and for the choice among models
 MODELS = "constant", "constant-velocity", "constant-acceleration", "oscillator"
 LEAST_ROWS, ENOUGH, MOST_ROWS = 50, 500, 5000  # of a set; a model is chosen from ENOUGH rows on
 R = 1.0
@@ -87,7 +87,7 @@ def coverage() -> str:
     for name in MODELS:
         of_sets = [hits(drawn(name, seed)) for seed in range(SETS)]
         rates = [f"{number} {share([of_set[number] for of_set in of_sets])}" for number in of_sets[0]]
-        sets = [drawn(name, 400 + seed, ENOUGH, 3 * ENOUGH) for seed in range(CHOICES)]
+        sets = [drawn(name, 500 + seed, ENOUGH, 3 * ENOUGH) for seed in range(CHOICES)]
         chosen = [tuning.fit(data.z, times=data.times).name == name for data in sets]
         strong = [right for right, data in zip(chosen, sets, strict=True) if data.ratio >= WEAK]
         choice = share(strong if name == "oscillator" else chosen)
