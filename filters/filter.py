@@ -7,14 +7,19 @@ single steps and whole batches, compiled or not, is made from these in `filters.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from filters.engine.belief import Belief, Innovation, Kernels, OwnBelief
+from filters.engine.belief import Belief, Innovation, Kernels, OwnBelief, bounded_kernels
 from filters.engine.compile import PREDICT, UPDATE
 from filters.engine.session import GatedSession, Running, Session
+from filters.pages.kernels import page_kernels
+from filters.pages.page import Page
 from thruster_env.core.checks import short_repr
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.modules import object_named
@@ -22,13 +27,7 @@ from thruster_env.model.state_space import StateSpaceModel
 
 if TYPE_CHECKING:
     from filters.live import Live
-import dataclasses
-from collections.abc import Iterator, Mapping
-from functools import cached_property
 
-from filters.engine.belief import bounded_kernels
-from filters.pages.kernels import page_kernels
-from filters.pages.page import Page
 
 Q, R = "Q", "R"
 LIVE = "filters.live:Live"  # which knows this module

@@ -30,7 +30,7 @@ from thruster_env.core.files import BLUE, DARK, MUSTARD, RUST, SKY, save_figure
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.thruster.analysis import steady_state
-from thruster_env.thruster.env import simulate
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.parameters import PRESETS
 from thruster_env.thruster.plant import Plant, make_plant
 from tuning.problems.data import FIRST_SCORED_STEP

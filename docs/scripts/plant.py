@@ -18,7 +18,7 @@ from thruster_env.thruster.analysis import jacobians, required_substeps, run_sub
 from thruster_env.thruster.controllers import LQRController, PIController
 from thruster_env.thruster.dynamics import rates
 from thruster_env.thruster.effects import AMPLIFIER_EFFECTS, FLOW_SIGNALS, REFERENCE_SIGNALS
-from thruster_env.thruster.env import copies_of, simulate
+from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, derive_constants
 from thruster_env.thruster.plant import (
     DEFAULT_DT,

@@ -11,7 +11,7 @@ from tests.oracles import each_close, equal
 from tests.slow import SLOW
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys, filter_keys
-from thruster_env.thruster.env import simulate
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.plant import make_plant
 
 

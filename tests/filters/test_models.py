@@ -17,7 +17,7 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.core.sources import as_value
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
-from thruster_env.thruster.env import simulate as simulate_plant
+from thruster_env.thruster.equations import simulate as simulate_plant
 from thruster_env.thruster.plant import make_plant
 
 

@@ -27,8 +27,9 @@ from thruster_env.thruster.dynamics import (
     thrust_and_torque,
     thrust_and_torque_tangent,
 )
+from thruster_env.thruster.equations import step_cost
 from thruster_env.thruster.linear import OperatingPoints, operating_points, sampled_plant, slopes, thrust_of
-from thruster_env.thruster.plant import Plant, Task, step_cost, thrust_scale
+from thruster_env.thruster.plant import Plant, Task, thrust_scale
 
 # The gains of classical controllers, from the plant about an operating point.
 

@@ -259,11 +259,6 @@ class Task(NamedTuple):
     weights: tuple[float, ...] = DEFAULT_WEIGHTS
 
 
-def step_cost(error, voltage, change, tracking, energy, rate):
-    """Cost of a step, minus its reward: of a thrust error [T_max], a voltage and its change [V_max]."""
-    return tracking * error * error + energy * voltage * voltage + rate * change * change
-
-
 def make_task(
     reference=None,
     tracking_weight: float = DEFAULT_WEIGHTS[0],

@@ -17,7 +17,7 @@ import numpy as np
 
 from filters.bounds import path_bound, wrapped_variances
 from thruster_env.auv import plant as plants
-from thruster_env.auv.env import simulate
+from thruster_env.auv.equations import simulate
 from thruster_env.auv.model import MODELS, model_of_plant, state_range
 from thruster_env.auv.paths import MANOEUVRES
 from thruster_env.auv.plant import (

@@ -12,7 +12,7 @@ from thruster_env.core.checks import at_least, positive, within
 from thruster_env.core.files import check_target
 from thruster_env.core.streams import episode_keys
 from thruster_env.logs.write import check_suffix, header_of, write_columns
-from thruster_env.thruster.env import simulate
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.parameters import CHANNELS
 from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MEASUREMENT_NOISE, DEFAULT_PROCESS_NOISE, make_plant
 from tuning.api.markers import INPUT, OUTPUT, RUNS, WRITTEN, Option, PresetOption, Seed

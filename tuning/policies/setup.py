@@ -6,31 +6,20 @@ reaches Gymnasium, a filter or Stable-Baselines3, and before any other file is o
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-from filters.registry import filter_type
-from filters.tuned_file import AUGMENTED, read_tuned_file
-from thruster_env.core.checks import at_least, one_of, positive, short_repr
-from tuning.policies.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm, find_observation_set
-from tuning.problems.scenario import PlantScenario, plain
-
-# Checks of a training configuration: known names, and known arguments of env, filter and algorithm, all data.
-
-
-if TYPE_CHECKING:
-    pass
-import inspect
-from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
+from filters.registry import filter_type
+from filters.tuned_file import AUGMENTED, read_tuned_file
 from thruster_env.auv.env import SegorogeniAUVDepthEnv, SegorogeniAUVPathEnv
 from thruster_env.auv.model import MODEL_ARGUMENTS as AUV_MODEL_ARGUMENTS
 from thruster_env.auv.model import auv_model
@@ -38,6 +27,7 @@ from thruster_env.auv.paths import DepthAndCourse
 from thruster_env.auv.plant import CRUISE_SPEED, STATES
 from thruster_env.auv.plant import Plant as VehiclePlant
 from thruster_env.auv.plant import make_plant as make_vehicle
+from thruster_env.core.checks import at_least, one_of, positive, short_repr
 from thruster_env.env.env import ObserveState
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.controllers import HORIZONS
@@ -48,10 +38,18 @@ from tuning.auv.scenario import SCENARIOS as VEHICLE_SCENARIOS
 from tuning.auv.scenario import Scenario as VehicleScenario
 from tuning.auv.scenario import find_scenario as find_vehicle_scenario
 from tuning.policies.algorithms import (
+    HYPERPARAMETERS,
     LAYERS,
+    POLICY_ARGUMENTS,
     TrainingReturns,
+    find_algorithm,
+    find_observation_set,
 )
+from tuning.problems.scenario import PlantScenario, plain
 from tuning.thruster.scenario import SCENARIOS, Scenario, find_scenario
+
+# Checks of a training configuration: known names, and known arguments of env, filter and algorithm, all data.
+
 
 if TYPE_CHECKING:
     from tuning.policies.controllers import ClassicalPolicy

@@ -27,7 +27,7 @@ from thruster_env.thruster import plant as plants
 from thruster_env.thruster.analysis import equilibrium, jacobians, state_range, steady_state
 from thruster_env.thruster.controllers import PIController, lambda_gains
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
-from thruster_env.thruster.env import copies_of, simulate
+from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.linear import make_linear_plant, operating_points
 from thruster_env.thruster.model import model_of_plant
 from thruster_env.thruster.parameters import CHANNELS, is_file, preset_mapping

@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env
 import thruster_env.auv  # noqa: F401 - registers the envs
 from filters import EstimateState
 from thruster_env.auv.env import SegorogeniAUVVectorEnv
-from thruster_env.auv.env import simulate as simulate_plant
+from thruster_env.auv.equations import simulate as simulate_plant
 from thruster_env.auv.plant import make_plant
 from thruster_env.core.streams import draw_key
 from thruster_env.model.simulate import simulate

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from thruster_env.auv.env import simulate
+from thruster_env.auv.equations import simulate
 from thruster_env.auv.plant import CHANNELS, INSTRUMENTS, SUITES, VEHICLE_SENSOR_EFFECTS, make_current, make_plant
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 

@@ -10,7 +10,7 @@ from scipy import stats
 import thruster_env  # noqa: F401 - registers the env
 from thruster_env.core import streams
 from thruster_env.graphs.loops import Loops
-from thruster_env.thruster.env import simulate
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.plant import make_plant
 
 BLOCKS = 1_000_000  # four normals each

@@ -6,7 +6,7 @@ import pytest
 
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from thruster_env.core.streams import episode_keys
-from thruster_env.thruster.env import Simulation, simulate
+from thruster_env.thruster.equations import Simulation, simulate
 from thruster_env.thruster.plant import make_plant
 
 WILD = 'base = "nominal"\nprocess_noise_cov = [1e8, 1e8]\nscale = [1.0, 0.05]\n'

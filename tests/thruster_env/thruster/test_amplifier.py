@@ -9,7 +9,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.streams import episode_keys
 from thruster_env.thruster.analysis import run_substeps
-from thruster_env.thruster.env import copies_of
+from thruster_env.thruster.equations import copies_of
 from thruster_env.thruster.parameters import PRESETS, TUNNEL_PHYSICAL
 from thruster_env.thruster.plant import Task, make_plant
 

@@ -8,7 +8,7 @@ import pytest
 from thruster_env.core.streams import episode_keys
 from thruster_env.env.copies import Channel
 from thruster_env.model.quantities import Quantity
-from thruster_env.thruster.env import simulate
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.linear import make_linear_plant
 from thruster_env.thruster.model import model_of_plant, thruster_model
 from thruster_env.thruster.parameters import CHANNELS

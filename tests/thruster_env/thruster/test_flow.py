@@ -12,7 +12,7 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.effects.effects import RecordedSeries
 from thruster_env.thruster.analysis import run_substeps, state_range
 from thruster_env.thruster.effects import FLOW_SIGNALS
-from thruster_env.thruster.env import copies_of
+from thruster_env.thruster.equations import copies_of
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
 from thruster_env.thruster.plant import Task, make_plant
 

@@ -9,7 +9,7 @@ from thruster_env.core.checks import at_least, covariance, covariance_root, fini
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import draw_key, episode_keys
 from thruster_env.thruster.analysis import run_substeps, steady_state
-from thruster_env.thruster.env import copies_of, simulate
+from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, checked
 from thruster_env.thruster.plant import Task, make_plant
 

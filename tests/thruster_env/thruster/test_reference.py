@@ -13,7 +13,8 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.effects.effects import Effect
 from thruster_env.thruster.analysis import steady_state
 from thruster_env.thruster.effects import REFERENCE_SIGNALS
-from thruster_env.thruster.env import BowThrusterReversalEnv, BowThrusterTrackingEnv, copies_of
+from thruster_env.thruster.env import BowThrusterReversalEnv, BowThrusterTrackingEnv
+from thruster_env.thruster.equations import copies_of
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
 from thruster_env.thruster.plant import Task, make_plant, make_task
 

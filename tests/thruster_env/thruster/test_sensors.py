@@ -15,7 +15,7 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.effects.effects import Effect
 from thruster_env.effects.sensors import SENSOR_EFFECTS, Bias, Quantisation
 from thruster_env.thruster.dynamics import thrust_and_torque
-from thruster_env.thruster.env import simulate
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.parameters import CHANNELS, PRESETS, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.thruster.plant import make_plant
 

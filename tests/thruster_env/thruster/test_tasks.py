@@ -17,7 +17,8 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.effects.effects import Sinusoid
 from thruster_env.effects.sensors import Dropout
 from thruster_env.thruster.effects import LogNormal
-from thruster_env.thruster.env import BowThrusterLinearEnv, simulate
+from thruster_env.thruster.env import BowThrusterLinearEnv
+from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.linear import PUBLISHED, make_linear_plant
 from thruster_env.thruster.parameters import TUNNEL_PHYSICAL
 

@@ -27,7 +27,8 @@ from thruster_env.thruster.effects import (
     extreme_parameters,
     make_uncertainty,
 )
-from thruster_env.thruster.env import BowThrusterVectorEnv, copies_of, simulate
+from thruster_env.thruster.env import BowThrusterVectorEnv
+from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.thruster.plant import Task, make_plant
 
