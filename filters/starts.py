@@ -213,7 +213,9 @@ def _states_and_cause(
         if cause != UNKNOWN:
             break
     symbols = (state.symbol for state, lost in zip(filter_.model.states, states, strict=True) if lost)
-    return tuple(symbols), f"{cause} in modes[{j}]" if modes and cause != UNKNOWN else cause
+    if cause == UNKNOWN and np.isnan(z).any():
+        cause += "; a measurement is missing there, which a page of your own has to mask (mask_missing)"
+    return tuple(symbols), f"{cause} in modes[{j}]" if modes and not cause.startswith(UNKNOWN) else cause
 
 
 def _model_of_numbers(model: StateSpaceModel, numbers: np.ndarray | None) -> StateSpaceModel:
