@@ -33,6 +33,7 @@ OF_FLOATS = {"Add": "fadd", "Sub": "fsub", "Mult": "fmul", "Div": "fdiv"}
 COMPARISONS = {"Lt": "<", "LtE": "<=", "Gt": ">", "GtE": ">=", "Eq": "==", "NotEq": "!="}
 BIAS, EXPONENTS = 1023, 2047  # of a float64's exponent: what is added to it, and its bits
 MOST_FACTORS = 8  # of a power that is written as a product
+OF_TWO = "arctan2", "hypot", "pow"  # functions of two numbers
 
 
 class Untranslated(TypeError):
@@ -153,6 +154,8 @@ class Arithmetic:
     def function(self, name: str, *arguments: Any) -> ir.Value:
         """A function of floats by its name in NumPy: an intrinsic of LLVM, or a function of C's library."""
         values, module = [self.as_float(value) for value in arguments], self.builder.module
+        if len(values) != (2 if name in OF_TWO else 1):
+            raise Untranslated(f"{name} of {len(values)} numbers")
         if name in OF_LLVM:
             return self.builder.call(
                 module.declare_intrinsic(f"llvm.{OF_LLVM[name]}", [DOUBLE]), values, fastmath=self._flags
@@ -162,7 +165,11 @@ class Arithmetic:
         return self.builder.call(module.globals.get(name) or ir.Function(module, kind, name), values)
 
     def extreme(self, name: str, *values: Any) -> Any:
-        """The least ("Lt") or the largest ("Gt") of numbers, of equal ones the first, as Python has it."""
+        """The least ("Lt") or the largest ("Gt") of numbers, or of a tuple of these, the first of equal ones."""
+        if len(values) == 1:
+            if type(values[0]) is not tuple or not values[0]:
+                raise Untranslated("min or max of what is no tuple of numbers")
+            (values,) = values
         first, *rest = values
         for value in rest:
             if is_known(first) and is_known(value):

@@ -8,9 +8,10 @@ size, its caller frees.
 from __future__ import annotations
 
 import ctypes
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -106,7 +107,7 @@ class Arrays:
 
     Attributes:
         numbers: operations on numbers.
-        wraps: whether an index that is not known may be negative and count from the end.
+        wraps: whether an index that is not known may be negative and count from the end, or be none: of a user's.
     """
 
     has_loops: bool
@@ -187,45 +188,86 @@ class Arrays:
     # Entries.
 
     def _part(self, value: Any, index: Any) -> Any:
-        """An entry or a part of a tuple or an array."""
-        entry = self._entry(value, index)
-        if isinstance(entry, Array) and not entry.shape:
-            return self._builder.load(entry.pointer, align=8, typ=DOUBLE)
-        return entry
-
-    def _entry(self, value: Any, index: Any) -> Any:
-        """What lies at an index: a tuple's entry, or an array's part, which has no lengths if it is a number."""
+        """An entry or a part of a tuple or an array; NaN at an index that is not within an array of a user's."""
         if not isinstance(value, Array):
-            if isinstance(value, tuple):
-                if is_known(index):
-                    return value[index]
-                return (
-                    self._entry_of_known(value, index)
-                    if is_known(value)
-                    else self._part(self._copied(value), index)
-                )
-            raise Untranslated("an index")
+            if not isinstance(value, tuple):
+                raise Untranslated("an index")
+            if is_known(index):
+                return value[index]
+            if is_known(value):
+                return self._entry_of_known(value, index)
+            value = self._copied(value)
+        entry, within = self._entry(value, index)
+        return entry if entry.shape else self._or_nan(within, self._load(entry))
+
+    def _load(self, entry: Array) -> ir.Value:
+        return self._builder.load(entry.pointer, align=8, typ=DOUBLE)
+
+    def _or_nan(self, within: Any, value: ir.Value) -> ir.Value:
+        """A number, or NaN if an index is not within its array."""
+        return value if within is None else self._builder.select(within, value, ir.Constant(DOUBLE, math.nan))
+
+    def _entry(self, array: Array, index: Any) -> tuple[Array, Any]:
+        """What lies at an index of an array, which has no lengths if it is a number.
+
+        Also whether the index lies within the array, or None if it must: else the entry is another one.
+        """
         indices = list(index) if isinstance(index, tuple) else [index]
-        indices += [slice(None)] * (len(value.shape) - len(indices))
-        at, shape, steps, of_two = 0, [], [], self.numbers.of_two
-        for part, size, step in zip(indices, value.shape, value.steps, strict=True):
-            first: Any = self._from_the_end(part, size)
+        if len(indices) > len(array.shape):
+            raise Untranslated("more indices than an array has")
+        indices += [slice(None)] * (len(array.shape) - len(indices))
+        at, shape, steps, of_two, all_within = 0, [], [], self.numbers.of_two, None
+        for part, size, step in zip(indices, array.shape, array.steps, strict=True):
             if isinstance(part, slice):
-                if part.step is not None:
-                    raise Untranslated("a slice with a step")
-                if all(map(is_known, (part.start, part.stop, size))):
-                    first, stop, _ = part.indices(size)
-                    stop = max(first, stop)
-                else:
-                    first = 0 if part.start is None else self._from_the_end(part.start, size)
-                    stop = size if part.stop is None else self._from_the_end(part.stop, size)
+                first, stop = self._bounds(part, size)
                 shape.append(of_two("Sub", stop, first))
                 steps.append(step)
+            else:
+                first, within = self._within(part, size)
+                if within is not None:
+                    all_within = within if all_within is None else self._builder.and_(all_within, within)
             at = of_two("Add", at, of_two("Mult", first, step))
-        return Array(self._behind(value.pointer, at), tuple(shape), tuple(steps))
+        return Array(self._behind(array.pointer, at), tuple(shape), tuple(steps)), all_within
+
+    def _bounds(self, part: slice, size: Any) -> tuple[Any, Any]:
+        """The first index of a slice, and the one after its last; in functions of users cut off as in Python."""
+        if part.step is not None:
+            raise Untranslated("a slice with a step")
+        if all(map(is_known, (part.start, part.stop, size))):
+            first, stop, _ = part.indices(size)
+            return first, max(first, stop)
+        first = 0 if part.start is None else self._from_the_end(part.start, size)
+        stop = size if part.stop is None else self._from_the_end(part.stop, size)
+        if self.wraps:
+            least, most = (partial(self.numbers.extreme, name) for name in ("Lt", "Gt"))
+            first = least(most(first, 0), size)
+            stop = least(most(stop, first), size)
+        return first, stop
+
+    def _within(self, index: Any, size: Any) -> tuple[Any, Any]:
+        """An index from the beginning, in functions of users 0 if it is not within; and whether it is, or None."""
+        index = self._from_the_end(index, size)
+        if not self.wraps:
+            return index, None
+        if is_known(index) and is_known(size):
+            if not 0 <= index < size:
+                raise Untranslated(f"the index {index} of {size} numbers")
+            return index, None
+        index, zero = self.numbers.as_whole(index), ir.Constant(LONG, 0)
+        within = self._builder.icmp_unsigned("<", index, self.numbers.as_whole(size))
+        return self._builder.select(within, index, zero), within
+
+    def _at(self, array: Array, indices: tuple) -> Array:
+        """The part of an array at indices of a loop over all of it."""
+        count, of_two = len(indices), self.numbers.of_two
+        at = reduce(partial(of_two, "Add"), map(partial(of_two, "Mult"), indices, array.steps), 0)
+        return Array(self._behind(array.pointer, at), array.shape[count:], array.steps[count:])
 
     def _entry_of_known(self, values: tuple, index: Any) -> ir.Value:
-        """An entry of a tuple of known numbers, at an index that is not known."""
+        """An entry of a tuple of known numbers, at an index that is not known; NaN if it is not within.
+
+        Of whole numbers it is the least one then, which is no index either.
+        """
         numbers = [as_value(value) for value in values if is_known(value)]
         kind = DOUBLE if any(number.type == DOUBLE for number in numbers) else LONG
         if len(numbers) < len(values) or not values:
@@ -234,8 +276,12 @@ class Arrays:
         table = ir.GlobalVariable(module, ir.ArrayType(kind, len(values)), module.get_unique_name("known"))
         table.linkage, table.global_constant = "internal", True
         table.initializer = ir.Constant(table.value_type, [float(v) if kind == DOUBLE else int(v) for v in values])
+        index, within = self._within(index, len(values))
         pointer = self._builder.gep(table, [ir.Constant(LONG, 0), self.numbers.as_whole(index)])
-        return self._builder.load(pointer, typ=kind)
+        value = self._builder.load(pointer, typ=kind)
+        if kind == DOUBLE or within is None:
+            return self._or_nan(within, value)
+        return self._builder.select(within, value, ir.Constant(LONG, -(2**63)))
 
     def _from_the_end(self, bound: Any, size: Any) -> Any:
         """An index or a bound that counts from the beginning: a negative one counts from the end.
@@ -301,17 +347,18 @@ class Arrays:
     def _fill(self, out: Array, values: Any) -> None:
         """Copy numbers into an array: those of a tuple or of an array, or one."""
         if is_tuple(values):
-            if is_known(out.shape[0]) and out.shape[0] != len(values):
+            if out.shape[0] != len(values) if is_known(out.shape[0]) else self.wraps:
                 raise Untranslated("numbers of another shape than their array")
             for k, part in enumerate(values):
-                self._fill(self._entry(out, k), part)
+                self._fill(self._at(out, (k,)), part)
             return
         if isinstance(values, Array) and not self._is_apart(out, values):
             values = self._copied(values)
         for indices in self._indices(self._common_shape(out, values)):
-            self._builder.store(
-                self.numbers.as_float(self._at(values, indices)), self._entry(out, indices).pointer, align=8
-            )
+            self._put(self._at(out, indices), self._number_at(values, indices))
+
+    def _put(self, entry: Array, number: Any) -> None:
+        self._builder.store(self.numbers.as_float(number), entry.pointer, align=8)
 
     def _is_apart(self, out: Array, values: Array) -> bool:
         """Whether two arrays have no memory in common, for sure, or are one."""
@@ -324,8 +371,7 @@ class Arrays:
         shape = self._common_shape(*values)
         out = self._new_array(shape)
         for indices in self._indices(shape):
-            entry = function(*(self._at(value, indices) for value in values))
-            self._builder.store(self.numbers.as_float(entry), self._entry(out, indices).pointer, align=8)
+            self._put(self._at(out, indices), function(*(self._number_at(value, indices) for value in values)))
         return out
 
     def _common_shape(self, *values: Any) -> tuple:
@@ -346,8 +392,8 @@ class Arrays:
             for rest in self._indices(shape[1:]):
                 yield (first, *rest)
 
-    def _at(self, value: Any, indices: tuple) -> Any:
-        return self._part(value, indices) if isinstance(value, Array) and indices else value
+    def _number_at(self, value: Any, indices: tuple) -> Any:
+        return self._load(self._at(value, indices)) if isinstance(value, Array) else value
 
     def _eigenvectors(self, a: Array) -> tuple[Array, Array]:
         """NumPy's `eigh`, by the same function of LAPACK; its matrices are columns after columns."""

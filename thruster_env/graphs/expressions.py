@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import math
 import types
 from collections.abc import Callable, Iterator, Sequence
 from functools import reduce
@@ -243,10 +244,24 @@ class Expressions(Arrays):
         if name == "reshape" and isinstance(value, Array):
             shape = arguments[0] if isinstance(arguments[0], tuple) else tuple(arguments)
             if value.steps == self.array_at(value.pointer, value.shape).steps:  # in C order
-                return self.array_at(value.pointer, (self._count(value.shape),) if shape == (-1,) else shape)
+                return self.array_at(value.pointer, self._of_same_count(shape, value))
         if name == "view" and isinstance(value, ir.Value):
             return self.numbers.bits_as({np.int64: LONG, np.float64: DOUBLE}[arguments[0]], value)
         raise Untranslated(f"the method {name}")
+
+    def _of_same_count(self, shape: tuple, value: Array) -> tuple:
+        """A shape for the numbers of an array, whose -1 is what remains for it."""
+        count = self._count(value.shape)
+        if shape == (-1,):
+            return (count,)
+        if is_known((count, *shape)):
+            rest = math.prod(size for size in shape if size != -1)
+            shape = tuple(count // max(rest, 1) if size == -1 else size for size in shape)
+            if math.prod(shape) != count:
+                raise Untranslated(f"{count} numbers in the shape {shape}")
+        elif any(is_known(size) and size == -1 for size in shape):
+            raise Untranslated("a shape with -1 for a count that is not known")
+        return shape
 
     def _binop(self, node: ast.BinOp) -> Any:
         a, b = self._value(node.left), self._value(node.right)

@@ -8,8 +8,8 @@
 
 What a function has in its closure is known when it is translated, so sizes are constants. A function that it
 calls is translated once for all calls that differ in numbers alone. Whatever else it contains raises
-`Untranslated`. The same function runs as Python. Nothing checks indices: one that is not
-known must lie within the array, and counts from its beginning.
+`Untranslated`. The same function runs as Python. An index that is not known must lie within the array and counts
+from its beginning; only a user's function may have others, which count from the end, or read NaN as Python raises.
 """
 
 from __future__ import annotations
@@ -38,7 +38,16 @@ from thruster_env.graphs.arrays import LAPACK, POINTER, Memory, of_lapack
 from thruster_env.graphs.expressions import FILL_NORMALS, Expressions, Functions
 from thruster_env.graphs.forms import Array, changing_form, common_form, is_tuple
 from thruster_env.graphs.instructions import DOUBLE, LONG
-from thruster_env.graphs.machine_code import WIDE, Code, NotLinked, add_builtin, code_folder, code_of, function_of
+from thruster_env.graphs.machine_code import (
+    WIDE,
+    Code,
+    NotLinked,
+    add_builtin,
+    check,
+    code_folder,
+    code_of,
+    function_of,
+)
 
 
 class Entry(NamedTuple):
@@ -173,8 +182,10 @@ def refusal_of(function: Callable, arguments: Sequence) -> str:
     translator = _Translator(ir.IRBuilder(target.append_basic_block()), Functions(), FASTMATH)
     try:
         translator.call(function, arguments)
-    except TypeError as error:
-        return str(error) or type(error).__name__
+        translator._builder.ret_void()
+        check(target.parent)
+    except Exception as error:  # also of names that have a value in another branch only, which LLVM finds
+        return error_line(error)
     return ""
 
 
@@ -320,12 +331,6 @@ class _Translator(Expressions):
     def _assign(self, statement: ast.Assign) -> None:
         value = self._value(statement.value)
         for target in statement.targets:
-            if (
-                isinstance(target, ast.Tuple)
-                and is_tuple(value)
-                and any(isinstance(part, ast.Subscript) for part in target.elts)
-            ):
-                value = tuple(self._copied(part) if isinstance(part, Array) else part for part in value)
             self._store(target, value)
 
     def _augassign(self, statement: ast.AugAssign) -> None:
@@ -350,11 +355,11 @@ class _Translator(Expressions):
                 raise Untranslated("an assignment to a part of what is no array")
             if any(memory.is_copy for memory in self._memory_of(array)):
                 raise Untranslated("an assignment to a part of an argument that changes")
-            entry = self._entry(array, self._value(target.slice))
+            entry, within = self._entry(array, self._value(target.slice))
             if entry.shape:
                 self._fill(entry, value)
             else:
-                self._builder.store(self.numbers.as_float(value), entry.pointer, align=8)
+                self._put(entry, self._or_nan(within, self.numbers.as_float(value)))
         elif not isinstance(target, ast.Name):
             raise Untranslated("an assignment")
         elif (

@@ -143,6 +143,12 @@ def host() -> str:
     return f"{llvmlite.__version__} {version} {llvm.get_process_triple()} {processor} {PASSES} {SELECTION}"
 
 
+def check(module: ir.Module) -> None:
+    """Raise RuntimeError for a module that LLVM refuses."""
+    with _compiling, llvm.create_context() as context, llvm.parse_assembly(str(module), context) as parsed:
+        parsed.verify()
+
+
 def _compiled(text: str, unrolled: bool) -> bytes:
     context = llvm.create_context()  # of its own, so that all of it can be freed
     module = llvm.parse_assembly(text, context)

@@ -1,6 +1,7 @@
 """Loops around programs as machine code: the same numbers as Python, without numba."""
 
 import gc
+import math
 import os
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from llvmlite import ir
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.graphs import machine_code
 from thruster_env.graphs.graphs import Graph
-from thruster_env.graphs.loops import Loops, Untranslated, add_function, machine_code_of
+from thruster_env.graphs.loops import Loops, Untranslated, add_function, machine_code_of, refusal_of, unknown
 from thruster_env.graphs.machine_code import NotLinked, add_builtin, builtin_of, code_of, function_of
 from thruster_env.graphs.programs import OF_STEPS, Place, callable_of, program_of
 
@@ -531,3 +532,76 @@ def of_another_shape(x):
 def test_arrays_that_would_be_others_than_pythons_are_refused(function):
     with pytest.raises(Untranslated):
         add_function(ir.Module(), "run", function, [(8,)])
+
+
+TABLE, WHOLE = (0.0, 1.0, 4.0, 9.0), (0, 1, 2)
+
+
+def cut_off(x, n):
+    x[0] = len(x[:n]) + 10 * len(x[n:6]) + 100 * len(x[-n:])
+    x[n:10], rest = 7.0, x[3 : n + 5]
+    rest[:] = 5.0
+    x[:2], x[2:4] = x[2:4], x[:2]
+    x[1] = TABLE[-1 - n % 4] + WHOLE[-(n % 3)] + max((x[1], 2.0, n)) + min([x[2], 3.0])
+    x[4] = x.reshape((2, -1))[1, 0] + x.reshape(-1, 2)[3, 1]
+
+
+def test_slices_are_cut_off_and_tuples_counted_from_their_ends():
+    run = machine(cut_off, (8,), None)
+    for n in range(13):
+        x = np.linspace(-1.0, 2.0, 8)
+        expected = x.copy()
+        cut_off(expected, n)
+        run(x, n)
+        assert x.tolist() == expected.tolist()
+
+
+def at_an_index(x, n):
+    row = x.reshape(2, 4)
+    x[0], x[1], x[2] = x[n], TABLE[n], row[n % 2, n]
+    x[3] = TABLE[WHOLE[n]]
+    x[n + 4] = 3.0
+
+
+def test_what_lies_at_no_index_is_nan():
+    run = machine(at_an_index, (8,), None)
+    for n, are_known in ((2, [True] * 4), (3, [True, True, True, False]), (8, [False] * 4), (2**62, [False] * 4)):
+        x = np.arange(8.0)
+        run(x, n)
+        assert np.isfinite(x).tolist() == [*are_known, *[True] * 4]
+
+
+def largest_of_array(x):
+    x[0] = max(x)
+
+
+def in_another_shape(x):
+    x[0] = x.reshape(3, 3)[0, 0]
+
+
+def length_of_three(x):
+    x[0] = math.hypot(x[0], x[1], x[2])
+
+
+def of_another_base(x):
+    x[0] = math.log(x[0], 2.0)
+
+
+def of_itself(x):
+    x[0] = factorial(x[0])
+
+
+def factorial(n):
+    return 1.0 if n < 1.0 else n * factorial(n - 1.0)
+
+
+def with_a_new_axis(x):
+    x[:] = x[:, None][:, 0]
+
+
+@pytest.mark.parametrize(
+    "function",
+    [at_times, largest_of_array, in_another_shape, length_of_three, of_another_base, of_itself, with_a_new_axis],
+)
+def test_a_users_function_is_refused_whatever_its_translation_raises(function):
+    assert refusal_of(function, [unknown(8, as_array=True)])
