@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from filters.algebra import matrices, members, operations, points, roots
+from filters.algebra import matrices, members, operations, points, roots, tangents
 from filters.algebra import operations as geometric
 from filters.algebra.matrices import Matrix, Operation, in_order
 from filters.algebra.roots import by_entries
@@ -28,6 +28,7 @@ from thruster_env.core import matrices as matrix_functions
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.sources import Source, entrywise, is_array, matrix_of, tuple_of, written_out
 from thruster_env.graphs.programs import ARRAYS, Place
+from thruster_env.model.traced import MOST
 
 
 def arguments_of(matrix: Matrix) -> tuple[Matrix, ...]:
@@ -60,6 +61,12 @@ def _function(
     """One function for all equal operations, so that it is compiled once."""
     if operation is matrices.multiply:
         return _product(by_transpose, *shapes)
+    if operation not in _FUNCTIONS and getattr(tangents, operation.name, None) is operation:
+        raise ValueError(
+            "a filter of rotations must have functions that can be traced, and a prediction and an update of at "
+            f"most {MOST} operations each, but this one has not: use 'ekf', fewer states, measurements or "
+            "iterations, and loops of known lengths"
+        )
     if operation not in _FUNCTIONS:
         raise ValueError(f"{operation.name} is for models that are small and can be traced, but this one is not")
     return _FUNCTIONS[operation](result, *parameters, *shapes)

@@ -317,6 +317,22 @@ def test_every_filter_runs_on_rotations_or_refuses_them(name):
             make().kernels()
 
 
+def until_small(x, u, c):
+    """Turn by smaller and smaller angles, which cannot be traced."""
+    angle, q = u[0], x[:4]
+    while abs(angle) > 1e-3:
+        q, angle = rotations.product(q, rotations.exponential((angle, 0.0, 0.0))), 0.5 * angle
+    return *q, *x[4:]
+
+
+def test_a_model_that_is_too_large_or_cannot_be_traced_is_refused_by_a_rule():
+    """Operations on rotations are parts of programs alone."""
+    with pytest.raises(
+        ValueError, match="a filter of rotations must have functions that can be traced, and .* 30000"
+    ):
+        filters.ExtendedKalmanFilter(model=attitude_model().replace(transition=until_small)).kernels()
+
+
 def test_every_other_path_refuses_them():
     """Smoothers, tensors, C, gradients, bounds, simulation, envs and models made of a model."""
     model, filter_ = attitude_model(), filters.ExtendedKalmanFilter(model=attitude_model())

@@ -246,7 +246,7 @@ def run_chain(
     for kind, numbers, memory in zip(kinds, parameters, memories or (None,) * len(kinds), strict=True):
         name = kind.effect.name
         try:
-            results = traceable(kind.effect.act)(
+            results = traceable(kind.effect.act, may_raise=False)(
                 kind.arguments(numbers), value, memory, t._replace(number=kind.number)
             )
             if not isinstance(results, tuple) or len(results) != 2 or shape_of(results[0]) != shape_of(value):

@@ -124,13 +124,15 @@ def _name(function: Callable) -> str:
 
 
 @lru_cache(maxsize=256)
-def traceable(function: Callable) -> Callable:
+def traceable(function: Callable, *, may_raise: bool = True) -> Callable:
     """A user's function of values that takes Numbers, too, and may decide by them.
 
-    Machine code rounds it as Python does, whatever is done with its arguments before.
+    Machine code rounds it as Python does, whatever is done with its arguments before. A branch that raises an
+    exception has NaN.
 
     Raises:
-        TypeError: if Numbers cannot replace floats in it, from `tracing.traced` or a call.
+        TypeError: if Numbers cannot replace floats in it, from `tracing.traced` or a call; if two calls differ; or
+            if a branch raises an exception, unless it `may_raise`.
     """
     copy = traced(function)
 
@@ -149,11 +151,12 @@ def traceable(function: Callable) -> Callable:
             entries[:] = [graph.number(leaf) for leaf in leaves(result)]
             return entries
 
-        graph.may_raise = False
+        outside = graph.may_raise
+        graph.may_raise = outside and may_raise
         try:
             results, again = on_every_side(entries, graph), on_every_side(entries, graph)
         finally:
-            graph.may_raise = True
+            graph.may_raise = outside
         if any(a is not b for a, b in zip(results, again, strict=False)):
             raise TypeError(
                 f"{_name(function)} must depend on its arguments alone, but two calls returned different values: "

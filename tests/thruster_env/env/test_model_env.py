@@ -203,6 +203,20 @@ def test_a_traced_function_takes_floats_in_a_thread_that_has_traced_nothing():
     assert results == [6.0]
 
 
+def reward_of_positive(x, u):
+    if x[0] > 0.0:
+        return x[0]
+    raise ValueError("a negative state")
+
+
+def test_a_reward_is_nan_where_it_raises():
+    env = ModelEnv(one_state(linear), reward=reward_of_positive)
+    env.reset(seed=1)
+    for action in (3.0, -30.0):
+        _, reward_, _, _, info = env.step([action])
+        assert reward_ == info["state"] if action > 0.0 else np.isnan(reward_)
+
+
 def test_copies_are_single_envs_with_all_disturbances_and_a_task():
     arguments = {
         "truth": one_state(linear),
