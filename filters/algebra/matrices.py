@@ -100,6 +100,10 @@ class Matrix:
     __rmul__ = __mul__
 
     def __truediv__(self, other):
+        if isinstance(other, Matrix) and len(other.shape) == 2:
+            raise TypeError(
+                f"a page must write C S^-1 as divide(C, S), as / divides each entry, but got {other!r}"
+            )
         return self * (reciprocal(other) if isinstance(other, Matrix) else 1.0 / other)
 
     def __rtruediv__(self, other):

@@ -57,6 +57,10 @@ def to_a_power(model, x, P, z):
     return x, P @ model.R**-1
 
 
+def divided(model, x, P, z):
+    return x, P @ model.H(x).T / model.R
+
+
 def comparing(model, x, P, z):
     return x if x > 0 else -x
 
@@ -93,6 +97,7 @@ def filter_of(update, fading=1.0):
             r"log density, log_density\(v, S, present\(z\)\) of shape",
         ),
         (to_a_power, TypeError, r"C S\^-1 as divide\(C, S\), as \*\* raises each entry"),
+        (divided, TypeError, r"C S\^-1 as divide\(C, S\), as / divides each entry"),
         (comparing, TypeError, "choose by operations, .* but it compares .* with 0"),
         (of_an_identity, TypeError, r"\(eye\(P\) is the identity\), but got array"),
         (of_entries, TypeError, "without entries, by the operations of filters.algebra, but it takes 0 of"),

@@ -41,6 +41,16 @@ class Context:
     dt: float  # sample time [s]
 
 
+class WithoutStep(Context):
+    """The context of an env that does not know its sample time."""
+
+    def __getattribute__(self, name: str) -> Any:
+        """ValueError for the sample time, on which an effect depends."""
+        if name == "dt":
+            raise ValueError("dt must be given, the sample time [s], where effects depend on it, but it is None")
+        return super().__getattribute__(name)
+
+
 def unrolled(count: int, body: Callable, x: tuple, inputs: Any) -> tuple:
     """X after `count` calls x = body(x, inputs)."""
     for _ in range(count):

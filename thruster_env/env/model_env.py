@@ -25,6 +25,7 @@ from thruster_env.effects.effects import (
     RecordedSignal,
     Registry,
     Sinusoid,
+    WithoutStep,
     chain_of,
     chain_runner,
 )
@@ -257,6 +258,9 @@ class ModelEnv(PlantEnv):
         self.inputs, self.task = truth.input_quantities, ModelTask(reward, ends)
         effects = _chains("sensors", sensors, truth.measurements, SENSOR_EFFECTS)
         signals = _chains("disturbances", disturbances, truth.input_quantities, DISTURBANCES)
+        if self.dt is None:
+            for effect in (effect for part in (*effects.values(), *signals.values()) for effect in part):
+                effect.parameters(WithoutStep(1.0))  # ValueError if they depend on the sample time
         self.plant = ModelPlant(truth, self.dt or 1.0, low, high, effects, signals)
         info = ("state", "measurement") + ("time",) * (self.dt is not None)
         chains = {quantity.symbol: effects.get(quantity.symbol, ()) for quantity in truth.measurements}

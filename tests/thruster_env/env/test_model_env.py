@@ -68,6 +68,10 @@ def test_filters_find_what_they_may_assume():
         ({"low": 2.0, "high": 1.0}, "low and high must be one number or 1, low at most high"),
         ({"low": [0.0, 1.0]}, "low and high must be one number or 1"),
         ({"dt": -1.0}, "dt must be positive, but got -1"),
+        (
+            {"disturbances": {"u_1": [{"name": "gauss-markov", "std": 1.0, "time_constant": 1.0}]}},
+            r"dt must be given, the sample time \[s\], where effects depend on it, but it is None",
+        ),
     ],
 )
 def test_a_wrong_argument_is_refused(arguments, rule):
