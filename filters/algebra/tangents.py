@@ -46,10 +46,13 @@ def points_around(model, x, D):
 
 
 def differences(model, Y, y):
-    """The d with move(model, y, d) = Y of a state, or of each column of Y, (t, points): Y - y of numbers."""
+    """The d with move(model, y, d) = Y of a state, or of each column of Y, (t, points): Y - y, angles wrapped."""
+    angles = list(model.state_angles)
+    for turn in reversed(model.turns):
+        del angles[turn.stored]
     if model.turns:
-        return apart(Y, y, model.turns)
-    return Y - y if len(Y.shape) == 1 else Y - outer(y, ones(Y))
+        return wrap(apart(Y, y, model.turns), angles)
+    return wrap(Y - y if len(Y.shape) == 1 else Y - outer(y, ones(Y)), angles)
 
 
 def reset(model, p, d):

@@ -41,7 +41,7 @@ def unscented_moments(model, Y, angles):
 
 def unscented_state(model, X):
     """Mean and covariance of states at the points."""
-    D = wrap(differences(model, without_first(X), first(X)), model.state_angles)
+    D = differences(model, without_first(X), first(X))
     s = (D @ ones(D)) * model.own.weight
     return move(model, first(X), s), reset(model, scatter(model, D, s), s)
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.algebra.operations import eye, quotient, sym, wrap
+from filters.algebra.operations import eye, quotient, sym
 from filters.algebra.points import root, square, units, without_first
 from filters.algebra.roots import careful
 from filters.algebra.tangents import differences, move, reset, reset_back
@@ -84,7 +84,7 @@ SCHEDULED = Relation(represent_jacobian, propagate_scheduled_jacobian, link)
 def back(model, x, P, linked, later):
     """Correct the estimate of a step by that of the next one, `later`."""
     (mean, G, C), (later_x, later_P) = linked, later
-    change = wrap(differences(model, later_x, mean), model.state_angles)
+    change = differences(model, later_x, mean)
     d, later_P = G @ change, reset_back(model, later_P, change)
     return move(model, x, d), reset(model, sym(C + sym(G @ later_P @ G.T)), d)
 

@@ -17,6 +17,7 @@ from filters.registry import FILTERS
 from thruster_env.core.compiled import interpreted
 from thruster_env.env.model_env import ModelEnv
 from thruster_env.model import rotations
+from thruster_env.model.quantities import Quantity
 from thruster_env.model.simulate import simulate
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import Rotation
@@ -315,6 +316,49 @@ def test_every_filter_runs_on_rotations_or_refuses_them(name):
     else:
         with pytest.raises(ValueError, match="is of rotations|must have an affine model"):
             make().kernels()
+
+
+def with_heading(x, u, c):
+    """A heading beside an attitude."""
+    return x[0] + u[0], *rotations.product(x[1:], rotations.exponential((0.1, 0.0, 0.0)))
+
+
+def heading_and_gravity(x, c):
+    """The heading, and gravity in the axes of the body."""
+    return x[0], *rotations.to_body(x[1:], GRAVITY)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_angles_beside_rotations_are_wrapped():
+    """A heading that turns by 3 rad in each step has the estimates of a scalar filter and smoother."""
+    model = StateSpaceModel(
+        transition=with_heading,
+        observe=heading_and_gravity,
+        process_noise_cov=[0.02] + [1e-4] * 3,
+        measurement_noise_cov=[0.1] + [0.01] * 3,
+        prior_mean=[3.0, 1.0, 0.0, 0.0, 0.0],
+        prior_cov=[0.3] + [0.01] * 3,
+        states=(Quantity("heading", "a", "rad", True), Rotation("attitude")),
+        measurements=(Quantity("heading", "z_a", "rad", True), "z_x", "z_y", "z_z"),
+        inputs=1,
+    )
+    z = np.column_stack([3.1 + 3.0 * np.arange(6), np.tile(GRAVITY, (6, 1))])
+    data = {"inputs": np.full((5, 1), 3.0), "measurements": z}
+    x, p, means, gain = 3.0, 0.3, [], 0.0
+    for k in range(6):
+        if k:
+            gain = p / (p + 0.02)
+            x, p = x + 3.0, p + 0.02
+        x, p = x + p / (p + 0.1) * (z[k, 0] - x), 0.1 * p / (p + 0.1)
+        means.append(x)
+    wrapped = np.angle(np.exp(1j * np.array(means)))
+    for name in ("ekf", "ukf"):
+        estimates = filters.run(FILTERS[name](model=model), **data)
+        np.testing.assert_allclose(estimates.means[:, 0], wrapped, atol=1e-12)
+        np.testing.assert_allclose(estimates.covs[-1, 0, 0], p, rtol=1e-9)
+    smoothed = filters.smooth(FILTERS["ekf"](model=model), **data)
+    before = means[-2] + gain * (means[-1] - means[-2] - 3.0)
+    np.testing.assert_allclose(smoothed.means[-2, 0], np.angle(np.exp(1j * before)), atol=1e-12)
 
 
 def until_small(x, u, c):
