@@ -300,7 +300,7 @@ def _called(function, shape, *arguments) -> np.ndarray:
     """What a function of the model returns; NaN where it raises."""
     try:
         return np.asarray(function(*arguments), dtype=np.float64).reshape(shape)
-    except (ArithmeticError, ValueError, TypeError):
+    except Exception:  # whatever a user's function raises
         return np.full(shape, np.nan)
 
 

@@ -217,12 +217,12 @@ def not_known(*arguments):
 
 
 def _value_at(function: Callable, arguments: list) -> np.ndarray:
-    """The result of a function, flat; one NaN if it raises an arithmetic error."""
+    """The result of a function, flat; one NaN if it raises an exception."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             return np.array(in_python(function, arguments), dtype=np.float64).ravel()
-        except (ArithmeticError, ValueError, TypeError):  # also of complex numbers
+        except Exception:  # whatever a user's function raises
             return np.array([np.nan])
 
 
@@ -349,7 +349,7 @@ def _by_numba(function: Callable, sizes: Sequence[int], form: type | int, shape:
     plain = getattr(function, "py_func", function)
     for part in with_callees([plain]):
         if part not in _known:
-            register_jitable(fastmath=fastmath_of(part))(part)
+            register_jitable(fastmath=fastmath_of(part), boundscheck=True)(part)
             _known.add(part)
     lines, at = [f"numbers, out = carray(given, {sum(sizes)}), carray(results, {prod(shape)})", "out[:] = nan"], 0
     arguments = [f"v{i}" for i in range(len(sizes))]
@@ -362,12 +362,13 @@ def _by_numba(function: Callable, sizes: Sequence[int], form: type | int, shape:
             text, as_array = entries, is_array(size)
         lines.append(f"{argument} = numbers[{at}:{at + size}]" if as_array else f"{argument} = {text}")
         at += size
-    lines.append(f"y = function({', '.join(arguments)})")
-    stores = (f"out[{k}] = y[{']['.join(map(str, i))}]" for k, i in enumerate(np.ndindex(*shape)))
+    lines += "try:", f"    y = function({', '.join(arguments)})"
+    stores = (f"    out[{k}] = y[{']['.join(map(str, i))}]" for k, i in enumerate(np.ndindex(*shape)))
+    stores = *stores, "except Exception:", "    pass"
     names = {"carray": numba.carray, "nan": math.nan, "function": plain, "Constants": form}
     native = written_out("native", "given, results", *lines, *stores, "None", **names)
     pointer = numba.types.CPointer(numba.float64)
-    options: Any = {"fastmath": set(FASTMATH), "error_model": "numpy"}
+    options: Any = {"fastmath": set(FASTMATH), "error_model": "numpy", "boundscheck": True}
     code = numba.cfunc(numba.void(pointer, pointer), **options)(native)
 
     def call(*arguments):

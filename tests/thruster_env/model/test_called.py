@@ -9,6 +9,7 @@ from collections import namedtuple
 import numpy as np
 import pytest
 
+import filters
 from thruster_env.graphs.branches import on_every_side
 from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.loops import Loops
@@ -226,3 +227,32 @@ def test_what_fails_otherwise_than_by_a_raise_of_its_own_has_no_outcome():
     x = (graph.given("x"),)
     with pytest.raises(ValueError, match="invalid literal"):
         on_every_side(lambda: np.array([*traced(calling)(x)], dtype=object), graph)
+
+
+SQUARES = np.arange(16.0) ** 2
+
+
+def of_a_table(x, u, c):
+    """What numba compiles: an array of the file, at an index."""
+    return (0.9 * x[0] + 0.01 * SQUARES[int(abs(x[0]))],)
+
+
+def test_a_table_ends_where_python_says_so():
+    """Beyond its end numba would read other memory, or end the process; the filter restarts, and says why."""
+    filter_ = filters.ExtendedKalmanFilter(model=model_of(of_a_table))
+    z, u = np.ones((1, 5, 1)), np.zeros((1, 4, 1))
+    for outlier in (40.0, 1e12):
+        z[0, 1] = outlier
+        with pytest.warns(filters.RestartWarning, match=r"first at step 2 \(x_1\): f\(x, u\) is NaN"):
+            estimates = filters.run(filter_, inputs=u, measurements=z)
+        assert estimates.divergences == 1 and np.isfinite(estimates.means).all()
+
+
+def never_so_low(x, u, c):
+    if x[0] < -5.0:
+        raise LookupError("so low")
+    return (x[0] * c[0],)
+
+
+def test_a_function_is_traced_though_it_raises_at_a_point_of_the_check():
+    assert not machine_code(never_so_low, "x, u, c", (1, 1, 1), 1, (1,)).reason
