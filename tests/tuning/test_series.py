@@ -318,6 +318,23 @@ def test_an_index_of_dates_and_a_file_are_the_same_numbers(position, tmp_path):
     assert column_of(list(z)).dt == 1.0 and column_of([*z[:30], None]).measured.sum() == 30
 
 
+def test_a_pandas_index_of_times_is_taken_and_one_that_counts_is_not():
+    pandas = pytest.importorskip("pandas")
+    z, dates = np.arange(40.0) % 7.0, pandas.date_range("2026-01-01", periods=40, freq="100ms")
+    seconds = 0.1 * np.arange(40.0)
+    for index in (seconds, pandas.Index(seconds, name="elapsed"), pandas.Index(1e3 * seconds, name="elapsed_ms")):
+        assert column_of(pandas.Series(z, index=index)).dt == pytest.approx(0.1)
+    assert column_of(pandas.Series(z, index=map(str, dates))).dt == pytest.approx(0.1)
+    hours = pandas.period_range("2026-01-01", periods=40, freq="h")
+    assert column_of(pandas.DataFrame({"z": z}, index=hours)).dt == 3600.0
+    for index in (None, np.arange(40.0), range(100, 140), [f"row {k}" for k in range(40)], seconds[::-1]):
+        assert column_of(pandas.Series(z, index=index)).dt == 1.0
+    table = pandas.DataFrame({"time": np.arange(40.0), "z": z}, index=seconds)
+    assert column_of(table).dt == 1.0  # its column of times is meant
+    missing = column_of(pandas.Series(z, index=seconds).drop(seconds[[5, 6]]))
+    assert np.flatnonzero(np.isnan(missing.values)).tolist() == [5, 6]
+
+
 def test_tune_names_fit_for_a_log_that_is_a_column_of_numbers(tmp_path):
     file = tmp_path / "level.csv"
     file.write_text("t,level [m]\n" + "".join(f"{k},{z!r}\n" for k, z in enumerate(map(float, NILE.split()))))

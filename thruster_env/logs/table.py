@@ -21,6 +21,7 @@ import numpy as np
 
 from thruster_env.core.checks import as_floats, listed, short_repr
 from thruster_env.core.modules import to_install
+from thruster_env.logs.columns import DATE_NAMES, TIME_NAMES, parted, simple
 from thruster_env.logs.findings import Remark
 from thruster_env.logs.grid import MISSING as MISSING_TEXT
 from thruster_env.logs.grid import seconds_of
@@ -31,7 +32,7 @@ MISSING = ("", "nan", "na", "n/a", "null", "none", "<na>", "nat")
 DATES = "times must be dates as of ISO 8601, such as 2026-05-01T12:00:00.01"
 DELIMITERS = ",;\t"
 ZIP_END, ZIP_COUNT = 22, 10  # bytes of a zip's last record, and where in it the number of its files stands
-TIME_HEADER = "time_s"  # of an index of dates
+TIME_HEADER = "time_s"  # of an index of times
 SUFFIXES = (".csv", ".parquet", ".npz")
 
 
@@ -323,7 +324,7 @@ def _damaged(rule: str, path: Path) -> Iterator[None]:
 def table_of(columns: Any, name: str) -> Table:
     """A table that is in memory: a mapping from headers to arrays (rows,), or a pandas.DataFrame.
 
-    An index of dates or of time differences is a column of seconds, and one that has a name is a column.
+    An index of times (`times_of_index`) is a column of seconds, and another one that has a name is a column.
 
     Raises:
         ValueError: if it is neither, or its columns are not of equal length.
@@ -344,10 +345,45 @@ def _with_index(frame: Any) -> dict:
     """The columns of a DataFrame as arrays, and its index where that tells something."""
     columns = {header: frame[header].to_numpy() for header in frame.columns}
     index = frame.index
-    kind = getattr(index.dtype, "kind", "")
-    if kind in "mM":
-        return {TIME_HEADER: (index - index[0]).total_seconds().to_numpy(), **columns} if len(index) else columns
+    is_plain = getattr(index.dtype, "kind", "") not in "mM" and not hasattr(index, "to_timestamp")
+    if is_plain and (_is_time(index.name) or any(map(_is_time, columns))):
+        return columns if index.name is None else {index.name: index.to_numpy(), **columns}
+    times = times_of_index(index)
+    if times is not None:
+        return {TIME_HEADER: times, **columns}
     return columns if index.name is None else {index.name: index.to_numpy(), **columns}
+
+
+def _is_time(header: Any) -> bool:
+    """Whether a header names times, with or without a unit."""
+    return isinstance(header, str) and parted(header)[0].strip().lower() in (*TIME_NAMES, *DATE_NAMES)
+
+
+def times_of_index(index: Any) -> np.ndarray | None:
+    """Times of the rows of a pandas index [s], (rows,); None where it only counts them or names them.
+
+    Times are dates, also as texts and as periods, which count from their beginnings, time differences, and
+    floats that increase, unless they are 0, 1, 2 and so on or their name has another unit than of time.
+    """
+    if not len(index):
+        return None
+    if hasattr(index, "to_timestamp"):
+        index = index.to_timestamp()
+    kind = getattr(index.dtype, "kind", "O")
+    if kind in "mM":
+        return (index - index[0]).total_seconds().to_numpy()
+    if kind == "f":
+        unit = parted(index.name)[1] if isinstance(index.name, str) else None
+        base, scale = simple(unit) if unit else ("s", 1.0)
+        times = scale * index.to_numpy().astype(np.float64)
+        if base != "s":
+            return None
+        is_count = np.array_equal(times, np.arange(len(times)))
+        return None if is_count or len(times) < 2 or not (np.diff(times) > 0.0).all() else times
+    if kind in "OUT" and isinstance(index[0], str):
+        texts = Table("an index", {"index": [*map(str, index)]}, range(1, len(index) + 1), "row")
+        return texts.dates("index")
+    return None
 
 
 def _of_arrays(path: Path | str, cells: dict[str, np.ndarray]) -> Table:
