@@ -112,7 +112,10 @@ def findings(
     counted: np.ndarray | None = None,
 ) -> Findings:
     """Errors and innovations of a filter's estimates; arguments are those of `consistency_report`."""
-    late = slice(first_step, None)
+    late, (n, t) = slice(first_step, None), (estimates.means.shape[-1], estimates.covs.shape[-1])
+    if n != t:
+        rule = "estimates must have a variance of each state, which rotations have not"
+        raise ValueError(f"{rule}, but got {t} for {n}: docs/attitude.md has the errors to compare with P")
     truth = np.full(estimates.means.shape, np.nan) if states is None else states
     errors = difference(estimates.means, truth, angles)[:, late]
     mask = None if counted is None else counted[:, late]

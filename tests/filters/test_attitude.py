@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation as Turned
 import filters
 from filters.bounds import path_bound, posterior_bound
 from filters.c.project import c_filter, write_project
+from filters.consistency.report import consistency_report
 from filters.estimators.foreign import Estimator, ForeignFilter
 from filters.registry import FILTERS
 from thruster_env.core.compiled import interpreted
@@ -381,11 +382,13 @@ def test_every_other_path_refuses_them():
     """Smoothers, tensors, C, gradients, bounds, simulation, envs and models made of a model."""
     model, filter_ = attitude_model(), filters.ExtendedKalmanFilter(model=attitude_model())
     data = {"inputs": np.zeros((2, 3)), "measurements": np.zeros((3, 6))}
+    batch = {name: np.tile(part, (2, 1, 1)) for name, part in data.items()}
     refusals = (
         lambda: filters.ExtendedKalmanFilter(model=model, form="square-root").kernels(),
         lambda: filters.ExtendedKalmanFilter(model=model, form="ud").kernels(),
         lambda: filters.smooth(filters.UnscentedKalmanFilter(model=model), **data),
         lambda: filters.run(filter_, **data).to_frame(),
+        lambda: consistency_report(filters.run(filter_, **batch), None),
         lambda: ForeignFilter(model=model, estimator=Estimator()),
         lambda: filters.torch(filter_),
         lambda: write_project(filter_, "a folder"),

@@ -396,9 +396,9 @@ class Arrays:
         return self._load(self._at(value, indices)) if isinstance(value, Array) else value
 
     def _eigenvectors(self, a: Array) -> tuple[Array, Array]:
-        """NumPy's `eigh`, by the same function of LAPACK; its matrices are columns after columns."""
+        """NumPy's `eigh`, by the same function of LAPACK, on the lower triangle; columns follow one another."""
         n, builder, of_two = a.shape[0], self._builder, self.numbers.of_two
-        vectors, values = self._copied(a), self._new_array(n)
+        vectors, values = self._copied(Array(a.pointer, a.shape[::-1], a.steps[::-1])), self._new_array(n)
         count = of_two("Add", of_two("Mult", 5, n), 3)
         length = of_two("Add", of_two("Mult", 2, of_two("Mult", n, n)), of_two("Add", of_two("Mult", 6, n), 1))
         work, whole_work = self._new_array(length), self._new_array(count)
