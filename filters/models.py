@@ -16,6 +16,7 @@ Filter, sections 2.3 (local levels and trends, cycles); van Loan (1978) for Q.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -366,7 +367,12 @@ class Sum(NamedTuple):
 
 def is_named(name: str) -> bool:
     """Whether a text is the name of a model, or a sum of such names."""
-    return all(part.partition(":")[0].strip().lower() in NAMES for part in name.split("+"))
+    return all(part.partition(":")[0].strip().lower() in NAMES for part in parts_of(name))
+
+
+def parts_of(name: str) -> list[str]:
+    """The texts that a sum has between its signs; the "+" of a number such as 8.64e+04 is none."""
+    return re.split(r"(?<!\d[eE])\+|\+(?!\d)", name)
 
 
 def named_model(name: str) -> Sum:
@@ -375,7 +381,7 @@ def named_model(name: str) -> Sum:
     Raises:
         ValueError: for an unknown name; the message has the known ones.
     """
-    parts = tuple(_part(part.strip().lower()) for part in name.split("+"))
+    parts = tuple(_part(part.strip().lower()) for part in parts_of(name))
     if len({part.name.partition(":")[0] for part in parts}) < len(parts):
         raise ValueError(f"parts of a sum must differ, but got {name!r}")
     if sum(not part.about_mean for part in parts) > 1:

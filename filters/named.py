@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from filters.models import NAMED, is_named, named_model
+from filters.models import WITH_SETTINGS, is_named, named_model, parts_of
 from filters.plants import FINE, PLANTS
 from thruster_env.core.checks import at_least, finite, one_of, positive, short_repr
 from thruster_env.model.affine import AffineModel, affine_functions
@@ -27,7 +27,8 @@ from thruster_env.model.state_space import StateSpaceModel
 
 AUTO = "auto"  # in place of a name: the simplest model that predicts unseen data as well as the best
 R, AXES, DT, MEAN = "R", "axes", "dt", "mean"  # settings of every model of `filters.models` beside its numbers
-NUMBERS = {number.name for model in NAMED.values() for number in model.free}
+PERIOD = "period"
+FORM = PERIOD, "seasons", "harmonics"  # settings that make another model, with other free numbers
 MOST_AXES = 64
 
 
@@ -161,7 +162,7 @@ def is_model_name(text: Any) -> bool:
     """Whether something is the name of a model, perhaps with settings, and no "module:object"."""
     if not isinstance(text, str) or re.fullmatch(r"[\w.]+:[A-Za-z_][\w.]*", text):
         return False
-    return text.partition(":")[0].strip() in PLANTS or is_named(re.sub(r"\d[eE]\+\d", "", text))
+    return text.partition(":")[0].strip() in PLANTS or is_named(text)
 
 
 def model_for_step(text: Any, dt: float | None) -> Callable[..., StateSpaceModel] | None:
@@ -197,26 +198,52 @@ def _plant(name: str, settings: str) -> Callable[..., ContinuousModel]:
 
 def _maker(text: str) -> NamedMaker:
     parts, values = [], {}
-    for part in re.split(r"\+(?!\d)", text):
+    for part in parts_of(text):
         name, _, settings = (piece.strip() for piece in part.partition(":"))
         retained = []
         for setting in settings.split(",") if settings else []:
             key, equals, value = (piece.strip() for piece in setting.partition("="))
-            if equals and (key in (R, AXES, DT, MEAN) or any(key.endswith(number) for number in NUMBERS)):
-                values[name.replace("-", "_"), key] = value
-            else:
+            if not equals or name.lower() in WITH_SETTINGS and key in FORM:
                 retained.append(setting)
+            else:
+                values[name.lower().replace("-", "_"), key] = value
         parts.append(name + ":" * bool(retained) + ",".join(retained))
     maker = NamedMaker(named_model(" + ".join(parts)).name)
     known, numbers = (*maker.names, AXES, DT, MEAN), {}
+    signed = {number.name for number in named_model(maker.name).free if not number.log}
     for (part, key), value in values.items():
         key = f"{part}_{key}" if f"{part}_{key}" in known else key
-        check = finite if key == MEAN else positive
+        check = finite if key == MEAN or key in signed else positive
         numbers[one_of(f"a setting of {maker.name}", key, known)] = check(f"{key} of {maker.name}", value)
     count, dt, mean = numbers.pop(AXES, 1.0), numbers.pop(DT, None), numbers.pop(MEAN, None)
     axes = at_least(AXES, int(count) if count == int(count) else count, 1, MOST_AXES)
     maker = replace(maker, values=numbers, dt=dt, mean=None if mean is None else (mean,))
     return replace(maker, quantities=axes_named("z", axes))
+
+
+def text_of(name: str, values: Mapping[str, float], axes: int = 1, mean: float | None = None) -> str:
+    """The text from which `model_named` makes a model with these numbers, to seven digits.
+
+    Numbers stand behind the last part of a sum: "constant + harmonic:period=24,constant_drift=1,R=2"; a free
+    period stands behind its harmonic, as a fixed one does.
+    """
+    numbers = dict(values)
+    parts = [part.strip() for part in parts_of(name)]
+    for i, part in enumerate(parts):
+        if part.partition(":")[0] == "harmonic" and PERIOD in numbers:
+            parts[i] = _with(part, [f"{PERIOD}={_digits(numbers.pop(PERIOD))}"])
+    settings = [f"{AXES}={axes}"] * (axes > 1) + [f"{key}={_digits(value)}" for key, value in numbers.items()]
+    settings += [] if mean is None else [f"{MEAN}={_digits(mean)}"]
+    return _with(" + ".join(parts), settings)
+
+
+def _with(text: str, settings: list[str]) -> str:
+    """A name with further settings of its last part."""
+    return f"{text}{',' if ':' in parts_of(text)[-1] else ':'}{','.join(settings)}"
+
+
+def _digits(value: float) -> str:
+    return f"{value:.7g}".replace("e+", "e")
 
 
 def axes_named(symbol: str, axes: int) -> tuple[Quantity, ...]:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import filters
-from filters.models import kalman_filter
-from filters.named import model_for_step, model_named
+from filters.models import NAMED, kalman_filter, named_model
+from filters.named import axes_named, is_model_name, model_for_step, model_named, text_of
 from filters.plants import pendulum
 
 
@@ -26,6 +26,27 @@ def test_settings_are_numbers_of_the_model_its_axes_or_those_of_its_name(text, v
     assert len(maker.quantities) == axes and set(maker.values) <= set(maker.names)
     assert {name: maker.values[name] for name in values} == values
     assert model_named(maker.name).names == maker.names
+
+
+SUMS = "constant + harmonic", "constant + harmonic:period=86400,harmonics=2", "harmonic + ar:2", "ar:1 + harmonic"
+SUMS += "constant-velocity + oscillator", "ornstein-uhlenbeck + oscillator", "oscillator + seasonal:period=12"
+
+
+@pytest.mark.parametrize("name", [*NAMED, *SUMS, "ar:3", "harmonic", "seasonal:period=8.64e+04,seasons=24"])
+def test_a_text_of_numbers_gives_the_model_of_these_numbers(name):
+    model = named_model(name)
+    values = {number.name: 1.234567e5 / 7.0**i for i, number in enumerate(model.free)}
+    values |= {number.name: -0.4 for number in model.free if not number.log}
+    values |= {"frequency": 1e-5} if "frequency" in values else {}
+    text = text_of(name, {**values, "R": 2e-7}, 2, -3.5)
+    expected = model.model(values, 2e-7, 1.0, offset=-3.5, quantities=axes_named("z", 2))
+    assert is_model_name(text) and "e+" not in text.replace(name, "")
+    model = model_named(text)(dt=1.0)
+    for parsed, matrix in zip(model.matrices(), expected.matrices(), strict=True):
+        np.testing.assert_allclose(parsed, matrix, rtol=1e-5, atol=1e-9)
+    q = expected.process_noise_cov
+    np.testing.assert_allclose(model.process_noise_cov, q, rtol=1e-5, atol=1e-6 * np.abs(q).max())
+    np.testing.assert_allclose(model.measurement_noise_cov, expected.measurement_noise_cov, rtol=1e-5)
 
 
 def test_a_named_model_is_that_of_the_kalman_filter_of_its_numbers():

@@ -48,7 +48,7 @@ def test_an_estimate_uses_given_numbers_or_finds_them_and_says_which(log):
     assert not any("maximum-likelihood" in sentence for sentence in stated.sentences())
     free, fit = tuning.estimate((NAME, log), filter="kf"), tuning.fit(log, model=NAME)
     assert free.filter.model.measurement_noise_cov[0, 0] == pytest.approx(fit.r, rel=1e-4)
-    assert any(f"--model {NAME}:acceleration=" in sentence for sentence in free.sentences())
+    assert any(f'--model "{NAME}:acceleration=' in sentence for sentence in free.sentences())
     for numbers in (Z, Z.tolist()):
         reading = tuning.read_logs(numbers, model=f"{NAME}:acceleration=0.5,R=0.3", dt=0.1)
         np.testing.assert_allclose(tuning.estimate(reading, filter="kf").means, stated.means, rtol=1e-6, atol=1e-6)

@@ -287,21 +287,38 @@ def test_lines_for_filterpy_give_the_same_estimates(position):
     kf, z = names["kf"], position.column.values
     kf.update(z[0])
     for k in range(1, 50):
-        exec(step.split("\n", 1)[1], {"kf": kf, "z": z[k]})
+        exec(step.split("\n", 1)[1], {**names, "z": z[k]})
         np.testing.assert_allclose(kf.x[:, 0], position.estimates.means[0, k], rtol=1e-6, atol=1e-9)
+    before = kf.x
+    exec(step.split("\n", 1)[1], {**names, "z": math.nan})
+    np.testing.assert_allclose(kf.x, kf.F @ before)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="the lines of C need a compiler")
 def test_lines_for_a_controller_are_the_filter_once_it_has_settled(position, tmp_path):
+    """Far from zero, too, where float would round z to half a unit; the first call sets the level."""
+    code = position.code("arduino")
+    assert code.startswith("// a step is 0.1 s\n// measured: z [1]\n// state: position [1], velocity [1/s]\n")
     source = tmp_path / "filter.c"
-    source.write_text(position.code("arduino") + "\nfloat state(int i) { return i ? x2 : x1; }\n")
+    source.write_text(code + "\ndouble state(int i) { return i ? x2 : x1; }\n")
     subprocess.run(["cc", "-shared", "-fPIC", "-o", str(tmp_path / "filter.so"), str(source)], check=True)
     library = ctypes.CDLL(str(tmp_path / "filter.so"))
-    library.filter.argtypes, library.state.restype = [ctypes.c_float], ctypes.c_float
-    for z in position.column.values:
-        library.filter(z)
-    state = [library.state(0), library.state(1)]
-    np.testing.assert_allclose(state, position.estimates.means[0, -1], rtol=2e-3)
+    library.filter.argtypes, library.state.restype = [ctypes.c_double], ctypes.c_double
+    far = 5200300.0
+    for k, z in enumerate(position.column.values):
+        library.filter(z + far)
+        if not k:
+            assert [library.state(0), library.state(1)] == [z + far, 0.0]
+    state = [library.state(0) - far, library.state(1)]
+    np.testing.assert_allclose(state, position.estimates.means[0, -1], rtol=2e-6)
+
+
+def test_a_controller_gets_no_constant_gain_that_needs_longer_than_the_record(nile):
+    values = {"constant_drift": 1.0, "harmonic_drift": 1e-6, "R": 15098.5}
+    slow = replace(nile, chosen=nile.chosen._replace(name="constant + harmonic:period=11", values=values))
+    with pytest.raises(ValueError, match="forget its start within the record, 99 s, but .* forgets in .*python"):
+        slow.code("arduino")
+    assert "# a step is 1 s" in slow.code("python") and "% a step is 1 s" in slow.code("matlab")
 
 
 def test_an_index_of_dates_and_a_file_are_the_same_numbers(position, tmp_path):
@@ -359,7 +376,7 @@ def test_the_axes_of_a_track_have_the_same_numbers(position, tmp_path):
     assert fit.gain.shape == (4, 2) and not fit.gain[:2, 1].any()
     np.testing.assert_array_equal(fit.gain[:2, 0], fit.gain[2:, 1])
     assert [state.symbol for state in fit.model.states][2:] == ["position_z_2", "velocity_z_2"]
-    assert "float z1, float z2" in fit.code("arduino") and len(fit.plot().axes) == 4
+    assert "double z1, double z2" in fit.code("arduino") and len(fit.plot().axes) == 4
     assert fit.axes_differ() > 1e-3 and not fit.is_wrong
     noisy = track + [[0.0, 2.0]] * np.random.default_rng(3).normal(size=(600, 2))
     assert "The axes differ" in str(tuning.fit(noisy, 0.1, model="constant-velocity"))

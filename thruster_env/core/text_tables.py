@@ -115,7 +115,7 @@ class WholeTable(RichTable):
 
 
 class Unfolded(str):
-    """Text whose lines are not folded where they go into a file or another program."""
+    """Text whose lines are not folded, as of a command to copy."""
 
 
 class Table(NamedTuple):
@@ -270,5 +270,5 @@ def plain_text(parts: Iterable[RenderableType], width: int | None = None) -> str
         highlight=False,
     )
     for part in parts:
-        plain.print(part)
+        plain.print(part, soft_wrap=isinstance(part, Unfolded))
     return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()).strip("\n")

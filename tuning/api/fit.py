@@ -76,5 +76,14 @@ def fit(
     if plot is not None:
         save_figure(fitted.plot(), plot)
     if code is not None:
-        write_whole(code, "\n".join(f"## {name}\n\n```\n{fitted.code(name)}\n```\n" for name in LANGUAGES))
+        write_whole(code, "\n".join(_section(fitted, name) for name in LANGUAGES))
     return fitted
+
+
+def _section(fitted: SeriesFit, language: str) -> str:
+    """The filter in a language as a section of Markdown, or why there is none."""
+    try:
+        body = f"```\n{fitted.code(language)}\n```"
+    except ValueError as error:
+        body = f"{error}."
+    return f"## {language}\n\n{body}\n"

@@ -34,7 +34,7 @@ def emit(parts: Sequence[RenderableType], data: dict, json_target: str | None) -
             if isinstance(part, Unfolded) and not console.is_terminal:
                 sys.stdout.write(f"{part}\n")
             else:
-                console.print(part)
+                console.print(part, soft_wrap=isinstance(part, Unfolded))
 
 
 def _check_json(target: str | None) -> None:

@@ -15,14 +15,15 @@ from filters.consistency.nees import LAGS, Whiteness, whiteness
 from filters.engine.batch import Estimates
 from filters.gaussian.kalman import KalmanFilter
 from filters.models import named_model
-from thruster_env.core.text_tables import Table
+from filters.named import text_of
+from thruster_env.core.text_tables import Table, Unfolded
 from thruster_env.model.affine import AffineModel
 from tuning.api.result import Result, frame
 from tuning.identification.objective import climb
-from tuning.series.column import Column
+from tuning.series.column import Column, seconds_text
 from tuning.series.fit import Candidate, Number, behind, filtered
 from tuning.series.likelihood import ColumnLikelihood, R, model_of
-from tuning.series.paste import lines_of
+from tuning.series.paste import ARDUINO, lines_of
 
 if TYPE_CHECKING:
     import pandas
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 WHITE = 0.001  # probability from which innovations count as white
 HIDDEN = 1e-9  # share of a mode in the measurements, below which they do not show it
+SLOW = 1e-3  # Hz, below which a frequency is also given as a period
+NEVER = "the filter never forgets its start"
 LARGE = 0.05  # correlation of innovations that matters
 
 
@@ -143,7 +146,7 @@ class SeriesFit(Result):
             correlation, time = white.correlations[largest], (lag + 1) * self.column.dt
             sentences.append(
                 f"No model that was tried fits: innovations are correlated ({correlation:.2f} at a lag of "
-                f"{time:.3g} s), so Q and R make up for what the model misses."
+                f"{seconds_text(time)}), so Q and R make up for what the model misses."
             )
         sentences += [
             f"The data do not determine {number.name}: {number.low:.3g} to {number.high:.3g} are as likely."
@@ -192,10 +195,10 @@ class SeriesFit(Result):
         count = int(column.measured.any(axis=1).sum())
         missing = len(column.values) - count
         names = ", ".join(quantity.short_label for quantity in column.quantities)
-        apart, step = f"one each {column.dt:.4g} s", "per step"
+        apart, step = f"one each {_step_text(column.dt)}", "per step"
         if column.stamps is not None:
             steps = np.diff(column.stamps)
-            apart, step = f"{steps.min():.4g} to {steps.max():.4g} s apart", f"of a step of {column.dt:.4g} s"
+            apart, step = f"{_range_text(steps)} apart", f"of a step of {_step_text(column.dt)}"
         heading = f"{names}: {count} numbers, {apart}"
         sentences = self.sentences()
         if self.is_wrong:
@@ -207,7 +210,7 @@ class SeriesFit(Result):
                 f"{number.low:.3g}",
                 f"{number.high:.3g}",
                 number.unit,
-                number.meaning,
+                _meaning(number),
             )
             for number in self.numbers
         ]
@@ -215,7 +218,7 @@ class SeriesFit(Result):
         numbers = Table(
             f"Model: {self.name}, {about}", ["", "value", "95 % from", "to", "unit", ""], rows, words=True
         )
-        forgets = f"the filter forgets in {self.memory:.3g} s"
+        forgets = f"the filter forgets in {seconds_text(self.memory)}" if math.isfinite(self.memory) else NEVER
         lines = [
             f"Q {step} = {_matrix(self.q, f'Q {step} = ')}",
             f"R = {self.r:.6g}" + " of each axis" * (self.model.m > 1),
@@ -234,16 +237,16 @@ class SeriesFit(Result):
             numbers,
             *lines,
             *sentences,
-            f"Next: --code FILE.md (fit.code) writes it for a controller; elsewhere it is --model {self.text}",
+            "Next: --code FILE.md (fit.code) writes it for a controller; elsewhere it is",
+            Unfolded(f'--model "{self.text}"'),
         ]
 
     @property
     def text(self) -> str:
         """The model with its numbers as other commands and `EstimateState` take it (`filters.named`)."""
-        axes = [f"axes={self.model.m}"] * (self.model.m > 1)
-        return (
-            f"{self.name}:{','.join([*axes, *(f'{number.name}={number.value:.4g}' for number in self.numbers)])}"
-        )
+        numbers = {number.name: number.value for number in self.numbers}
+        is_one = self.level is not None and np.ptp(self.level) == 0.0
+        return text_of(self.name, numbers, self.model.m, float(self.level[0]) if is_one else None)
 
     def _standings(self) -> list[tuple[str, float, float]]:
         """Of each candidate, best first: by how much it is behind the best, and the standard error of that."""
@@ -297,9 +300,36 @@ class SeriesFit(Result):
         """Lines to paste: "python" (ours), "filterpy", "pykalman", "matlab" or "arduino".
 
         Raises:
-            ValueError: for another language.
+            ValueError: for another language, or for "arduino", whose gain is constant, if this filter forgets its
+                first state more slowly than in the time of the record.
         """
-        return lines_of(language, self.model, self._gains())
+        duration = float(self.column.times[-1])
+        if language == ARDUINO and self.memory > duration:
+            forgets = "never forgets" if math.isinf(self.memory) else f"forgets in {seconds_text(self.memory)}"
+            raise ValueError(
+                f"a filter of constant gain must forget its start within the record, {seconds_text(duration)}, "
+                f'but {self.name} {forgets}: take code("python") or code("filterpy"), whose gain varies, or '
+                "thruster export"
+            )
+        return lines_of(language, self.model, self._gains(), self.column.dt)
+
+
+def _step_text(dt: float) -> str:
+    return seconds_text(dt) if dt > 120.0 else f"{dt:.4g} s"
+
+
+def _range_text(steps: np.ndarray) -> str:
+    least, most = float(steps.min()), float(steps.max())
+    return f"{least:.4g} to {_step_text(most)}"
+
+
+def _meaning(number: Number) -> str:
+    """What a number means; of a long time and of a slow frequency also in minutes, hours or days."""
+    if number.unit == "Hz" and number.value < SLOW:
+        return f"{number.meaning}, a period of {seconds_text(1.0 / number.value)}"
+    if number.unit == "s" and number.value > 120.0:
+        return f"{number.meaning}, {seconds_text(number.value)}"
+    return number.meaning
 
 
 def _matrix(values: np.ndarray, prefix: str) -> str:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.models import named_model
-from filters.named import AUTO, NamedMaker, model_named
+from filters.named import AUTO, NamedMaker, model_named, text_of
 from thruster_env.core.checks import listed, short_repr
 from thruster_env.logs.findings import Remark
 from thruster_env.logs.log import Log
@@ -114,9 +114,10 @@ def with_numbers(maker: NamedMaker, log: Log, rows: np.ndarray | None = None) ->
     if maker.name == AUTO or not maker.is_complete:
         chosen = choose(column, CANDIDATES if maker.name == AUTO else (maker.name,)).chosen
         maker, known = replace(maker, name=chosen.name), {**chosen.values, **known}
-        settings = ",".join([f"axes={axes}"] * (axes > 1) + [f"{name}={known[name]:.6g}" for name in maker.names])
+        numbers = {name: known[name] for name in maker.names}
         of = "this log" if rows is None else "the training rows"
-        text = f"the model's numbers are the maximum-likelihood ones of {of}, --model {maker.name}:{settings}"
+        model = text_of(maker.name, numbers, axes)
+        text = f'the model\'s numbers are the maximum-likelihood ones of {of}, --model "{model}"'
         remark = Remark(MODEL, "", text)
         log = replace(log, recording=log.recording._replace(remarks=(*log.recording.remarks, remark)))
     sum_ = named_model(maker.name)

@@ -9,19 +9,28 @@ import numpy as np
 from thruster_env.core.checks import one_of
 from thruster_env.model.affine import AffineModel
 
+ARDUINO = "arduino"  # the only one of constant gain
 
-def lines_of(language: str, model: AffineModel, gain: np.ndarray) -> str:
-    """The filter of a model without inputs as lines of a language.
+
+def lines_of(language: str, model: AffineModel, gain: np.ndarray, dt: float) -> str:
+    """The filter of a model without inputs as lines of a language, below a comment with sample time and units.
 
     Args:
         language: a key of `LANGUAGES`.
         model: F, H, Q, R, the first state and its covariance; the measurement's offset is subtracted from z.
         gain: K (n, m), the steady-state gain.
+        dt: sample time [s].
 
     Raises:
         ValueError: for another language.
     """
-    return LANGUAGES[one_of("a language", language, tuple(LANGUAGES))](model, gain)
+    lines = LANGUAGES[one_of("a language", language, tuple(LANGUAGES))](model, gain)
+    comment = COMMENTS.get(language, "#")
+    units = [
+        f"{word}: {', '.join(f'{quantity.symbol} [{quantity.unit or 1}]' for quantity in quantities)}"
+        for word, quantities in (("measured", model.measurements), ("state", model.states))
+    ]
+    return "\n".join([f"{comment} a step is {dt:.12g} s", *(f"{comment} {line}" for line in units), lines])
 
 
 def _python(model: AffineModel, gain: np.ndarray) -> str:
@@ -55,12 +64,13 @@ kf.x = np.array([{_numbers(model.prior_mean)}]).T
 kf.P = np.array({_rows(model.prior_cov)})
 # the first measurement updates the state at once: kf.update(z[0]{_less(d)}), then for each further one
 kf.predict()
-kf.update(z{_less(d)})"""
+kf.update(None if np.isnan(z).any() else z{_less(d)})"""
 
 
 def _pykalman(model: AffineModel, gain: np.ndarray) -> str:
     a, _, _, c, d = model.matrices()
-    return f"""from pykalman import KalmanFilter
+    return f"""import numpy as np
+from pykalman import KalmanFilter
 
 kf = KalmanFilter(
     transition_matrices={_rows(a)},
@@ -71,7 +81,7 @@ kf = KalmanFilter(
     initial_state_mean={_numbers(model.prior_mean)},
     initial_state_covariance={_rows(model.prior_cov)},
 )
-means, covs = kf.filter(z)"""
+means, covs = kf.filter(np.ma.masked_invalid(z))"""
 
 
 def _matlab(model: AffineModel, gain: np.ndarray) -> str:
@@ -101,16 +111,30 @@ end"""
 def _arduino(model: AffineModel, gain: np.ndarray) -> str:
     a, _, _, c, d = model.matrices()
     names = [f"x{i + 1}" for i in range(model.n)]
-    predicted = [_products(row, names) for row in a]
     inputs = [f"z{j + 1}" for j in range(model.m)] if model.m > 1 else ["z"]
     p, v = [f"p{i + 1}" for i in range(model.n)], [f"v{j + 1}" for j in range(model.m)]
-    state = ", ".join(f"{name} = {_c(value)}" for name, value in zip(names, model.prior_mean, strict=True))
-    lines = ["// steady-state Kalman filter: call once each sample with the measurement z", f"float {state};"]
-    lines.append(f"void filter({', '.join(f'float {z}' for z in inputs)}) {{")
-    lines += [f"  float p{i + 1} = {terms};" for i, terms in enumerate(predicted)]
+    arguments, offsets = ", ".join(f"double {z}" for z in inputs), [float(offset) for offset in d]
+    first = dict.fromkeys(names, "0.0")
+    for z, row, offset in zip(inputs, c, offsets, strict=True):
+        first[names[int(np.argmax(row))]] = z + (f" - {_c(offset)}" if offset > 0.0 else "")
+        if offset < 0.0:
+            first[names[int(np.argmax(row))]] = f"{z} + {_c(-offset)}"
+    lines = [
+        f"// steady-state Kalman filter: call filter({', '.join(inputs)}) once each step; the first one begins",
+        "// it needs double of 64 bits: on boards with an AVR (Uno, Mega) double is float, of seven digits",
+        f"double {', '.join(names)};",
+        "int begun = 0;",
+        f"void filter({arguments}) {{",
+        "  if (!begun) {",
+        *(f"    {name} = {value};" for name, value in first.items()),
+        "    begun = 1;",
+        "    return;",
+        "  }",
+    ]
+    lines += [f"  double {name} = {_products(row, names)};" for name, row in zip(p, a, strict=True)]
     lines += [
-        f"  float {difference} = {z} - ({_products(row, p, float(offset))});"
-        for difference, z, row, offset in zip(v, inputs, c, d, strict=True)
+        f"  double {difference} = {z} - ({_products(row, p, offset)});"
+        for difference, z, row, offset in zip(v, inputs, c, offsets, strict=True)
     ]
     lines += [
         f"  {x} = {_products(np.array([1.0, *row]), [before, *v])};"
@@ -124,8 +148,9 @@ LANGUAGES: dict[str, Callable[[AffineModel, np.ndarray], str]] = {
     "filterpy": _filterpy,
     "pykalman": _pykalman,
     "matlab": _matlab,
-    "arduino": _arduino,
+    ARDUINO: _arduino,
 }
+COMMENTS = {"matlab": "%", ARDUINO: "//"}
 
 
 def _number(value: float) -> str:
@@ -151,9 +176,9 @@ def _less(offset: np.ndarray) -> str:
 
 
 def _c(value: float) -> str:
-    """A number in C, single precision."""
-    text = f"{float(value):.8g}"
-    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
+    """A number in C, double precision."""
+    text = _number(value)
+    return text if "." in text or "e" in text else f"{text}.0"
 
 
 def _products(row: np.ndarray, names: list[str], offset: float = 0.0) -> str:
@@ -163,4 +188,4 @@ def _products(row: np.ndarray, names: list[str], offset: float = 0.0) -> str:
         for value, name in zip(row, names, strict=True)
         if value != 0.0
     ]
-    return " + ".join(terms + ([_c(offset)] if offset else [])) or "0.0f"
+    return " + ".join(terms + ([_c(offset)] if offset else [])) or "0.0"
