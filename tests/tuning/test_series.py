@@ -352,6 +352,41 @@ def test_a_pandas_index_of_times_is_taken_and_one_that_counts_is_not():
     assert np.flatnonzero(np.isnan(missing.values)).tolist() == [5, 6]
 
 
+@pytest.mark.parametrize(
+    ("times", "header", "dt"),
+    [
+        ([f"2026-05-01T12:{k // 60:02d}:{k % 60:02d}" for k in range(0, 120, 2)], "Datum", 2.0),
+        ([100000 * k for k in range(60)], "micros", 0.1),
+        ([20 * k for k in range(60)], "millis", 0.02),
+        ([0.5 * k for k in range(60)], "Zeit", 0.5),
+        ([0.5 * k for k in range(60)], "T", 0.5),
+        ([0.5 * k for k in range(60)], "Sekunde", 1.0),  # no name of times
+        ([20.0 + k % 7 for k in range(60)], "T", 1.0),  # a temperature
+    ],
+)
+def test_times_are_found_beside_a_column_or_their_lack_is_said(tmp_path, times, header, dt):
+    file = tmp_path / "log.csv"
+    z = np.random.default_rng(1).normal(size=60)
+    file.write_text(
+        f"{header},Füllstand\n" + "".join(f"{t},{v!r}\n" for t, v in zip(times, z.tolist(), strict=True))
+    )
+    column = column_of(file, column="Füllstand")
+    assert column.dt == pytest.approx(dt)
+    lacks = f"no column of times was found (columns {header}, Füllstand): 1 s is assumed, give --dt, or --column "
+    assert (f"{lacks}Füllstand,time={header}." in column.remarks) == (dt == 1.0)
+    if header == "Sekunde":
+        stated = column_of(file, column="Füllstand,time=Sekunde")
+        assert stated.dt == 0.5 and stated.remarks == () and column_of(file, 0.25, column="Füllstand").dt == 0.25
+        assert column_of(file, column="time=Sekunde").dt == 0.5
+
+
+@pytest.mark.parametrize("times", ["date", "t", "time"])
+def test_a_temperature_beside_times_is_no_time(times):
+    table = {times: 2.0 * np.arange(60), "T": 20.0 + np.arange(60.0)}
+    column = column_of(table)
+    assert column.quantities[0].symbol == "T" and column.dt == 2.0
+
+
 def test_tune_names_fit_for_a_log_that_is_a_column_of_numbers(tmp_path):
     file = tmp_path / "level.csv"
     file.write_text("t,level [m]\n" + "".join(f"{k},{z!r}\n" for k, z in enumerate(map(float, NILE.split()))))

@@ -62,8 +62,9 @@ _BRACKETS = re.compile(r"^(?P<base>.*?\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 INPUT, MEASUREMENT, STATE, OUTPUT = "input", "measurement", "state", "output"
 NO_COLUMN = "a log must have a column"  # with which the message on missing columns begins
 TIME = "time"
-TIME_NAMES = ("t", "time", "Time", "TIME", "timestamp", "stamp")
-DATE_NAMES = ("timestamp", "datetime", "date_time", "date time")
+TIME_NAMES = ("t", "time", "Time", "TIME", "timestamp", "stamp", "Zeit", "zeit")
+DATE_NAMES = ("timestamp", "datetime", "date_time", "date time", "date", "datum", "zeitstempel")
+COUNTERS = {"micros": "us", "millis": "ms"}  # columns of times whose name is the unit, as Arduino's functions
 
 
 # Units of columns: as headers have them, and converted to those of a model, rare ones by the package pint.
@@ -324,6 +325,10 @@ def _by_headers(columns: dict, wanted: Sequence[Wanted], headers: Sequence[str],
 
     times = [header for header in left if bare[header][0] in TIME_NAMES]
     take(TIME, times or [header for header in left if bare[header][0].lower() in DATE_NAMES])
+    counters = [header for header in left if header.lower() in COUNTERS]
+    if TIME not in columns and counters:
+        columns[TIME] = Column(counters[0], _unit(counters[0], units) or COUNTERS[counters[0].lower()])
+        del bare[counters[0]]
     for kinds in ((INPUT, MEASUREMENT), (STATE, OUTPUT)):
         remaining = [channel for channel in wanted if channel.kind in kinds]
         for channel in remaining:

@@ -18,8 +18,8 @@ import numpy as np
 
 from filters.models import Scales, named_model
 from thruster_env.core.checks import as_floats, listed, one_of, short_repr
-from thruster_env.logs.columns import DATE_NAMES, TIME, TIME_NAMES, parted, simple
-from thruster_env.logs.findings import sentences
+from thruster_env.logs.columns import COUNTERS, DATE_NAMES, TIME, TIME_NAMES, parted, simple
+from thruster_env.logs.findings import CLOCK, Remark, sentences
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 from thruster_env.logs.recorders.registry import format_of
@@ -205,7 +205,14 @@ def log_of_columns(
     columns |= {} if time is None else {TIME: time}
     options["dt"] = 1.0 if dt is None and time is None and not recorded else dt
     options = {key: value for key, value in options.items() if value is not None}
-    return read_log(source, reader, columns, table=table, **options)
+    log = read_log(source, reader, columns, table=table, **options)
+    if not is_table or recorded or time is not None or dt is not None or table is None:
+        return log
+    further = [name for name in table.names if name not in headers]
+    way = f"give --dt, or --column {headers[0]},{TIME}={further[0]}" if further else "give --dt"
+    text = f"no column of times was found (columns {listed(table.names)}): 1 s is assumed, {way}"
+    remarks = (*log.recording.remarks, Remark(CLOCK, "", text))
+    return replace(log, recording=log.recording._replace(remarks=remarks))
 
 
 def _resolution(times: np.ndarray, dt: float) -> float:
@@ -281,20 +288,53 @@ def as_columns(z: Any, times: Any = None) -> Mapping[str, Any]:
 
 def _headers(table: Table, named: Sequence[str] | None, axes: int = 1) -> tuple[list[str], str | None]:
     """The headers of the numbers and that of the times; ValueError for other columns than axes without names."""
-    times = [name for name in table.names if parted(name)[0].strip().lower() in (*TIME_NAMES, *DATE_NAMES)]
-    times += [name for name in table.names if name not in times and table.dates(name) is not None]
-    time = next((name for name in times if name not in (named or ())), None)
+    times = _times(table, named or ())
     numbers = [name for name in table.names if name not in times]
+    time = next((name for name in times if _increases(table, name)), times[0] if times else None)
+    unit = COUNTERS.get((time or "").strip().lower())
+    time = f"{time}[{unit}]" if unit else time
     if named is not None:
+        stated = [text.partition("=")[2] for text in named if _is_time(text, table)]
+        named = [text for text in named if not _is_time(text, table)]
         by_name = {parted(name)[0].strip().lower(): name for name in table.names}
         of = {header: header if header in table.names else by_name.get(header.strip().lower()) for header in named}
-        return [of[each] or one_of(f"a column of {table.file}", each.strip(), table.names) for each in named], time
+        headers = [of[each] or one_of(f"a column of {table.file}", each.strip(), table.names) for each in named]
+        time = stated[0] if stated else time
+        if headers:
+            return headers, time
+        numbers = [name for name in numbers if name != time]
     if len(numbers) != axes:
         count = "one column" if axes == 1 else f"{axes} columns"
         rule = f"a file must have {count} of numbers beside its times, or columns must be named"
         way = "column=, --column HEADER, or --column X,Y for the axes of a track"
-        raise ValueError(f"{rule} ({way}), but {table.file} has {listed(numbers)}")
+        raise ValueError(f"{rule} ({way}), but {table.file} has {listed(numbers or table.names)}")
     return numbers, time
+
+
+def _is_time(text: str, table: Table) -> bool:
+    return text not in table.names and text.strip().startswith(f"{TIME}=")
+
+
+def _times(table: Table, named: Sequence[str]) -> list[str]:
+    """The columns that may be times, by their names or as they hold dates.
+
+    T is a temperature, unless its values increase and nothing else has a name of times.
+    """
+    known = {*map(str.lower, TIME_NAMES), *DATE_NAMES, *COUNTERS}
+    free = [name for name in table.names if name not in named]
+    times = [name for name in free if parted(name)[0].strip().lower() in known and parted(name)[0].strip() != "T"]
+    times += [name for name in free if name not in times and table.dates(name) is not None]
+    return times or [name for name in free if parted(name)[0].strip() == "T" and _increases(table, name)]
+
+
+def _increases(table: Table, name: str) -> bool:
+    """Whether a column holds times or numbers of which each is larger than the one before."""
+    try:
+        values = table.dates(name)
+        values = table.numbers(name) if values is None else values
+    except ValueError:
+        return False
+    return len(values) > 1 and bool((np.diff(values) > 0.0).all())
 
 
 def _roughness(times: np.ndarray, values: np.ndarray, spread: float) -> float:
