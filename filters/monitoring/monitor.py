@@ -342,8 +342,14 @@ class Monitor:
             innovations: (K, m).
             covs: (K, m, m).
             measurements: (K, m), NaN where nothing was measured.
+
+        Raises:
+            ValueError: if shapes do not fit.
         """
         v, s, z = (np.ascontiguousarray(as_floats(array)) for array in (innovations, covs, measurements))
+        if z.ndim != 2 or (v.shape, s.shape) != (z.shape, (*z.shape, z.shape[1])):
+            rule = "innovations and measurements must have the shape (K, m), covs (K, m, m)"
+            raise ValueError(f"{rule}, but got {v.shape}, {z.shape} and {s.shape}")
         steps, m = z.shape
         shape = steps, len(TESTS), m
         raised, since, sizes = np.zeros(shape), np.zeros(shape), np.zeros(shape)
@@ -431,6 +437,10 @@ class Watch:
         """Take the innovation (m,), its covariance (m, m) and the measurement (m,), NaN where there was none."""
         raised, since, sizes = self._out
         innovation, cov, z = (np.ascontiguousarray(part, dtype=np.float64) for part in (innovation, cov, z))
+        count = (len(self._state),)
+        if innovation.shape != count or z.shape != count or cov.shape != 2 * count:
+            rule = f"a monitor of {count[0]} channels must get as many innovations and measurements"
+            raise ValueError(f"{rule}, but got {innovation.shape}, {z.shape} and a covariance {cov.shape}")
         tests = self._state, float(self._k), innovation, cov, z, self._limits, raised, since, sizes
         dead = _compiled(is_interpreting())[0](*tests)
         alarms: tuple[Alarm, ...] = ()

@@ -276,3 +276,13 @@ def test_a_monitor_that_ran_as_python_first_is_compiled_afterwards():
         Monitor().alarms(np.zeros((3, 1)), np.ones((3, 1, 1)), np.zeros((3, 1)))
         assert of_monitors._compiled(is_interpreting())[1].in_python
     assert not of_monitors._compiled(is_interpreting())[1].in_python
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    """Machine code would read behind them."""
+    v, s, z = np.zeros((5, 2)), np.tile(np.eye(2), (5, 1, 1)), np.zeros((5, 2))
+    for arguments in ((v[:4], s, z), (v, s[:4], z), (v[:, :1], s, z), (v, s, z[:, :1]), (v[0], s[0], z[0])):
+        with pytest.raises(ValueError, match=r"must have the shape \(K, m\), covs \(K, m, m\), but got"):
+            Monitor().alarms(*arguments)
+    with pytest.raises(ValueError, match="a monitor of 2 channels must get as many innovations"):
+        Monitor().watch(2).step(v[0, :1], s[0], z[0])
