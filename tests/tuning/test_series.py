@@ -18,6 +18,7 @@ from thruster_env.graphs.loops import machine_code_of
 from tuning.series.column import column_of
 from tuning.series.likelihood import ColumnLikelihood
 from tuning.series.paste import LANGUAGES
+from tuning.series.periods import outstanding_period
 from tuning.series.recursion import _recursion
 
 NILE = """
@@ -441,6 +442,24 @@ def test_a_daily_course_and_steps_between_numbers():
     masked = column_of(np.ma.masked_array(z, mask=hours == 7.0))
     assert np.flatnonzero(np.isnan(masked.values)).tolist() == [7]
     assert masked.remarks == ("1 of 240 row is missing, in 1 place.",)  # without an input that is held
+
+
+def test_a_day_that_no_model_has_is_named_with_the_model_that_has_it():
+    rng, hours = np.random.default_rng(3), np.arange(240.0)
+    z = np.cos(2.0 * np.pi * (hours - 9.0) / 24.0) + 0.4 * np.cos(4.0 * np.pi * hours / 24.0)
+    z = 4.0 * z + np.cumsum(0.1 * rng.normal(size=240)) + 0.2 * rng.normal(size=240)
+    z[100:107] = np.nan
+    fit = tuning.fit(z, 3600.0, model="constant")
+    model = "constant + harmonic:period=86400,harmonics=2"
+    assert fit.is_wrong and "one each 3600 s (1 h)" in str(fit)
+    assert fit.sentences()[1] == f'A period of 86400 s (24 h) stands out: try --model "{model}".'
+    assert f'try --model "{model}".' in str(fit).splitlines()[3]
+    better = tuning.fit(z, 3600.0, model=model)
+    assert not better.is_wrong and "harmonics=2,constant_drift=" in str(better).splitlines()[-1]
+    for noise in (rng.normal(size=500), np.cumsum(rng.normal(size=500))):
+        assert outstanding_period(column_of(noise)) is None
+    period = outstanding_period(column_of(np.cos(2.0 * np.pi * np.arange(500) / 23.7) + rng.normal(size=500)))
+    assert period.seconds == pytest.approx(23.7, rel=5e-3) and period.harmonics == 1
 
 
 def test_a_season_an_autoregression_and_a_period_are_found():

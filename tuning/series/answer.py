@@ -24,6 +24,7 @@ from tuning.series.column import Column, seconds_text
 from tuning.series.fit import Candidate, Number, behind, filtered
 from tuning.series.likelihood import ColumnLikelihood, R, model_of
 from tuning.series.paste import ARDUINO, lines_of
+from tuning.series.periods import Period, outstanding_period
 
 if TYPE_CHECKING:
     import pandas
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 WHITE = 0.001  # probability from which innovations count as white
 HIDDEN = 1e-9  # share of a mode in the measurements, below which they do not show it
 SLOW = 1e-3  # Hz, below which a frequency is also given as a period
+PERIODIC = {"harmonic", "seasonal"}  # models of a period
+OF_PERIOD = "A period of "
 NEVER = "the filter never forgets its start"
 LARGE = 0.05  # correlation of innovations that matters
 
@@ -123,6 +126,10 @@ class SeriesFit(Result):
         correlations = np.abs(self.whiteness.correlations)
         return self.whiteness.p_value < WHITE and float(correlations.max()) > LARGE
 
+    @cached_property
+    def _period(self) -> Period | None:
+        return outstanding_period(self.column)
+
     def axes_differ(self) -> float:
         """Probability of so large a likelihood ratio, if all axes have the same numbers; 1 for one axis."""
         axes, candidate = len(self.column.quantities), named_model(self.name)
@@ -148,6 +155,11 @@ class SeriesFit(Result):
                 f"No model that was tried fits: innovations are correlated ({correlation:.2f} at a lag of "
                 f"{seconds_text(time)}), so Q and R make up for what the model misses."
             )
+            period = None if PERIODIC.intersection(self.name.replace(":", " ").split()) else self._period
+            if period is not None:
+                sentences.append(
+                    f'{OF_PERIOD}{seconds_text(period.seconds)} stands out: try --model "{period.model}".'
+                )
         sentences += [
             f"The data do not determine {number.name}: {number.low:.3g} to {number.high:.3g} are as likely."
             for number in self.numbers
@@ -202,7 +214,8 @@ class SeriesFit(Result):
         heading = f"{names}: {count} numbers, {apart}"
         sentences = self.sentences()
         if self.is_wrong:
-            first, sentences = [sentences[0]], sentences[1:]
+            count = 1 + "".join(sentences[1:2]).startswith(OF_PERIOD)
+            first, sentences = [sentences[0], *map(Unfolded, sentences[1:count])], sentences[count:]
         rows = [
             (
                 number.name,

@@ -33,7 +33,7 @@ SPARSE = 2.0  # rows of a grid a number, from which on numbers have their own ti
 DIGITS = 1e-12  # of the largest number: noise that is rounding
 MOST_AXES = 6
 RANGES = 1e-60, 1e60  # of a column's numbers, of which Q and R are squares
-LONG_UNITS, LEAST_OF_UNIT = (("days", 86400.0), ("h", 3600.0), ("min", 60.0)), 2.0
+LONG_UNITS = ("days", 86400.0, 172800.0), ("h", 3600.0, 3600.0), ("min", 60.0, 0.0)  # seconds, and from which on
 WIDTHS, PEAKS = (1, 5, 21), 2  # by how many points a spectrum is smoothed, and how many of its peaks are tried
 
 
@@ -248,7 +248,7 @@ def seconds_text(seconds: float) -> str:
     text = f"{seconds:.5g}" if seconds < 1e5 else f"{seconds:.0f}"
     if not 120.0 < seconds < math.inf:
         return f"{seconds:.3g} s"
-    unit, size = next(pair for pair in LONG_UNITS if seconds >= LEAST_OF_UNIT * pair[1])
+    unit, size, _ = next(unit for unit in LONG_UNITS if seconds >= unit[2])
     return f"{text} s ({seconds / size:.3g} {unit})"
 
 
