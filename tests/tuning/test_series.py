@@ -388,6 +388,16 @@ def test_a_temperature_beside_times_is_no_time(times):
     assert column.quantities[0].symbol == "T" and column.dt == 2.0
 
 
+@pytest.mark.parametrize("unit", ["kPa", "degC", "Hz", "deg", "km"])
+def test_numbers_keep_the_unit_of_their_column(position, tmp_path, unit):
+    file = tmp_path / "log.csv"
+    z = position.column.values[:60]
+    file.write_text(f"t,value [{unit}]\n" + "".join(f"{k},{v!r}\n" for k, v in enumerate(z.tolist())))
+    column = column_of(file)
+    np.testing.assert_array_equal(column.values, z)
+    assert column.quantities[0].unit == unit
+
+
 def test_tune_names_fit_for_a_log_that_is_a_column_of_numbers(tmp_path):
     file = tmp_path / "level.csv"
     file.write_text("t,level [m]\n" + "".join(f"{k},{z!r}\n" for k, z in enumerate(map(float, NILE.split()))))
@@ -439,6 +449,10 @@ def test_a_daily_course_and_steps_between_numbers():
     steps[100] = 3.0
     column = column_of(z, steps)
     assert len(column.values) == 242 and np.isnan(column.values[101:103]).all()
+    lost = z.copy()
+    lost[[3, 9]] = lost[40:60] = lost[100:130] = np.nan
+    missing = "52 of 240 rows are missing, in 4 places, the longest of 30 rows (30 s)."
+    assert column_of(lost).remarks == (missing,)
     masked = column_of(np.ma.masked_array(z, mask=hours == 7.0))
     assert np.flatnonzero(np.isnan(masked.values)).tolist() == [7]
     assert masked.remarks == ("1 of 240 row is missing, in 1 place.",)  # without an input that is held

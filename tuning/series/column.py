@@ -18,8 +18,8 @@ import numpy as np
 
 from filters.models import Scales, named_model
 from thruster_env.core.checks import as_floats, listed, one_of, short_repr
-from thruster_env.logs.columns import COUNTERS, DATE_NAMES, TIME, TIME_NAMES, parted, simple
-from thruster_env.logs.findings import CLOCK, Remark, sentences
+from thruster_env.logs.columns import COUNTERS, DATE_NAMES, TIME, TIME_NAMES, parted
+from thruster_env.logs.findings import CLOCK, GAP, MISSING, Remark, sentences
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 from thruster_env.logs.recorders.registry import format_of
@@ -156,7 +156,23 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
     for quantity, values in zip(log.measured, log.measurements.T, strict=True):
         _check_numbers(quantity.symbol, values)
     values = log.measurements[:, 0] if len(log.measured) == 1 else log.measurements
-    return Column(values, log.dt, log.measured, tuple(sentences(log.findings)), stamps)
+    lost = (GAP, MISSING) if stamps is None else ()  # of which one sentence tells all
+    remarks = sentences([finding for finding in log.findings if finding.kind not in lost])
+    missing = [] if stamps is not None else _missing(log.measurements, log.dt)
+    return Column(values, log.dt, log.measured, (*remarks, *missing), stamps)
+
+
+def _missing(values: np.ndarray, dt: float) -> list[str]:
+    """How many rows of a grid have no number, and where; none if all have one."""
+    lost = np.isnan(values).all(axis=1)
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]])))
+    lengths = ends[1::2] - ends[::2]
+    if not len(lengths):
+        return []
+    rows, longest = int(lengths.sum()), int(lengths.max())
+    text = f"{rows} of {len(lost)} row{' is' if rows == 1 else 's are'} missing, in {len(lengths)} place"
+    more = f", the longest of {longest} rows ({seconds_text(longest * dt)})" if longest > 1 else ""
+    return [f"{text}{'s' * (len(lengths) > 1)}{more}."]
 
 
 def log_of_columns(
@@ -229,7 +245,7 @@ def _quantity(header: str) -> Quantity:
     """Name, symbol and unit that a header states."""
     base, unit = parted(header)
     symbol = re.sub(r"[^A-Za-z0-9_-]+", "_", base).strip("_") or "z"
-    return Quantity(base.strip(), symbol, simple(unit or "")[0] if unit and unit.isalnum() else unit or "")
+    return Quantity(base.strip(), symbol, unit or "")  # which the answer has, too
 
 
 def _check_numbers(header: str, values: np.ndarray) -> None:
