@@ -354,8 +354,10 @@ class Arrays:
             return
         if isinstance(values, Array) and not self._is_apart(out, values):
             values = self._copied(values)
-        for indices in self._indices(self._common_shape(out, values)):
-            self._put(self._at(out, indices), self._number_at(values, indices))
+        self._common_shape(out, values)
+        shape = out.shape
+        for indices in self._indices(shape):
+            self._put(self._at(out, indices), self._number_at(values, indices, shape))
 
     def _put(self, entry: Array, number: Any) -> None:
         self._builder.store(self.numbers.as_float(number), entry.pointer, align=8)
@@ -371,7 +373,8 @@ class Arrays:
         shape = self._common_shape(*values)
         out = self._new_array(shape)
         for indices in self._indices(shape):
-            self._put(self._at(out, indices), function(*(self._number_at(value, indices) for value in values)))
+            numbers = (self._number_at(value, indices, shape) for value in values)
+            self._put(self._at(out, indices), function(*numbers))
         return out
 
     def _common_shape(self, *values: Any) -> tuple:
@@ -381,6 +384,8 @@ class Arrays:
         for sizes in zip(*shapes, strict=True):
             if len({size for size in sizes if is_known(size)}) > 1:
                 raise Untranslated("arithmetic of arrays of different shapes")
+        if self.wraps:  # the others may have one number, for all
+            return tuple(next(filter(is_known, sizes), sizes[0]) for sizes in zip(*shapes, strict=True))
         return shapes[0]
 
     def _indices(self, shape: Sequence) -> Iterator[tuple]:
@@ -392,8 +397,19 @@ class Arrays:
             for rest in self._indices(shape[1:]):
                 yield (first, *rest)
 
-    def _number_at(self, value: Any, indices: tuple) -> Any:
-        return self._load(self._at(value, indices)) if isinstance(value, Array) else value
+    def _number_at(self, value: Any, indices: tuple, shape: tuple) -> Any:
+        """A number, or an array's at indices of a shape; NaN in a user's function if its shape does not fit."""
+        if not isinstance(value, Array):
+            return value
+        within, builder, of_two = None, self._builder, self.numbers.of_two
+        if self.wraps:
+            for k, (size, other) in enumerate(zip(value.shape, shape, strict=True)):
+                if size is not other and not is_known((size, other)):
+                    alike, zero = of_two("Eq", size, other), ir.Constant(LONG, 0)
+                    indices = (*indices[:k], builder.select(alike, indices[k], zero), *indices[k + 1 :])
+                    fits = builder.or_(alike, self.numbers.truth(of_two("Eq", size, 1)))  # one counts for all
+                    within = fits if within is None else builder.and_(within, fits)
+        return self._or_nan(within, self._load(self._at(value, indices)))
 
     def _eigenvectors(self, a: Array) -> tuple[Array, Array]:
         """NumPy's `eigh`, by the same function of LAPACK, on the lower triangle; columns follow one another."""

@@ -605,3 +605,20 @@ def with_a_new_axis(x):
 )
 def test_a_users_function_is_refused_whatever_its_translation_raises(function):
     assert refusal_of(function, [unknown(8, as_array=True)])
+
+
+def of_two_lengths(x, n):
+    x[5:8] = x[:n] + np.ones(3)
+    x[:2] = x[1:n]
+
+
+def test_arrays_of_lengths_that_do_not_fit_are_nan():
+    run = machine(of_two_lengths, (8,), None)
+    for n in (0, 1, 2, 3, 8):
+        x = np.arange(8.0)
+        run(x, n)
+        assert np.isnan(x[5:]).all() == (n not in (1, 3))
+        if n == 3:
+            assert x.tolist() == [1.0, 2.0, 2.0, 3.0, 4.0, 1.0, 2.0, 3.0]
+        else:
+            assert x[:2].tolist() == [1.0, 1.0] if n == 2 else np.isnan(x[:2]).all()
