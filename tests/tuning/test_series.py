@@ -15,7 +15,9 @@ import filters
 import tuning
 from filters.models import NAMED, Scales, named_model
 from thruster_env.graphs.loops import machine_code_of
-from tuning.series.column import column_of
+from tuning.series.answer import _digits
+from tuning.series.column import column_of, seconds_text
+from tuning.series.fit import Number
 from tuning.series.likelihood import ColumnLikelihood
 from tuning.series.paste import LANGUAGES
 from tuning.series.periods import outstanding_period
@@ -474,6 +476,17 @@ def test_a_day_that_no_model_has_is_named_with_the_model_that_has_it():
         assert outstanding_period(column_of(noise)) is None
     period = outstanding_period(column_of(np.cos(2.0 * np.pi * np.arange(500) / 23.7) + rng.normal(size=500)))
     assert period.seconds == pytest.approx(23.7, rel=5e-3) and period.harmonics == 1
+
+
+def test_narrow_intervals_have_digits_and_long_times_words():
+    narrow = Number("period", "period", 86397.123, 86390.2, 86404.4, "s", True)
+    assert _digits(narrow) == ("86397.12", "86390.2", "86404.4")
+    assert _digits(narrow._replace(low=4e4, high=2e5))[:2] == ("8.64e+04", "4e+04")
+    texts = [
+        seconds_text(seconds) for seconds in (0.6428, 119.0, 150.0, 6647.8, 86400.0, 2156400.0, 1e9, math.inf)
+    ]
+    expected = ["0.643 s", "119 s", "150 s (2.5 min)", "6648 s (1.85 h)", "86400 s (24 h)", "2156400 s (25 days)"]
+    assert texts == [*expected, "1000000000 s (31.7 years)", "inf s"]
 
 
 def test_a_season_an_autoregression_and_a_period_are_found():

@@ -49,7 +49,8 @@ def fit(
             Series or table, whose index may have times or dates; NaN or None where a number is missing.
         dt: sample time [s], where there are no times; 1 by default. In Python also the steps between numbers.
         times: of an array's numbers [s], (K,).
-        column: header of the numbers, where there are several; x,y for the axes of a track.
+        column: header of the numbers, where there are several; x,y for the axes of a track; level,time=HEADER
+            names that of the times, too.
         model: name of a model, or a sum such as "constant-velocity + oscillator"; auto tries the small ones.
         plot: also draw the data, the estimate with its band, and the innovations: .png, .svg or .pdf.
         code: also write the filter as lines to paste, for Python, FilterPy, pykalman, MATLAB, a controller: .md.
@@ -85,5 +86,5 @@ def _section(fitted: SeriesFit, language: str) -> str:
     try:
         body = f"```\n{fitted.code(language)}\n```"
     except ValueError as error:
-        body = f"{error}."
+        body = f"None: {error}."
     return f"## {language}\n\n{body}\n"

@@ -219,9 +219,7 @@ class SeriesFit(Result):
         rows = [
             (
                 number.name,
-                f"{number.value:.4g}",
-                f"{number.low:.3g}",
-                f"{number.high:.3g}",
+                *_digits(number),
                 number.unit,
                 _meaning(number),
             )
@@ -322,7 +320,7 @@ class SeriesFit(Result):
             raise ValueError(
                 f"a filter of constant gain must forget its start within the record, {seconds_text(duration)}, "
                 f'but {self.name} {forgets}: take code("python") or code("filterpy"), whose gain varies, or '
-                "thruster export"
+                "thruster tune and export, which write such a one in C"
             )
         return lines_of(language, self.model, self._gains(), self.column.dt)
 
@@ -334,6 +332,13 @@ def _step_text(dt: float) -> str:
 def _range_text(steps: np.ndarray) -> str:
     least, most = float(steps.min()), float(steps.max())
     return f"{least:.4g} to {_step_text(most)}"
+
+
+def _digits(number: Number) -> tuple[str, str, str]:
+    """Value and ends of the interval, to as many digits as tell the ends of a narrow one apart."""
+    width = (number.high - number.low) / max(abs(number.value), 1e-300)
+    more = max(math.ceil(-math.log10(width)) - 1, 0) if 1e-9 < width < 1.0 else 0
+    return f"{number.value:.{4 + more}g}", f"{number.low:.{3 + more}g}", f"{number.high:.{3 + more}g}"
 
 
 def _meaning(number: Number) -> str:

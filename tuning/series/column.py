@@ -33,7 +33,13 @@ SPARSE = 2.0  # rows of a grid a number, from which on numbers have their own ti
 DIGITS = 1e-12  # of the largest number: noise that is rounding
 MOST_AXES = 6
 RANGES = 1e-60, 1e60  # of a column's numbers, of which Q and R are squares
-LONG_UNITS = ("days", 86400.0, 172800.0), ("h", 3600.0, 3600.0), ("min", 60.0, 0.0)  # seconds, and from which on
+YEAR = 365.25 * 86400.0
+LONG_UNITS = (
+    ("years", YEAR, 2.0 * YEAR),
+    ("days", 86400.0, 172800.0),
+    ("h", 3600.0, 3600.0),
+    ("min", 60.0, 0.0),
+)  # seconds, and from which on
 WIDTHS, PEAKS = (1, 5, 21), 2  # by how many points a spectrum is smoothed, and how many of its peaks are tried
 
 
@@ -261,11 +267,15 @@ def _check_numbers(header: str, values: np.ndarray) -> None:
 
 def seconds_text(seconds: float) -> str:
     """A time, beyond two minutes also in minutes, hours or days: "86400 s (24 h)"."""
-    text = f"{seconds:.5g}" if seconds < 1e5 else f"{seconds:.0f}"
+    text = f"{seconds:.4g}" if seconds < 1e4 else f"{seconds:.0f}"
     if not 120.0 < seconds < math.inf:
         return f"{seconds:.3g} s"
     unit, size, _ = next(unit for unit in LONG_UNITS if seconds >= unit[2])
-    return f"{text} s ({seconds / size:.3g} {unit})"
+    return f"{text} s ({_short(seconds / size)} {unit})"
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}" if value < 999.5 else f"{value:.0f}"
 
 
 def is_numbers(z: Any) -> bool:
