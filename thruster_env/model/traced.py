@@ -20,7 +20,7 @@ from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.modules import error_line
 from thruster_env.core.results import array_valued
-from thruster_env.core.sources import is_array, tuple_of, written_out
+from thruster_env.core.sources import is_array, matrix_of, tuple_of, written_out
 from thruster_env.core.user_functions import functions_in, is_copy, needs_python, stand_in, stands_for
 from thruster_env.graphs.branches import along, on_every_side
 from thruster_env.graphs.graphs import Graph, Number, TooLarge
@@ -282,7 +282,10 @@ def _machine_code(
     function: Callable, arguments: str, sizes: Sequence[int], form, shape: tuple[int, ...]
 ) -> Instead:
     """Machine code of a function's graph, or of its loops, else of numba's."""
-    parts, of_loops = [*functions_in(function)], array_valued(function, arguments, *shape)
+    parts, of_loops = (
+        [*functions_in(function)],
+        _of_floats(array_valued(function, arguments, *shape), arguments, shape),
+    )
     large = is_array(max(sizes[:-1])) or is_array(*shape)
     if (large or not parts) and _is_translated(of_loops, sizes, form):
         return Instead(of_loops)
@@ -303,6 +306,20 @@ def _machine_code(
         return Instead(_by_numba(function, sizes, form, shape), reason)
     except Exception as error:  # numba's, of many classes
         return Instead(None, f"{reason}; numba refuses it: {_reason(error)}")
+
+
+@makes_functions
+def _of_floats(function: Callable, arguments: str, shape: tuple[int, ...]) -> Callable:
+    """The function with floats in its result, a tuple, where it may return whole numbers."""
+    if is_array(*shape):
+        return function
+    entry = "float(y[{}])".format
+    result = (
+        tuple_of(map(entry, range(*shape)))
+        if len(shape) == 1
+        else matrix_of(*shape, lambda i, j: entry(f"{i}][{j}"))
+    )
+    return written_out("of_floats", arguments, f"y = function({arguments})", result, function=function)
 
 
 def _is_translated(function: Callable, sizes: Sequence[int], form: type | int) -> bool:

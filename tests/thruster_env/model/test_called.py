@@ -256,3 +256,18 @@ def never_so_low(x, u, c):
 
 def test_a_function_is_traced_though_it_raises_at_a_point_of_the_check():
     assert not machine_code(never_so_low, "x, u, c", (1, 1, 1), 1, (1,)).reason
+
+
+def counted(x, u, c):
+    n = 0
+    while n < abs(x[0]):
+        n += 1
+    return (n // 2,)
+
+
+def test_a_function_of_whole_numbers_is_machine_code():
+    filter_ = filters.ExtendedKalmanFilter(model=model_of(counted))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        belief = filter_.predict(filter_.init()._replace(mean=np.array([6.5])), [0.0])
+    assert belief.mean == 3.0
