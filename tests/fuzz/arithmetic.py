@@ -272,6 +272,15 @@ def _of_single(program: Program, points: np.ndarray) -> np.ndarray:
     return rows.astype(np.float64)
 
 
+def storing(work):
+    """A program as a function of its results and its arguments."""
+
+    def call(rows, given):
+        work(rows, rows, given, given)
+
+    return call
+
+
 def compiled_arithmetic(rng: np.random.Generator, seconds: float) -> str:
     """Random expressions: machine code has Python's values, where it jumps as well."""
     counts: Counter = Counter()
@@ -281,10 +290,7 @@ def compiled_arithmetic(rng: np.random.Generator, seconds: float) -> str:
         stores = [(Place("rows", k), one) for k, one in enumerate(numbers)]
         work = callable_of(program_of(stores, {}), 1)
 
-        def call(rows, given, work=work):
-            work(rows, rows, given, given)
-
-        run_it, found = Loops(call), np.empty((len(numbers), points.shape[1]))
+        run_it, found = Loops(storing(work)), np.empty((len(numbers), points.shape[1]))
         for k in range(points.shape[1]):
             rows = np.empty(len(numbers))
             run_it(rows, np.ascontiguousarray(points[:, k]))

@@ -92,9 +92,8 @@ def test_former_names_are_answered_with_those_of_today(thruster):  # noqa: F811
     for command, name in (
         (("tune", "--way", "em"), "--method"),
         (("tune", "--sampler=gp"), "--method"),
-        (("study", "methods", "--way", "em"), "--method"),
         (("ways",), "'methods'"),
-        (("study", "ways"), "'methods'"),
+        (("study", "methods"), "'reproduce'"),
     ):
         refused = thruster(*command)
         assert refused.returncode == 2 and refused.stderr.strip().endswith(f"Did you mean {name}?")

@@ -79,11 +79,11 @@ def test_data_are_those_of_an_env_of_the_plant_with_the_same_seed(name):
     _, info = env.reset(seed=11)
     for k, action in enumerate([*data.inputs[1], None]):
         measured = np.where(info.get("measurement_valid", True), info["measurement"], np.nan)
-        np.testing.assert_array_equal(data.measurements[1, k], measured)
+        np.testing.assert_allclose(data.measurements[1, k], measured, rtol=1e-14, atol=1e-14)
         state = np.append(info["state"], info.get("current", []))
-        np.testing.assert_array_equal(data.states[1, k], state[: data.states.shape[-1]])
+        np.testing.assert_allclose(data.states[1, k], state[: data.states.shape[-1]], rtol=1e-14, atol=1e-14)
         if "T" in data.outputs:
-            assert info["thrust"] == data.outputs["T"][1, k]
+            np.testing.assert_allclose(info["thrust"], data.outputs["T"][1, k], rtol=1e-14, atol=1e-14)
         if action is not None:
             *_, info = env.step(action)
 

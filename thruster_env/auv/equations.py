@@ -73,9 +73,9 @@ class Memory(NamedTuple):
 
 def next_piece(arguments, results, numbers):
     """The piece of a path that a position has got to, from the one that it was at; as `paths.Path.piece`."""
-    first, count, piece = arguments[0], arguments[1], arguments[2]
+    first, count, begun = arguments[0], arguments[1], arguments[2]
     x, y, z = arguments[3], arguments[4], arguments[5]
-    last, piece = int(count) // PIECE - 1, int(piece)
+    last, piece = int(count) // PIECE - 1, int(begun)
     at = int(first) + PIECE * piece
     while piece < last:
         along = (x - numbers[at]) * numbers[at + 3] + (y - numbers[at + 1]) * numbers[at + 4]

@@ -326,6 +326,12 @@ class Arrays:
     def _zeros(self, shape: Any) -> Array:
         return self._full(shape, 0.0)
 
+    def _identity(self, size: Any) -> Array:
+        out = self._zeros((size, size))
+        step = size + 1 if isinstance(size, int) else self._builder.add(as_value(size), as_value(1))
+        self._fill(Array(out.pointer, (size,), (step,)), 1.0)
+        return out
+
     def _copied(self, values: Any) -> Array:
         """A new array with the numbers of another, or of a tuple."""
         if isinstance(values, Array):

@@ -473,6 +473,8 @@ BUILTINS: dict[Any, Callable] = {
     np.zeros_like: lambda translator, like: translator._zeros(like.shape),
     np.ones: lambda translator, shape: translator._full(shape, 1.0),
     np.full: Expressions._full,
+    np.eye: Expressions._identity,
+    np.identity: Expressions._identity,
     np.array: Expressions._copied,
     np.linalg.eigh: Expressions._eigenvectors,
     fill: Expressions._fill,

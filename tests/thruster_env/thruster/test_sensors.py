@@ -263,7 +263,8 @@ def test_noise_of_the_channels_has_covariance_r():
 
 
 def test_every_effect_is_tried():
-    assert {effect["name"] for effect in EVERY_EFFECT} == set(SENSOR_EFFECTS.effects)
+    ours = {name for name, kind in SENSOR_EFFECTS.effects.items() if kind.__module__.startswith("thruster_env")}
+    assert {effect["name"] for effect in EVERY_EFFECT} == ours  # and what examples of the docs have registered
 
 
 def registered(monkeypatch, act):
