@@ -106,6 +106,11 @@ def check_excitation(objective: Objective, logs: Sequence[Log], start: np.ndarra
     cov = covariance(evaluation.information, evaluation.scores[:0], coordinates.high - coordinates.low)
     narrow = is_narrow(cov, coordinates)
     loose = [name for name, known in zip(coordinates.names, narrow, strict=True) if not known]
+    if loose and not levels[0].size:
+        raise ValueError(
+            f"logs must determine the free parameters, but these do not determine {', '.join(loose)}: leave these "
+            "out of free (--free), or record more"
+        )
     if loose:
         raise ValueError(
             f"logs must excite the free parameters, but constant inputs do not determine {', '.join(loose)}: "

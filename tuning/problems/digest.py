@@ -6,6 +6,7 @@ how the code is written, where it stands and what it is called does not. It cann
 
 - problems that differ only beyond these runs, as by an event of one seed in a hundred, or in what f and h do for
   states and inputs that neither the data nor the fixed points of `StateSpaceModel.digest` reach;
+- functions that make the same model at the defaults and where one parameter is at an end, and another between;
 - what only other results follow from, as a model's own Jacobians.
 
 Where a run amplifies rounding, as of a chaotic plant, another processor has other data and another digest.
