@@ -276,6 +276,11 @@ def prepared(
     plain = Prepared(
         filter_, keys, inputs, z, process_noise_covs, measurement_noise_covs, rows, times[rows], single
     )
+    if noise is not None and not (callable(noise) and process_noise_covs is None):
+        got = "process_noise_covs, too" if callable(noise) else short_repr(noise)
+        raise ValueError(
+            f"noise must be a function of a step's length, in place of process_noise_covs, but got {got}"
+        )
     if dt is None and noise is not None:
         raise ValueError("noise must come with dt, the lengths of the steps, but got noise alone")
     unlike = [

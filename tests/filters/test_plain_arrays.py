@@ -92,6 +92,20 @@ def test_an_ensemble_draws_as_the_batch_of_one_does():
         ),
         ({"inputs": np.zeros(39), "measurements": ["a"] * 40}, "measurements must be an array of numbers"),
         ({}, "measurements must be an array"),
+        (
+            {"inputs": np.zeros(39), "measurements": Z, "dt": 0.1, "noise": 0.3},
+            "noise must be a function of a step",
+        ),
+        (
+            {
+                "inputs": np.zeros(39),
+                "measurements": Z,
+                "dt": 0.1,
+                "noise": lambda dt: np.eye(2),
+                "process_noise_covs": np.zeros((39, 2, 2)),
+            },
+            "in place of process_noise_covs, but got process_noise_covs, too",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(arguments, message):
