@@ -43,6 +43,7 @@ from thruster_env.model.affine import AffineModel, affine_model
 from thruster_env.model.quantities import Quantity
 
 MOST_HARMONICS, MOST_SEASONS, MOST_ORDER = 6, 24, 8
+SEASON_ROUNDING = 0.15  # of a season, by which a step may differ from it, as months do
 UNDAMPED = 1e-6  # share of decay in a rate, below which it is that of a harmonic
 
 
@@ -84,6 +85,7 @@ class NamedModel(NamedTuple):
     free: tuple[Free, ...]
     signal: Callable[..., Signal]  # of the free numbers by name
     about_mean: bool = False  # whether the signal varies about the mean of the data
+    apart: float | None = None  # [s], whose multiples steps must be
 
 
 def _density(name: str, meaning: str, power: int) -> Free:
@@ -205,8 +207,9 @@ def _seasonal_model(settings: str) -> NamedModel:
     if not seasons.is_integer() or not 3 <= seasons <= MOST_SEASONS:
         raise ValueError(f"{rule}, but got {settings!r}")
     signal = partial(seasonal, period=values["period"], seasons=int(seasons))
+    apart = values["period"] / seasons if seasons % 2 == 0 else None
     about = f"a pattern of {int(seasons)} values in {values['period']:g} s"
-    return NamedModel(f"seasonal:{settings}", about, (SHAPE_DRIFT,), signal, about_mean=True)
+    return NamedModel(f"seasonal:{settings}", about, (SHAPE_DRIFT,), signal, about_mean=True, apart=apart)
 
 
 def _autoregressive_model(settings: str) -> NamedModel:
@@ -241,11 +244,15 @@ def _further_partials(scales: Scales) -> Sequence[float]:
 def _numbers_of(settings: str, rule: str, *names: str) -> dict[str, float]:
     """Positive numbers by name of text such as "period=24,harmonics=3"; ValueError with the rule for others."""
     try:
-        pairs = dict(setting.split("=") for setting in settings.split(",") if setting)
-        values = {name.strip(): float(text) for name, text in pairs.items()}
+        pairs = [setting.split("=") for setting in settings.split(",") if setting]
+        values = {name.strip(): float(text) for name, text in pairs}
     except ValueError:
         raise ValueError(f"{rule}, but got {settings!r}") from None
-    if not set(values) <= set(names) or not all(0.0 < value < math.inf for value in values.values()):
+    if (
+        len(values) < len(pairs)
+        or not set(values) <= set(names)
+        or not all(0.0 < value < math.inf for value in values.values())
+    ):
         raise ValueError(f"{rule}, but got {settings!r}")
     return values
 
@@ -313,6 +320,20 @@ class Sum(NamedTuple):
                 f"{rule}, but one has a period of {2.0 * math.pi / fastest:.4g} s, and dt is {dt:g} s"
             )
 
+    def check_steps(self, dts: Sequence[float] | np.ndarray) -> None:
+        """Raise ValueError for steps [s] to times between seasons, where a last quadrature would not be zero."""
+        for part in self.parts:
+            counts = np.asarray(dts, dtype=np.float64) / (part.apart or math.inf)
+            wrong = (np.abs(counts - np.maximum(np.round(counts), 1.0)) > SEASON_ROUNDING) & (
+                part.apart is not None
+            )
+            if wrong.any():
+                rule = (
+                    f"rows of {part.name} must be {part.apart:g} s apart, or multiples, to {SEASON_ROUNDING:.0%}"
+                )
+                way = "harmonic:period=SECONDS,harmonics=N takes any steps"
+                raise ValueError(f"{rule}, but got {np.asarray(dts)[wrong][0]:g} s: {way}")
+
     def model(
         self,
         values: Mapping[str, float],
@@ -330,7 +351,8 @@ class Sum(NamedTuple):
             values: of the free numbers.
             noise: R, the variance of the measurement noise [U^2].
             dt: sample time [s].
-            first: the first measurement of each axis, where the filter begins, or one for all.
+            first: the first measurement of each axis, or one for all, where a state begins that may begin
+                anywhere; stationary ones begin at zero.
             spread: of the data [U]; the prior is the stationary one, or else a hundred times as wide as the data,
                 and as fast as that within a step.
             offset: the mean of the data on each axis, about which the signal varies, or one for all.
@@ -341,9 +363,11 @@ class Sum(NamedTuple):
         """
         signal, axes = self.signal(values), len(quantities)
         self.check_harmonics(signal, dt)
+        self.check_steps([dt])
         n, each, (transition, noise_cov) = len(signal.output), np.eye(axes), signal.step(positive("dt", dt))
         offset = np.broadcast_to(np.asarray(offset, dtype=np.float64), axes)
-        level = np.eye(n)[int(np.argmax(signal.output))]
+        anywhere = np.isinf(np.diag(signal.first)) & (signal.output != 0.0)
+        level = np.eye(n)[int(np.argmax(anywhere))] * anywhere.any()
         states = [
             Quantity(name, name, in_unit(text, axis.unit))
             for axis in quantities

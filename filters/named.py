@@ -10,7 +10,7 @@ import inspect
 import math
 import re
 from collections import namedtuple
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any
@@ -43,7 +43,7 @@ class NamedMaker:
         quantities: name, symbol and unit of the measurement on each axis.
         values: of its numbers and R by name; those that it lacks must be given when it is called.
         mean: of the data on each axis, or one for all, about which a model without a level varies.
-        first: the first measurement of each axis, where a filter begins.
+        first: the first measurement of each axis, where a filter begins; the mean, if there is one, or 0 if None.
         spread: of the data.
         dt: sample time [s], if the text gives it.
     """
@@ -52,7 +52,7 @@ class NamedMaker:
     quantities: tuple[Quantity, ...] = (Quantity("measurement", "z"),)
     values: Mapping[str, float] = field(default_factory=dict)
     mean: tuple[float, ...] | None = None
-    first: tuple[float, ...] = (0.0,)
+    first: tuple[float, ...] | None = None
     spread: float = 1.0
     dt: float | None = None
 
@@ -84,13 +84,14 @@ class NamedMaker:
                 f"{self.name} must come with {', '.join(missing)}, as {self.name}:{settings}, but got none: "
                 "thruster fit (tuning.fit) finds these numbers in data"
             )
+        offset = 0.0 if self.mean is None else self.mean
         return named_model(self.name).model(
             {name: value for name, value in values.items() if name != R},
             positive(R, values[R]),
             dt,
-            first=self.first,
+            first=offset if self.first is None else self.first,
             spread=self.spread,
-            offset=0.0 if self.mean is None else self.mean,
+            offset=offset,
             quantities=self.quantities,
         )
 
@@ -146,8 +147,9 @@ def model_named(text: Any) -> NamedMaker | Callable[..., ContinuousModel] | None
     """What makes the model of NAME[:KEY=VALUE,...]; None for a text that is no such name.
 
     Args:
-        text: a model of `filters.models`, or a sum of such, with values of its numbers, R, axes, dt, mean; or one
-            of `filters.plants` with values of its arguments.
+        text: a model of `filters.models`, or a sum of such, with values of its numbers, R, axes, dt, mean (of axes
+            that differ mean_1, mean_2, ...); or one of `filters.plants` with values of its arguments. A level
+            begins at the mean, or at 0, with a deviation of 100: far from 0 a filter without data needs the mean.
 
     Raises:
         ValueError: for an unknown setting, or a value that is no number.
@@ -206,22 +208,44 @@ def _maker(text: str) -> NamedMaker:
             if not equals or name.lower() in WITH_SETTINGS and key in FORM:
                 retained.append(setting)
             else:
+                _check_once(name, setting, (name.lower().replace("-", "_"), key) in values)
                 values[name.lower().replace("-", "_"), key] = value
         parts.append(name + ":" * bool(retained) + ",".join(retained))
     maker = NamedMaker(named_model(" + ".join(parts)).name)
-    known, numbers = (*maker.names, AXES, DT, MEAN), {}
-    signed = {number.name for number in named_model(maker.name).free if not number.log}
+    of_axes = [key for _, key in values if re.fullmatch(rf"{MEAN}_\d+", key)]
+    known, numbers = (*maker.names, AXES, DT, MEAN, *sorted(set(of_axes))), {}
+    signed = {MEAN, *of_axes, *(number.name for number in named_model(maker.name).free if not number.log)}
     for (part, key), value in values.items():
         key = f"{part}_{key}" if f"{part}_{key}" in known else key
-        check = finite if key == MEAN or key in signed else positive
+        check = finite if key in signed else positive
+        _check_once(maker.name, f"{key}={value}", key in numbers)
         numbers[one_of(f"a setting of {maker.name}", key, known)] = check(f"{key} of {maker.name}", value)
     count, dt, mean = numbers.pop(AXES, 1.0), numbers.pop(DT, None), numbers.pop(MEAN, None)
     axes = at_least(AXES, int(count) if count == int(count) else count, 1, MOST_AXES)
-    maker = replace(maker, values=numbers, dt=dt, mean=None if mean is None else (mean,))
+    means: tuple[float, ...] | None = None if mean is None else (mean,)
+    if of_axes:
+        names = _names_of_means(axes)
+        if mean is not None or set(names) != set(of_axes):
+            rule = f"means of {maker.name} must be one for each axis, {', '.join(names)}, or one for all, mean"
+            raise ValueError(f"{rule}, but got {', '.join(of_axes)}")
+        means = tuple(numbers.pop(name) for name in names)
+    maker = replace(maker, values=numbers, dt=dt, mean=means)
     return replace(maker, quantities=axes_named("z", axes))
 
 
-def text_of(name: str, values: Mapping[str, float], axes: int = 1, mean: float | None = None) -> str:
+def _check_once(name: str, setting: str, is_known: bool) -> None:
+    """Raise ValueError for a setting that comes twice."""
+    if is_known:
+        raise ValueError(f"settings of {name} must be KEY=VALUE, each once, but got {short_repr(setting)} again")
+
+
+def _names_of_means(axes: int) -> list[str]:
+    return [f"{MEAN}_{i + 1}" for i in range(axes)]
+
+
+def text_of(
+    name: str, values: Mapping[str, float], axes: int = 1, mean: float | Sequence[float] | None = None
+) -> str:
     """The text from which `model_named` makes a model with these numbers, to seven digits.
 
     Numbers stand behind the last part of a sum: "constant + harmonic:period=24,constant_drift=1,R=2"; a free
@@ -233,7 +257,9 @@ def text_of(name: str, values: Mapping[str, float], axes: int = 1, mean: float |
         if part.partition(":")[0] == "harmonic" and PERIOD in numbers:
             parts[i] = _with(part, [f"{PERIOD}={_digits(numbers.pop(PERIOD))}"])
     settings = [f"{AXES}={axes}"] * (axes > 1) + [f"{key}={_digits(value)}" for key, value in numbers.items()]
-    settings += [] if mean is None else [f"{MEAN}={_digits(mean)}"]
+    means = np.ravel([] if mean is None else mean).tolist()
+    names = [MEAN] if len(set(means)) == 1 else _names_of_means(len(means))
+    settings += [f"{key}={value:.12g}".replace("e+", "e") for key, value in zip(names, means, strict=False)]
     return _with(" + ".join(parts), settings)
 
 

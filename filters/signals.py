@@ -297,7 +297,8 @@ def harmonics(drift: float, period: float, count: int) -> Signal:
 def seasonal(drift: float, period: float, seasons: int) -> Signal:
     """A pattern of as many values in a period, about the mean, that drifts: all of its `harmonics`.
 
-    The last one of an even number has no quadrature, as all its samples would be zero.
+    The last one of an even number has no quadrature, as all its samples would be zero, and twice the density, as
+    half of its noise turns into the quadrature within a sample: Q of each cosine is drift dt.
 
     Args:
         drift: density of the noise on each cosine and sine [U^2/s].
@@ -309,6 +310,7 @@ def seasonal(drift: float, period: float, seasons: int) -> Signal:
     signal = harmonics(drift, period, seasons // 2)
     if seasons % 2 == 0:
         signal.densities[-1, -1] = signal.first[-1, -1] = 0.0
+        signal.densities[-2, -2] *= 2.0
     return signal
 
 
@@ -324,10 +326,16 @@ def autoregression(std: float, **partials: float) -> Signal:
         std: stationary standard deviation [U].
         **partials: r_1 ... r_p.
 
+    Raises:
+        ValueError: for a partial autocorrelation that is not between -1 and 1.
+
     Source: Durbin (1960), "The fitting of time-series models", Review of the International Statistical Institute
     28(3); Monahan (1984), "A note on enforcing stationarity in autoregressive-moving average models", Biometrika
     71(2).
     """
+    wrong = next((name for name, partial in partials.items() if not abs(partial) < 1.0), None)
+    if wrong is not None:
+        raise ValueError(f"{wrong} must be between -1 and 1, but got {partials[wrong]:g}")
     p, phi, innovation, correlations = len(partials), np.empty(0), 1.0, [1.0]
     for partial in partials.values():
         correlations.append(float(phi @ correlations[:0:-1]) + partial * innovation)

@@ -32,7 +32,7 @@ SUMS = "constant + harmonic", "constant + harmonic:period=86400,harmonics=2", "h
 SUMS += "constant-velocity + oscillator", "ornstein-uhlenbeck + oscillator", "oscillator + seasonal:period=12"
 
 
-@pytest.mark.parametrize("name", [*NAMED, *SUMS, "ar:3", "harmonic", "seasonal:period=8.64e+04,seasons=24"])
+@pytest.mark.parametrize("name", [*NAMED, *SUMS, "ar:3", "harmonic", "seasonal:period=1.2e+01,seasons=12"])
 def test_a_text_of_numbers_gives_the_model_of_these_numbers(name):
     model = named_model(name)
     values = {number.name: 1.234567e5 / 7.0**i for i, number in enumerate(model.free)}
@@ -67,11 +67,40 @@ def test_a_named_model_is_that_of_the_kalman_filter_of_its_numbers():
         ("pendulum:long=1", "a setting of pendulum must be one of length"),
         ("pendulum:length=", "length of pendulum must be a finite number"),
         ("pendulum:length=1,length=2", "KEY=VALUE, each once"),
+        ("constant:drift=1,drift=2", "settings of constant must be KEY=VALUE, each once"),
+        ("constant:R=1 + oscillator:R=2", "each once, but got 'R=2' again"),
+        ("harmonic:period=24,period=12", "may have period=SECONDS"),
+        ("oscillator:axes=2,mean_1=3", "one for each axis, mean_1, mean_2, or one for all"),
     ],
 )
 def test_a_wrong_setting_is_named_with_those_that_are_right(text, message):
     with pytest.raises(ValueError, match=message):
         model_named(text)
+
+
+@pytest.mark.parametrize("text", ["oscillator:frequency=1,damping=0.1", "ornstein-uhlenbeck:time_constant=3"])
+def test_a_signal_about_a_mean_begins_there_with_its_stationary_covariance(text):
+    model = model_named(f"{text},std=2,R=1,axes=2,mean_1=100,mean_2=-300")(dt=0.1)
+    np.testing.assert_array_equal(model.prior_mean, np.zeros(model.n))
+    np.testing.assert_array_equal(model.matrices()[4], [100.0, -300.0])
+    for order in ("ornstein-uhlenbeck + constant", "constant + ornstein-uhlenbeck"):
+        values = {"drift": 0.1, "time_constant": 3.0, "std": 2.0}
+        model = named_model(order).model(values, 1.0, 0.1, first=1000.0, spread=5.0)
+        of = {state.symbol: i for i, state in enumerate(model.states)}
+        assert model.prior_mean[of["level"]] == 1000.0 and model.prior_mean[of["deviation"]] == 0.0
+        assert model.prior_cov[of["deviation"], of["deviation"]] == pytest.approx(4.0)
+    with pytest.raises(ValueError, match="partial_1 must be between -1 and 1, but got 1.5"):
+        kalman_filter("ar:1", dt=1.0, noise=1.0, partial_1=1.5, std=1.0)
+
+
+def test_every_cosine_of_a_season_has_the_same_noise_and_its_rows_are_a_season_apart():
+    signal = named_model("seasonal:period=12,seasons=4").signal({"drift": 0.3})
+    noise = np.diag(signal.noise(3.0))
+    assert noise[[0, 1, 2]] == pytest.approx(0.9)
+    with pytest.raises(ValueError, match="must be 3 s apart, or multiples, .* but got 1 s: harmonic:per"):
+        named_model("seasonal:period=12,seasons=4").model({"drift": 0.3}, 1.0, 1.0)
+    days = np.array([31.0, 28.0, 31.0, 30.0, 59.0])
+    named_model(f"seasonal:period={365.25 * 86400},seasons=12").check_steps(86400.0 * days)
 
 
 def test_texts_that_are_no_names_are_left_to_others():

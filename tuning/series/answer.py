@@ -92,7 +92,15 @@ class SeriesFit(Result):
         a, _, _, c, _ = self.model.matrices()
         axes = self.model.m
         n = self.model.n // axes  # states of an axis, which are independent of the others
-        gain = steady_state(a[:n, :n], c[:1, :n], self.q[:n, :n], self.model.measurement_noise_cov[:1, :1])[1]
+        a, c, q, r = a[:n, :n], c[:1, :n], self.q[:n, :n], self.model.measurement_noise_cov[:1, :1]
+        rows = [c]
+        for _ in range(n - 1):
+            rows.append(rows[-1] @ a)
+        orders = named_model(self.name).signal(self._values).orders
+        effects = np.abs(np.concatenate(rows)).max(axis=0) / self.column.dt ** np.array(orders)
+        measured = np.flatnonzero(effects > HIDDEN * effects.max())  # no gain of the others settles, nor matters
+        of, gain = np.ix_(measured, measured), np.zeros((n, 1))
+        gain[measured] = steady_state(a[of], c[:, measured], q[of], r)[1]
         return np.kron(np.eye(axes), gain)
 
     @property
@@ -104,6 +112,7 @@ class SeriesFit(Result):
         a, _, _, c, _ = self.model.matrices()
         rates, modes = np.linalg.eig(a - self._gains() @ c @ a)
         after, units = a @ modes, np.sqrt(np.diag(self.model.prior_cov))[:, None]
+        units = np.where(units > 0.0, units, units.max())  # of states that begin at zero
         hidden = np.abs(c @ after / (np.abs(c) @ units)).max(axis=0) < HIDDEN * np.abs(after / units).max(axis=0)
         slowest = np.abs(rates[~hidden]).max(initial=0.0)
         return math.inf if slowest >= 1.0 else -self.column.dt / math.log(max(slowest, 1e-300))
@@ -111,8 +120,12 @@ class SeriesFit(Result):
     @cached_property
     def estimates(self) -> Estimates:
         """The filter on the data."""
-        values = {name: value for name, value in self.chosen.values.items() if name != R}
-        return filtered(named_model(self.name).signal(values), self.model, self.column)
+        return filtered(named_model(self.name).signal(self._values), self.model, self.column)
+
+    @property
+    def _values(self) -> dict[str, float]:
+        """Values of the free numbers, without R."""
+        return {name: value for name, value in self.chosen.values.items() if name != R}
 
     @cached_property
     def whiteness(self) -> Whiteness:
@@ -256,8 +269,7 @@ class SeriesFit(Result):
     def text(self) -> str:
         """The model with its numbers as other commands and `EstimateState` take it (`filters.named`)."""
         numbers = {number.name: number.value for number in self.numbers}
-        is_one = self.level is not None and np.ptp(self.level) == 0.0
-        return text_of(self.name, numbers, self.model.m, float(self.level[0]) if is_one else None)
+        return text_of(self.name, numbers, self.model.m, None if self.level is None else self.level.tolist())
 
     def _standings(self) -> list[tuple[str, float, float]]:
         """Of each candidate, best first: by how much it is behind the best, and the standard error of that."""

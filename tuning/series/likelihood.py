@@ -106,6 +106,7 @@ class ColumnLikelihood:
         self.amplitude = np.array([*(_power(number.unit) for number in candidate.free), 1.0])
         first = self._signal([parameter.start for parameter in free])
         candidate.check_harmonics(first, column.dt)
+        candidate.check_steps(np.unique(np.diff(column.times)))
         self._n, self.states = len(first.output), len(first.output) - candidate.about_mean
         self._anywhere = np.flatnonzero(np.isinf(np.diag(first.first)))
         self._wide = first.start(scales.spread, column.dt)
