@@ -75,6 +75,19 @@ def test_a_tuned_file_of_a_named_model_needs_no_model_again(log, tmp_path):
     assert not any("maximum-likelihood" in sentence for sentence in tuning.estimate(log, file).sentences())
 
 
+def test_a_clock_offset_of_all_columns_moves_no_number():
+    options = {"model": f"{NAME}:acceleration=1", "columns": ["x,y"]}
+    log, maker = tuning.read_logs(TRACK, **options).read()
+    moved, of_moved = tuning.read_logs(TRACK, **options, clock_offset={"x": 0.05, "y": 0.05}).read()
+    np.testing.assert_array_equal(moved.measurements, log.measurements)
+    assert of_moved.values == maker.values and moved.start == pytest.approx(log.start - 0.05)
+    reading = tuning.read_logs(TRACK, **options, clock_offset={"x": 0.05})
+    with pytest.raises(ValueError, match="must come with all its numbers where columns have own clock"):
+        tuning.estimate(reading, filter="kf")
+    with pytest.raises(ValueError, match="clock offsets must be of channels x, y, but got 'z'"):
+        tuning.read_logs(TRACK, **options, clock_offset={"z": 0.05}).read()
+
+
 def test_columns_of_axes_are_those_that_are_named_or_as_many():
     runs = [
         tuning.read_logs(TRACK, model=f"{NAME}:axes=2,acceleration=1,R=1"),

@@ -75,7 +75,13 @@ def read_columns(
     axes, log = len(maker.quantities), source
     if not isinstance(source, Log):
         options["dt"] = options.get("dt") if maker.dt is None else maker.dt
+        offsets = options.pop("clock_offset", None) or {}
         log = log_of_columns(source, list(columns.values()) or None, axes, **options)
+        common = {offsets.get(quantity.symbol, 0.0) for quantity in log.measured}
+        if len(common) == 1 and set(offsets) <= {quantity.symbol for quantity in log.measured}:
+            log = replace(log, start=log.start - common.pop())  # of one clock: no sample is interpolated
+        else:
+            log = log_of_columns(source, list(columns.values()) or None, axes, clock_offset=offsets, **options)
     if axes not in (1, len(log.measured)):
         symbols = listed(quantity.symbol for quantity in log.measured)
         raise ValueError(f"{maker.name} of {axes} axes must have as many columns, but got {symbols}")
@@ -112,6 +118,12 @@ def with_numbers(maker: NamedMaker, log: Log, rows: np.ndarray | None = None) ->
     column = Column(values[:, 0] if values.shape[1] == 1 else values, log.dt, maker.quantities, stamps=log.stamps)
     known, axes = dict(maker.values), len(maker.quantities)
     if maker.name == AUTO or not maker.is_complete:
+        if any(log.offsets.values()):
+            rule = f"{maker.name} must come with all its numbers where columns have own clock offsets"
+            raise ValueError(
+                f"{rule}, since noise of interpolated samples is correlated, but log {log.name} has some: leave "
+                "them out, or give the numbers"
+            )
         chosen = choose(column, CANDIDATES if maker.name == AUTO else (maker.name,)).chosen
         maker, known = replace(maker, name=chosen.name), {**chosen.values, **known}
         numbers = {name: known[name] for name in maker.names}
