@@ -14,6 +14,7 @@ import pytest
 import filters
 import tuning
 from filters.models import NAMED, Scales, named_model
+from filters.named import model_named
 from thruster_env.graphs.loops import machine_code_of
 from tuning.series.answer import _digits
 from tuning.series.column import column_of, seconds_text
@@ -236,7 +237,7 @@ def test_the_likelihood_is_that_of_an_exact_diffuse_filter_on_unequal_steps(name
     statespace = pytest.importorskip("statsmodels.tsa.statespace.api")
     kalman_filter = pytest.importorskip("statsmodels.tsa.statespace.kalman_filter")
     rng = np.random.default_rng(8)
-    steps = np.ones(59) if "ar" in name else rng.uniform(0.1, 2.0, 59)
+    steps = np.ones(59) if "ar:" in name or "seasonal" in name else rng.uniform(0.1, 2.0, 59)
     z, times = 3.0 * rng.normal(size=60), np.cumsum(np.append(0.0, steps))
     times[30:] += 9.0
     z[[4, 40]] = np.nan
@@ -400,6 +401,47 @@ def test_numbers_keep_the_unit_of_their_column(position, tmp_path, unit):
     assert column.quantities[0].unit == unit
 
 
+def test_times_of_an_array_are_seconds_whatever_their_size():
+    z = np.random.default_rng(1).normal(size=60)
+    for times in (2.6e6 * np.arange(60.0), 1e12 + np.arange(60.0), 1e9 * np.arange(60.0)):
+        column = column_of(z, times=times)
+        np.testing.assert_array_equal(column.times, times - times[0])
+        assert not column.remarks
+
+
+@pytest.mark.parametrize("name", ["harmonic:period=12,harmonics=2", "ar:2", "constant + seasonal:period=4"])
+def test_the_text_of_an_answer_makes_its_model_elsewhere(name):
+    rng = np.random.default_rng(6)
+    z = 300.0 + np.cumsum(rng.normal(size=(60, 2)), axis=0) + np.cos(2.0 * np.pi * np.arange(60) / 12)[:, None]
+    for numbers in (z, z[:, 0]):
+        fit = tuning.fit(numbers, model=name)
+        model = model_named(fit.text)(dt=1.0)
+        np.testing.assert_allclose(model.process_noise_cov, fit.q, rtol=5e-3, atol=1e-9)
+        np.testing.assert_allclose(model.matrices()[4], fit.model.matrices()[4], rtol=1e-9)
+
+
+def test_a_record_begins_at_the_mean_of_its_stationary_signal():
+    z = simulated("ornstein-uhlenbeck", 60, noise=4.0) + 50.0
+    fit = tuning.fit(z, 0.1, model="ornstein-uhlenbeck")
+    variance, noise = fit.model.prior_cov[0, 0], fit.r
+    expected = (z[0] - fit.level[0]) * variance / (variance + noise)  # the first number counts once
+    assert fit.estimates.means[0, 0, 0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_memory_of_a_season_is_that_of_its_harmonics():
+    rng = np.random.default_rng(3)
+    z = np.cumsum(rng.normal(size=(15, 4)), axis=0).ravel() + 0.1 * rng.normal(size=60)
+    fit = tuning.fit(z, model="seasonal:period=4")
+    assert 0.5 < fit.memory < 100.0
+    a, _, _, c, _ = fit.model.matrices()
+    p = fit.model.prior_cov
+    for _ in range(400):  # the filter itself; the last quadrature is in no measurement, and its variance grows
+        p = a @ p @ a.T + fit.q
+        gain = p @ c[0] / (c[0] @ p @ c[0] + fit.r)
+        p = p - np.outer(gain, c[0] @ p)
+    np.testing.assert_allclose(fit.gain[:3], gain[:3], rtol=1e-6)
+
+
 def test_tune_names_fit_for_a_log_that_is_a_column_of_numbers(tmp_path):
     file = tmp_path / "level.csv"
     file.write_text("t,level [m]\n" + "".join(f"{k},{z!r}\n" for k, z in enumerate(map(float, NILE.split()))))
@@ -536,6 +578,7 @@ def test_a_season_an_autoregression_and_a_period_are_found():
         (1e-160 * np.arange(30.0), {}, "must vary by 1e-60 to 1e.60.* use another unit"),
         (np.arange(30.0), {"model": "constant-speed"}, "a model must be one of"),
         (np.arange(30.0), {"dt": -1.0}, "dt must be positive"),
+        (np.arange(30.0), {"model": ["constant"]}, "model .* must be auto, or a model's name, but got"),
         ({"t": np.arange(30.0), "a": np.arange(30.0), "b": np.arange(30.0)}, {}, "one column of numbers beside"),
     ],
 )

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from filters.named import AUTO
+from thruster_env.core.checks import short_repr
 from thruster_env.core.files import check_target, save_figure, write_whole
 from thruster_env.logs.write import check_picture
 from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, Argument, Option, Progress, PythonOnly
@@ -70,8 +71,10 @@ def fit(
         if Path(code).suffix != ".md":
             raise ValueError(f"code (--code) must be a file that ends in .md, but got {str(code)!r}")
         check_target(code)
+    if not isinstance(model, str):
+        raise ValueError(f"model (--model) must be {AUTO}, or a model's name, but got {short_repr(model)}")
     data = column_of(z, dt, times=times, column=column)
-    names = CANDIDATES if model == AUTO else (model,)
+    names = CANDIDATES if model.strip().lower() == AUTO else (model,)
     with console_for(progress).status("fitting ...") as status:
         fitted = SeriesFit(data, *choose(data, names, lambda name: status.update(f"fitting {name} ...")))
     if plot is not None:

@@ -23,7 +23,7 @@ from thruster_env.logs.findings import CLOCK, GAP, MISSING, Remark, sentences
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 from thruster_env.logs.recorders.registry import format_of
-from thruster_env.logs.table import Table, read_table, table_of
+from thruster_env.logs.table import TIME_HEADER, Table, read_table, table_of
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -217,7 +217,7 @@ def log_of_columns(
         if named is not None and ",".join(named) in table.names:
             named = [",".join(named)]
         if named is None and source is not z and isinstance(source, Mapping):
-            named = [name for name in source if name != TIME]
+            named = [name for name in source if name not in (TIME, TIME_HEADER)]
         headers, time = _headers(table, named, axes)
         for header in headers:
             _check_numbers(header, table.numbers(header))
@@ -309,7 +309,10 @@ def as_columns(z: Any, times: Any = None) -> Mapping[str, Any]:
         rule = "there must be a time for each number, so one step (dt=) fewer"
         raise ValueError(f"{rule}, but got {len(values)} numbers and {np.size(times)} times")
     columns = {"z": values} if values.ndim == 1 else {f"z_{i + 1}": axis for i, axis in enumerate(values.T)}
-    return columns if times is None else {TIME: np.asarray(times), **columns}
+    if times is None:
+        return columns
+    stamps = np.asarray(times)
+    return {TIME_HEADER if stamps.dtype.kind in "iuf" else TIME: stamps, **columns}
 
 
 def _headers(table: Table, named: Sequence[str] | None, axes: int = 1) -> tuple[list[str], str | None]:
