@@ -317,7 +317,7 @@ def _of_floats(function: Callable, arguments: str, shape: tuple[int, ...]) -> Ca
     result = (
         tuple_of(map(entry, range(*shape)))
         if len(shape) == 1
-        else matrix_of(*shape, lambda i, j: entry(f"{i}][{j}"))
+        else matrix_of(shape[0], shape[1], lambda i, j: entry(f"{i}][{j}"))
     )
     return written_out("of_floats", arguments, f"y = function({arguments})", result, function=function)
 
@@ -380,10 +380,10 @@ def _by_numba(function: Callable, sizes: Sequence[int], form: type | int, shape:
         lines.append(f"{argument} = numbers[{at}:{at + size}]" if as_array else f"{argument} = {text}")
         at += size
     lines += "try:", f"    y = function({', '.join(arguments)})"
-    stores = (f"    out[{k}] = y[{']['.join(map(str, i))}]" for k, i in enumerate(np.ndindex(*shape)))
-    stores = *stores, "except Exception:", "    pass"
+    lines += (f"    out[{k}] = y[{']['.join(map(str, i))}]" for k, i in enumerate(np.ndindex(*shape)))
+    lines += "except Exception:", "    pass"
     names = {"carray": numba.carray, "nan": math.nan, "function": plain, "Constants": form}
-    native = written_out("native", "given, results", *lines, *stores, "None", **names)
+    native = written_out("native", "given, results", *lines, "None", **names)
     pointer = numba.types.CPointer(numba.float64)
     options: Any = {"fastmath": set(FASTMATH), "error_model": "numpy", "boundscheck": True}
     code = numba.cfunc(numba.void(pointer, pointer), **options)(native)
