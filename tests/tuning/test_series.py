@@ -20,7 +20,7 @@ from tuning.series.answer import _digits
 from tuning.series.column import column_of, seconds_text
 from tuning.series.fit import Number
 from tuning.series.likelihood import ColumnLikelihood
-from tuning.series.paste import LANGUAGES
+from tuning.series.paste import LANGUAGES, lines_of
 from tuning.series.periods import outstanding_period
 from tuning.series.recursion import _recursion
 
@@ -323,6 +323,11 @@ def test_a_controller_gets_no_constant_gain_that_needs_longer_than_the_record(ni
     with pytest.raises(ValueError, match="forget its start within the record, 99 s, but .* forgets in .*python"):
         slow.code("arduino")
     assert "# a step is 1 s" in slow.code("python") and "% a step is 1 s" in slow.code("matlab")
+
+
+def test_a_controller_begins_at_the_level_of_a_sum():
+    model = model_named("oscillator + constant:frequency=0.1,damping=0.2,std=0.5,drift=1,R=1")(dt=1.0)
+    assert "    x1 = 0.0;\n    x2 = 0.0;\n    x3 = z;\n" in lines_of("arduino", model, np.full((3, 1), 0.1), 1.0)
 
 
 def test_an_index_of_dates_and_a_file_are_the_same_numbers(position, tmp_path):

@@ -115,10 +115,11 @@ def _arduino(model: AffineModel, gain: np.ndarray) -> str:
     p, v = [f"p{i + 1}" for i in range(model.n)], [f"v{j + 1}" for j in range(model.m)]
     arguments, offsets = ", ".join(f"double {z}" for z in inputs), [float(offset) for offset in d]
     first = dict.fromkeys(names, "0.0")
+    widths = np.diag(model.prior_cov)
     for z, row, offset in zip(inputs, c, offsets, strict=True):
-        first[names[int(np.argmax(row))]] = z + (f" - {_c(offset)}" if offset > 0.0 else "")
-        if offset < 0.0:
-            first[names[int(np.argmax(row))]] = f"{z} + {_c(-offset)}"
+        level = names[int(np.argmax((row != 0.0) * widths))]  # of a sum the part that may begin anywhere
+        sign = "-" if offset > 0.0 else "+"
+        first[level] = f"{z} {sign} {_c(abs(offset))}" if offset else z
     lines = [
         f"// steady-state Kalman filter: call filter({', '.join(inputs)}) once each step; the first one begins",
         "// it needs double of 64 bits: on boards with an AVR (Uno, Mega) double is float, of seven digits",
