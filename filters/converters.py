@@ -7,11 +7,13 @@ FilterPy predicts before it, so its prior is moved by one prediction.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from filters.filter import Filter
 from filters.gaussian.kalman import KalmanFilter
 from thruster_env.core.checks import as_floats, covariance, positive, short_repr, vector
 from thruster_env.core.modules import to_install
@@ -23,17 +25,46 @@ if TYPE_CHECKING:
     import filterpy.kalman
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PredictedKalmanFilter(KalmanFilter):
+    """A Kalman filter of FilterPy, whose prior is that after the first prediction; a first input can be added."""
+
+    has_first_input: ClassVar[bool] = False
+
+    def from_first_input(self, inputs: Any, rows: int, update_first: bool) -> tuple[Filter, Any]:
+        """Of as many inputs as rows the first one belongs to the first prediction: mean += B u_0."""
+        if not update_first:
+            way = "from_filterpy(kf, update_first=True) for run(..., update_first=False)"
+            raise ValueError(f"a filter must predict once before the first measurement, but has done so: {way}")
+        if inputs is None or len(inputs) != rows:
+            return self, inputs
+        if self.has_first_input:
+            rule = "inputs must be one fewer than measurements where the first is first_input="
+            raise ValueError(f"{rule}, but got {rows} of each: leave first_input out, or inputs[0]")
+        mean = self.model.prior_mean + self.kernel_model.matrices()[1] @ inputs[0]
+        return KalmanFilter(model=self.model.replace(prior_mean=mean), form=self.form), inputs[1:]
+
+
+class StartedKalmanFilter(PredictedKalmanFilter):
+    """One whose first prediction has its input."""
+
+    has_first_input: ClassVar[bool] = True
+
+
 def from_filterpy(kf: Any, *, update_first: bool = False, first_input: ArrayLike | None = None) -> KalmanFilter:
     """The Kalman filter of a `filterpy.kalman.KalmanFilter`, from where its state is now.
 
         x' = F x + B u,  P' = F P F' + Q,  unless update_first
 
-    `filters.run(filter_, z)` gives what `kf.batch_filter(z)` does.
+    `filters.run(filter_, z)` gives what `kf.batch_filter(z)` does, and `filters.run(filter_, measurements=z,
+    inputs=u)` what `kf.batch_filter(z, us=u)` does: of as many inputs as measurements the first belongs to the
+    prediction before the first measurement.
 
     Args:
         kf: with F, H, Q, R, B, x and P.
         update_first: whether the next call is `kf.update`, not `kf.predict`; as in `batch_filter`.
-        first_input: u of the prediction before the first measurement, (p,); none if None.
+        first_input: u of the prediction before the first measurement, (p,), where `run` gets the later ones alone;
+            none if None.
 
     Raises:
         ValueError: for another class, a fading memory, or correlated noise.
@@ -46,11 +77,12 @@ def from_filterpy(kf: Any, *, update_first: bool = False, first_input: ArrayLike
     b = getattr(kf, "B", None)
     b = np.zeros((len(f), 0)) if b is None or not np.ndim(b) and not b else as_floats(b)
     b = b[:, None] if b.ndim == 1 else np.atleast_2d(b)  # FilterPy takes one column as it is
-    mean, cov = np.ravel(x), p
+    mean, cov, kind = np.ravel(x), p, KalmanFilter
     if not update_first:
+        kind = PredictedKalmanFilter if first_input is None else StartedKalmanFilter
         u = np.zeros(b.shape[1]) if first_input is None else vector("first_input", first_input, b.shape[1])
         mean, cov = f @ mean + b @ u, f @ cov @ f.T + q
-    return _filter(f, b, h, q, r, mean, cov)
+    return kind(model=_filter(f, b, h, q, r, mean, cov).model)
 
 
 def to_filterpy(filter_: KalmanFilter) -> filterpy.kalman.KalmanFilter:
@@ -187,6 +219,7 @@ def from_control(
     if g.ndim != 2 or len(g) != n:
         raise ValueError(f"noise_input must have shape (n, w) with n = {n}, but got {g.shape}")
     q = g @ covariance("process_noise_cov", process_noise_cov, g.shape[1]) @ g.T
+    is_number = own_dt is not None and own_dt is not True
     if own_dt is None or own_dt is False or own_dt == 0:
         if dt is None:
             raise ValueError("a continuous system must have a sample time (dt=), but got none")
@@ -205,7 +238,8 @@ def from_control(
         except np.linalg.LinAlgError:
             rule = "a system without a steady state must have a first covariance (prior_cov=)"
             raise ValueError(f"{rule}, but got none") from None
-    return _filter(a, b, c, q, r, np.zeros(n) if prior_mean is None else prior_mean, prior_cov)
+    dt = own_dt if dt is None and is_number else dt
+    return _filter(a, b, c, q, r, np.zeros(n) if prior_mean is None else prior_mean, prior_cov, dt=dt)
 
 
 def _attributes(value: Any, kind: str, *names: str) -> list[np.ndarray]:
@@ -216,7 +250,7 @@ def _attributes(value: Any, kind: str, *names: str) -> list[np.ndarray]:
     return [np.atleast_2d(as_floats(getattr(value, name))) for name in names]
 
 
-def _filter(f, b, h, q, r, mean, cov, **offsets: np.ndarray) -> KalmanFilter:
+def _filter(f, b, h, q, r, mean, cov, **options: Any) -> KalmanFilter:
     model: StateSpaceModel = affine_model(
         a=f,
         b=b,
@@ -225,6 +259,6 @@ def _filter(f, b, h, q, r, mean, cov, **offsets: np.ndarray) -> KalmanFilter:
         measurement_noise_cov=r,
         prior_mean=mean,
         prior_cov=cov,
-        **offsets,
+        **options,
     )
     return KalmanFilter(model=model)

@@ -179,6 +179,10 @@ class Filter:
         """The fields, without memory that is kept for the next call."""
         return {name: value for name, value in vars(self).items() if name not in (SPARE, SPARE_IN_PYTHON)}
 
+    def from_first_input(self, inputs: Any, rows: int, update_first: bool) -> tuple[Filter, Any]:
+        """The filter and the inputs of a run of so many rows, of those that the user gave."""
+        return self, inputs
+
     @property
     def fixed_noise(self) -> tuple[str, ...]:
         """Which of Q and R this filter reads when it is made or started only: these must not vary."""

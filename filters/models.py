@@ -383,6 +383,7 @@ class Sum(NamedTuple):
             prior_mean=np.kron(np.broadcast_to(first, axes) - offset, level) + 0.0,  # no negative zeros
             prior_cov=np.kron(each, signal.start(spread, dt)),
             measurement_offset=offset,
+            dt=dt,
             states=states,
             input_quantities=[],
             measurements=list(quantities),

@@ -38,7 +38,7 @@ from filters.gaussian.multiple_models import InteractingMultipleModelFilter, Mul
 from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanFilter
 from filters.horizon.moving_horizon import MovingHorizonFilter
 from filters.particles.particle import AuxiliaryParticleFilter, ParticleFilter, RaoBlackwellisedParticleFilter
-from thruster_env.core.checks import one_of
+from thruster_env.core.checks import one_of, short_repr
 from thruster_env.logs.log import AnyStepModel
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -170,4 +170,7 @@ def make_filter(name, model: StateSpaceModel, **numbers) -> Filter:
         ValueError: for an unknown name or parameter, a value that the filter does not accept, or an object that is
             no estimator.
     """
+    if isinstance(model, str):
+        way = "filters.named.model_named(text)(dt=...) makes one of a text, and a fit of tuning.fit has .filter"
+        raise ValueError(f"model must be a model, but got {short_repr(model)}: {way}")
     return filter_type(name).make(model, **numbers)

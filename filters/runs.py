@@ -12,7 +12,7 @@ from filters.engine import batch
 from filters.engine.batch import Estimates, Prepared, prepared
 from filters.filter import Filter
 from filters.starts import warn_of_restarts
-from thruster_env.core.checks import at_least
+from thruster_env.core.checks import FEW, at_least
 from thruster_env.core.modules import to_install
 from thruster_env.logs.log import Log
 from thruster_env.model.continuous import same_dt
@@ -30,11 +30,28 @@ class FilteredRuns(Estimates):
 
     data: Prepared
 
-    def to_frame(self, run: int = 0) -> pandas.DataFrame:
+    def __repr__(self) -> str:
+        if not hasattr(self, "data"):  # as after `_replace`
+            return super().__repr__()
+        data, (n, t) = self.data, (self.means.shape[-1], self.covs.shape[-1])
+        count, rows = len(data.keys), len(data.rows)
+        names = [quantity.label for quantity in data.filter.model.states] if count == 1 and n == t else []
+        last = self.means.reshape(count, rows, n)[0, -1], self.stds.reshape(count, rows, t)[0, -1]
+        of = f"{count} trajectories of {rows} rows each" if count > 1 else f"{rows} rows"
+        lines = [f"Estimates of {data.filter.name}: {of}, {data.times[0]:g} to {data.times[-1]:g} s"]
+        lines += [f"  last {name} {m:.6g} +- {s:.3g}" for name, m, s in [*zip(names, *last, strict=False)][:FEW]]
+        lines[1:] += ["  ..."] * (len(names) > FEW)
+        total, restarts = float(np.sum(self.log_likelihoods)), int(np.sum(self.divergences))
+        lines.append(f"log-likelihood {total:.6g}" + f", {restarts} restarts" * (restarts > 0))
+        each = "to_frame() has all, plot(run=0) one" if count > 1 else "to_frame(), plot()"
+        lines.append(f".means {self.means.shape}, .stds, .covs, .innovations, .log_likelihoods; {each}")
+        return "\n".join(lines)
+
+    def to_frame(self, run: int | None = None) -> pandas.DataFrame:
         """A table by time: inputs, measurements, estimates with standard deviations, and innovations, with units.
 
         Args:
-            run: number of the trajectory in a batch.
+            run: number of the trajectory in a batch; all, by run and time, if None.
 
         Raises:
             ValueError: if pandas is not installed, or for an unknown number.
@@ -47,13 +64,17 @@ class FilteredRuns(Estimates):
             raise ValueError(
                 f"to_frame must have pandas, which is not installed: {to_install('frames')}"
             ) from None
-        return pandas.DataFrame(columns_of(self._of_log(run))).set_index("time_s")
+        count = len(self.data.keys)
+        if run is None and count > 1:
+            return pandas.concat({number: self.to_frame(number) for number in range(count)}, names=["run"])
+        return pandas.DataFrame(columns_of(self._of_log(run or 0))).set_index("time_s")
 
     def plot(self, run: int = 0) -> Figure:
-        """States and innovations of a trajectory over time, each in its 95 % band."""
+        """States and innovations of one trajectory over time, each in its 95 % band; of a batch the first one."""
         from filters.logs.findings import draw_log
 
-        return draw_log(self._of_log(run), self.data.filter.name)
+        count, title = len(self.data.keys), self.data.filter.name
+        return draw_log(self._of_log(run), f"{title}, run {run} of 0 to {count - 1}" if count > 1 else title)
 
     def _of_log(self, run: int) -> LogEstimate:
         """A trajectory as the estimate of a log."""
@@ -106,7 +127,10 @@ def run(
         estimates.means, estimates.stds, estimates.to_frame(), estimates.plot()
 
     A single trajectory may have the shapes (K + 1,) or (K + 1, m), and (K,) or (K, p), as an array, a list or
-    from pandas; its results then have no axis B. An input of the last row moves nothing and is left out.
+    from pandas; its results then have no axis B. An input of the last row moves nothing and is left out, except
+    that of `from_filterpy` the first one belongs to the prediction before the first measurement.
+
+    An index of pandas with dates, periods, time differences or increasing floats gives the steps if dt is None.
 
     The first measurement updates the prior, as in pykalman, statsmodels and MATLAB. With `update_first=False` the
     filter predicts before it, as FilterPy does: then there are as many inputs as measurements, and `dt` begins
@@ -120,14 +144,16 @@ def run(
             predicts step k + 1 with u[:, k], which a measurement h(x, u, c) at its end depends on.
         measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing.
         dt: lengths of the steps [s], one or (K,), the same for all trajectories. Of a model in continuous time
-            they may differ; a longer step than the model's is divided. For others it is the time axis.
+            they may differ; a longer step than the model's is divided. Others must be of equal steps, those of the
+            model if it has a `dt`.
         noise: Q (n, n) of a step by its length [s], as `ContinuousModel.noise`; in proportion to it if None.
         update_first: whether the first measurement updates the prior itself.
         process_noise_covs: Q of every step, (K, n, n), in place of the model's.
         measurement_noise_covs: R of every measurement, (K + 1, m, m), in place of the model's.
 
     Returns:
-        `Estimates`, which do not depend on the number of cores; a `RestartWarning` if the filter restarted.
+        `FilteredRuns`: `Estimates` with `to_frame()` and `plot()`, which do not depend on the number of cores; a
+        `RestartWarning` if the filter restarted.
 
     Raises:
         ValueError: if shapes do not fit, an input is not finite, or steps differ for a model or filter of one

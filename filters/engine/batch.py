@@ -27,14 +27,18 @@ from thruster_env.core.checks import as_floats, covariance, short_repr
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.streams import filter_keys
 from thruster_env.core.threads import spread
-from thruster_env.logs.grid import count_steps, resolution_of
+from thruster_env.logs.grid import count_steps, resolution_of, resolution_of_digits
 from thruster_env.logs.log import in_any_steps, sample_time_place
-from thruster_env.model.continuous import same_dt
+from thruster_env.logs.table import times_of_index
+from thruster_env.model.continuous import SAME_DT, same_dt
 from thruster_env.model.shape import LANES, with_root
 from thruster_env.model.state_space import StateSpaceModel
 
 if TYPE_CHECKING:
     from thruster_env.graphs.workers import InParts
+
+
+BY_NAME = "run(filter_, z) alone, run(filter_, inputs=u, measurements=z) with inputs"
 
 
 class Estimates(NamedTuple):
@@ -226,6 +230,8 @@ def _noise_rows(name: str, covs, count: int, size: int) -> np.ndarray:
 
 # Steps of any length, as the arguments of a batch.
 
+COARSE = 0.4  # of a sample time: less than half of it, by which a missing row moves stamps
+
 
 class Prepared(NamedTuple):
     """The arguments of a batch: long steps are divided into rows without a measurement."""
@@ -260,18 +266,30 @@ def prepared(
     update_first: bool = True,
 ) -> Prepared:
     """The arguments of `run` as those of a batch, whose last input is the step ratio where steps differ."""
+    _check_filter(filter_)
     if measurements is None and inputs is None:
         keys, measurements = None, keys
+    if measurements is None:
+        raise ValueError(f"measurements must be an array (B, K + 1, m), but got None: {BY_NAME}")
+    by_index = dt is None and hasattr(measurements, "iloc")
+    stamps = times_of_index(measurements.index) if by_index else None
+    measurements, inputs = _in_rows(filter_.kernel_model, keys, inputs, measurements)
+    if is_single(None, inputs, measurements):
+        filter_, inputs = filter_.from_first_input(inputs, len(measurements), update_first)
+    else:
+        filter_.from_first_input(None, 0, update_first)
+    model_dt, fixed = _sample_time(filter_.model), getattr(filter_.model, "dt", None)
+    if stamps is not None and len(stamps) > 1:
+        dt = _steps_of(stamps, fixed if model_dt is None else model_dt, update_first)
     if not update_first:  # a row without a measurement before the first one
-        z = as_floats(measurements)
-        measurements = np.insert(z, 0, np.nan, axis=1 if z.ndim == 3 else 0)
+        measurements = np.insert(measurements, 0, np.nan, axis=1 if measurements.ndim == 3 else 0)
         if measurement_noise_covs is not None:
             measurement_noise_covs = np.concatenate([measurement_noise_covs[:1], measurement_noise_covs])
     single = is_single(None, inputs, measurements)
     keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
     rows = np.arange(0 if update_first else 1, z.shape[1])
-    model_dt, steps = _sample_time(filter_.model), inputs.shape[1]
-    lengths = _lengths(dt, steps, 1.0 if model_dt is None else model_dt)
+    usual = fixed if model_dt is None else model_dt
+    lengths = _lengths(dt, inputs.shape[1], 1.0 if usual is None else usual)
     times = np.append(0.0, np.cumsum(lengths))
     plain = Prepared(
         filter_, keys, inputs, z, process_noise_covs, measurement_noise_covs, rows, times[rows], single
@@ -286,16 +304,22 @@ def prepared(
     unlike = [
         length
         for length in np.unique(lengths).tolist()
-        if not same_dt(length, lengths[0] if model_dt is None else model_dt)
+        if not same_dt(length, lengths[0] if usual is None else usual)
     ]
-    if not unlike and (model_dt is None or noise is None):
+    if not unlike and noise is None:
         return plain
     same_model = filter_.kernel_model is filter_.model and not isinstance(filter_, ForeignFilter)
     if model_dt is None or not (same_model and type(filter_).any_step):
-        raise ValueError(
-            "steps of different lengths must be for a model whose sample time is a constant, and a filter that "
-            f"evaluates f(x, u) at each step, but got {filter_.name!r}: make_filter('ekf', plant.at(dt))"
-        )
+        rule = "steps of different lengths (dt=), or noise=, must be for a model whose sample time is a constant, "
+        rule += f"and a filter that evaluates f(x, u) at each step, but got {filter_.name!r}"
+        rule += "" if fixed is None else f" for steps of {fixed:g} s"
+        rule += f" and a step of {unlike[0]:g} s" if unlike else ""
+        way = "make_filter('ekf', plant.at(dt))"
+        if fixed is not None:  # as of `tuning.fit`
+            way += " with noise=plant.noise, where plant is fit.plant of a fit of tuning.fit and dt fit.column.dt"
+        if stamps is not None:
+            way += "; z.asfreq(...) puts NaN in missing rows, z.to_numpy() leaves the index out"
+        raise ValueError(f"{rule}: {way}")
     exact = resolution_of(float(times[-1]), 0.0)
     counts = np.array([count_steps(length, model_dt, exact) for length in lengths.tolist()], dtype=int)
     parts = np.repeat(lengths / counts, counts)
@@ -316,6 +340,55 @@ def prepared(
     long_u = np.concatenate([np.repeat(inputs, counts, axis=1), ratios], axis=2)
     any_step = replace(filter_, model=in_any_steps(filter_.model))
     return Prepared(any_step, keys, long_u, long_z, q, r, user_rows[rows], times[rows], single)
+
+
+def _check_filter(filter_: Any) -> None:
+    """Raise ValueError for a model, a name or a result in the place of a filter."""
+    if isinstance(filter_, Filter):
+        return
+    way = "filters.make_filter('ekf', model) makes one"
+    if isinstance(getattr(filter_, "filter", None), Filter):
+        way = "use its .filter"
+    elif isinstance(filter_, StateSpaceModel):
+        way = "filters.make_filter('ekf', model) makes one of it"
+    raise ValueError(f"filter_ must be a filter, but got {short_repr(filter_)}: {way}")
+
+
+def _in_rows(model: StateSpaceModel, keys: Any, inputs: Any, measurements: Any) -> tuple[np.ndarray, Any]:
+    """Measurements and inputs as arrays, those of one trajectory without further axes, as FilterPy's columns."""
+    z, u = _floats("measurements", measurements), None if inputs is None else _floats("inputs", inputs)
+    if not z.size:
+        raise ValueError(f"measurements must have at least one row, but got {short_repr(measurements)}")
+    no_batch = keys is None and (u is None or u.ndim < 3 or u.shape[1:] == (model.inputs, 1))
+    if z.ndim == 3 and z.shape[1:] == (model.m, 1) and len(z) > 1 and (no_batch or model.m > 1):
+        z = z[:, :, 0]  # rows of columns (m, 1)
+    if z.ndim == 2 and z.shape[1] != model.m:
+        rule = f"measurements of one trajectory must have shape (K + 1, {model.m})"
+        way = f": z[..., None] for {len(z)} trajectories" if model.m == 1 and z.shape[0] < z.shape[1] else ""
+        way = ": z.T" if len(z) == model.m else way
+        raise ValueError(f"{rule}, but got {z.shape}{way}")
+    if z.ndim < 3 and u is not None:
+        if u.ndim == 3 and u.shape[1:] == (model.inputs, 1):
+            u = u[:, :, 0]
+        u = u[:, None] if u.ndim == 1 else u
+    return z, u
+
+
+def _steps_of(times: np.ndarray, usual: float | None, update_first: bool) -> np.ndarray:
+    """Lengths of the steps between times [s]; equal but for the rounding of times they are equal."""
+    steps = np.diff(times)
+    if not (steps > 0.0).all():
+        row = int(np.argmin(steps > 0.0)) + 1
+        raise ValueError(f"times of the index must increase, but row {row} comes {steps[row - 1]:g} s later")
+    since, count = times - times[0], len(steps)
+    mean = float(since[-1]) / count
+    rounding = 2.0 * resolution_of_digits(times, mean)  # of a stamp and of the ends
+    if rounding > COARSE * mean:  # digits that say nothing
+        rounding = 2.0 * (resolution_of(float(np.abs(times).max())) + SAME_DT * mean)
+    if (np.abs(since - mean * np.arange(count + 1)) <= rounding).all():
+        is_usual = usual is not None and abs(usual - mean) <= SAME_DT * usual + rounding / count
+        steps = np.full(count, usual if is_usual else mean)
+    return steps if update_first else np.append(float(np.median(steps)), steps)
 
 
 def _sample_time(model: StateSpaceModel) -> float | None:

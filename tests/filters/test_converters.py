@@ -49,6 +49,26 @@ def test_filterpy_with_inputs_from_its_present_state_and_back():
     close(kf.P, ours.covs[-1])
 
 
+def test_filterpy_with_an_input_for_each_measurement_predicts_before_the_first():
+    kf, u = filterpy_filter(np.array([[0.3], [0.5]])), np.sin(0.4 + np.arange(60.0))
+    filter_, after = filters.from_filterpy(kf), filters.from_filterpy(kf, update_first=True)
+    started = filters.from_filterpy(kf, first_input=u[:1])
+    means, covs, _, _ = kf.batch_filter(Z, us=u)
+    runs = (
+        filters.run(filter_, inputs=u, measurements=Z),
+        filters.run(filter_, inputs=u[:, None, None], measurements=Z[:, None, None]),
+        filters.run(after, inputs=u, measurements=Z, update_first=False),
+        filters.run(started, inputs=u[1:], measurements=Z),
+    )
+    for run in runs:
+        close(run.means, means[..., 0])
+        close(run.covs, covs)
+    with pytest.raises(ValueError, match="one fewer than measurements where the first is first_input="):
+        filters.run(started, inputs=u, measurements=Z)
+    with pytest.raises(ValueError, match="has done so: from_filterpy.kf, update_first=True"):
+        filters.run(filter_, inputs=u, measurements=Z, update_first=False)
+
+
 def test_pykalman_gives_the_same_with_offsets_and_missing_numbers():
     pykalman = pytest.importorskip("pykalman")
     kf = pykalman.KalmanFilter(

@@ -88,7 +88,7 @@ def test_an_ensemble_draws_as_the_batch_of_one_does():
         ({"inputs": np.zeros(20), "measurements": Z}, "inputs and measurements must have shapes"),
         (
             {"inputs": np.zeros(39), "measurements": np.stack([Z, Z], axis=1)},
-            "inputs and measurements must have shapes",
+            r"measurements of one trajectory must have shape \(K \+ 1, 1\), but got \(40, 2\)$",
         ),
         ({"inputs": np.zeros(39), "measurements": ["a"] * 40}, "measurements must be an array of numbers"),
         ({}, "measurements must be an array"),
@@ -106,8 +106,79 @@ def test_an_ensemble_draws_as_the_batch_of_one_does():
             },
             "in place of process_noise_covs, but got process_noise_covs, too",
         ),
+        ({"keys": Z, "inputs": np.zeros(39)}, r"got None: .*run\(filter_, inputs=u, measurements=z\)"),
+        ({"keys": []}, r"at least one row, but got \[\]"),
+        ({"keys": [[1.0, 2.0], [3.0]]}, "measurements must be an array of numbers"),
+        ({"keys": np.stack([Z, Z])}, r"got \(2, 40\): z\[..., None\] for 2 trajectories"),
+        ({"keys": Z[None]}, r"got \(1, 40\): z.T"),
     ],
 )
 def test_what_does_not_fit_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         filters.run(driven(), **arguments)
+
+
+def test_a_column_for_each_row_as_filterpy_has_it_is_one_trajectory(walk):
+    plain = filters.run(walk, Z)
+    for z in (Z[:, None, None], [np.array([[value]]) for value in Z]):
+        np.testing.assert_array_equal(filters.run(walk, z).means, plain.means)
+    u, z = np.cos(np.arange(39.0)), np.stack([Z, 0.5 * Z], axis=1)
+    of_columns = filters.run(driven(2), inputs=u[:, None, None], measurements=z[..., None])
+    np.testing.assert_array_equal(of_columns.means, filters.run(driven(2), inputs=u, measurements=z).means)
+    assert filters.run(walk, np.zeros((3, 2)), None, Z[:3, None, None]).means.shape == (3, 1, 2)  # with keys
+
+
+def test_what_is_no_filter_is_refused_with_the_way_to_one(walk):
+    for value, way in ((walk.model, "model makes one of it"), ("kf", "makes one"), (None, "makes one")):
+        with pytest.raises(ValueError, match="filter_ must be a filter, but got") as error:
+            filters.run(value, Z)
+        assert way.split(" ")[-1] in str(error.value) and "make_filter" in str(error.value)
+    with pytest.raises(ValueError, match="model must be a model, but got 'constant:drift=1,R=1'"):
+        filters.make_filter("kf", "constant:drift=1,R=1")
+    column = filters.affine_model(
+        F=np.eye(2), H=[[1.0, 0.0]], Q=[1.0, 1.0], R=[1.0], x0=[[3.0], [4.0]], P0=np.eye(2)
+    )
+    assert column.prior_mean.tolist() == [3.0, 4.0]
+
+
+def test_an_index_of_times_gives_the_steps(walk):
+    pandas = pytest.importorskip("pandas")
+    plain = filters.run(walk, Z)
+    for index in (pandas.date_range("2026-01-01", periods=40, freq="100ms"), 1.7e9 + 0.1 * np.arange(40.0), None):
+        np.testing.assert_array_equal(filters.run(walk, pandas.Series(Z, index=index)).means, plain.means)
+    stamped = np.round(np.arange(40.0) / 30.0, 3)  # to a millisecond
+    thirty = filters.make_filter("kf", walk.model.replace(dt=1.0 / 30.0))
+    assert filters.run(thirty, pandas.Series(Z, index=stamped)).data.times[-1] == pytest.approx(39.0 / 30.0)
+    series = pandas.Series(Z, index=pandas.date_range("2026-01-01", periods=40, freq="100ms"))
+    with pytest.raises(ValueError, match=r"for steps of 0.1 s and a step of 0.3 s: .*z.asfreq"):
+        filters.run(walk, series.drop(series.index[[7, 8]]))
+    with pytest.raises(ValueError, match=r"for steps of 0.1 s and a step of 5 s"):
+        filters.run(walk, Z, dt=5.0)
+    with pytest.raises(ValueError, match="times of the index must increase, but row 1 comes -0.1 s later"):
+        filters.run(walk, series[::-1])
+
+
+def test_missing_rows_of_an_index_are_long_steps_of_a_filter_that_can(as_python):
+    pandas = pytest.importorskip("pandas")
+    from filters.plants import pendulum
+
+    ekf = filters.make_filter("ekf", pendulum().at(0.05))
+    z = pandas.Series(0.1 * Z[:9], index=pandas.date_range("2026-01-01", periods=9, freq="50ms"))
+    z, u = z.drop(z.index[[4, 5]]), np.zeros(6)
+    steps = [0.05, 0.05, 0.05, 0.15, 0.05, 0.05]
+    for function in (filters.run, filters.smooth):
+        of_index = function(ekf, inputs=u, measurements=z)
+        by_hand = function(ekf, inputs=u, measurements=z.to_numpy(), dt=steps)
+        np.testing.assert_allclose(of_index.means, by_hand.means, rtol=1e-12)
+    late = filters.run(ekf, inputs=np.zeros(7), measurements=z, update_first=False)
+    assert late.data.times.tolist() == pytest.approx(np.cumsum([0.05, *steps]))
+
+
+def test_a_run_prints_few_lines_and_a_batch_is_one_table(walk):
+    text = str(filters.run(walk, Z))
+    assert text.startswith("Estimates of kf: 40 rows, 0 to 3.9 s\n  last position ") and text.count("\n") == 4
+    batch = filters.run(walk, np.stack([Z, 2.0 * Z])[..., None])
+    assert str(batch).startswith("Estimates of kf: 2 trajectories of 40 rows each")
+    table = batch.to_frame()
+    assert table.index.names == ["run", "time_s"] and table.loc[1].equals(batch.to_frame(1))
+    assert batch.plot(1).axes and "FilteredRuns(" in repr(batch._replace(divergences=0))

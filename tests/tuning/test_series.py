@@ -198,6 +198,25 @@ def test_missing_numbers_and_gaps_are_rows_without_a_number(position):
     assert f"{int(lost.sum())} missing" in str(by_nan)
 
 
+def test_a_fit_on_unequal_steps_filters_them_anew(as_python):
+    steps = np.random.default_rng(4).uniform(0.05, 0.4, 80)
+    z = simulated("ornstein-uhlenbeck", 81, steps=steps) + 5.0
+    fit = tuning.fit(z, steps, model="ornstein-uhlenbeck")
+    table = fit.estimates.to_frame()
+    np.testing.assert_allclose(table.index, np.append(0.0, np.cumsum(steps)))
+    assert len(fit.estimates.plot().axes) == 2 and str(fit.estimates).startswith("Estimates of kf: 81 rows")
+    with pytest.raises(ValueError, match=r"noise=plant.noise, where plant is fit.plant .* dt fit.column.dt"):
+        filters.run(fit.filter, z, dt=steps)
+    plant = fit.plant
+    ekf = filters.make_filter("ekf", plant.at(fit.column.dt))
+    anew = filters.run(ekf, z, dt=steps, noise=plant.noise)
+    np.testing.assert_allclose(anew.means, fit.estimates.means[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(anew.covs, fit.estimates.covs[0], rtol=1e-6)
+    assert filters.run(fit.filter, z).to_frame().index[1] == pytest.approx(fit.column.dt)
+    with pytest.raises(ValueError, match="but got SeriesFit.*: use its .filter"):
+        filters.run(fit, z)
+
+
 def test_unequal_steps_are_taken_as_they_are():
     """A position that goes far, on times with jitter: on a grid R would have jitter times velocity in it."""
     times = np.cumsum(np.random.default_rng(6).uniform(0.05, 0.15, 800))

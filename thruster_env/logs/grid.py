@@ -70,6 +70,16 @@ def resolution_of(latest: float, resolution: float = 0.0) -> float:
     return max(resolution, 2.0 * math.ulp(latest))
 
 
+def resolution_of_digits(times: np.ndarray, dt: float) -> float:
+    """How far rounding moves stamps [s]: half a unit of the fewest digits that write all of them, or float64's."""
+    least = 2.0 * math.ulp(float(np.abs(times).max())) + ROUNDING * dt
+    for digits in range(-3, MOST_DIGITS):
+        unit = 10.0**-digits
+        if float(np.abs(times - unit * np.round(times / unit)).max()) <= least:
+            return 0.5 * unit + least
+    return least
+
+
 def closeness(dt: float, resolution: float) -> float:
     """How far two stamps may be apart to be one [s], for a sample time dt [s] and their resolution [s]."""
     return max(SAME_STAMP * dt, resolution)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from thruster_env.core.angles import difference
-from thruster_env.core.checks import covariance, vector
+from thruster_env.core.checks import covariance, positive, vector, without_column
 from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import Source, as_value
@@ -66,7 +66,13 @@ def affine_functions(n: int, m: int, p: int, feeds: bool = False) -> dict[str, C
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AffineModel(StateSpaceModel):
-    """A `StateSpaceModel` with f = A x + B u + a and h = C x + d or C x + D u + d; make it with `affine_model`."""
+    """A `StateSpaceModel` with f = A x + B u + a and h = C x + d or C x + D u + d; make it with `affine_model`.
+
+    Attributes:
+        dt: sample time [s] that A, B and Q are for; None if it is not known.
+    """
+
+    dt: float | None = None
 
     def matrices(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """A (n, n), B (n, p), a (n,), C (m, n), d (m,)."""
@@ -133,6 +139,7 @@ def affine_model(
     states=None,
     input_quantities=None,
     measurements=None,
+    dt=None,
 ) -> AffineModel:
     """Make a model that is linear in state and input, with constant offsets.
 
@@ -156,6 +163,7 @@ def affine_model(
         states: names and units of the states, as `StateSpaceModel` takes them.
         input_quantities: those of the inputs.
         measurements: those of the measurements.
+        dt: sample time [s], so that `filters.run` refuses data with other steps; None if it is not known.
 
     Raises:
         ValueError: if shapes do not fit.
@@ -173,7 +181,7 @@ def affine_model(
     feeds = d is not None and p > 0
     offset = vector("state_offset", [0.0] * n if state_offset is None else state_offset, n)
     shift = vector("measurement_offset", [0.0] * m if measurement_offset is None else measurement_offset, m)
-    prior_mean = vector("prior_mean", prior_mean, n)
+    prior_mean = vector("prior_mean", without_column(prior_mean), n)
     measurement_noise_cov = covariance("measurement_noise_cov", measurement_noise_cov, m)
     return AffineModel(
         **affine_functions(n, m, p, feeds),
@@ -186,6 +194,7 @@ def affine_model(
         states=states,
         input_quantities=input_quantities,
         measurements=measurements,
+        dt=None if dt is None else positive("dt", dt),
     )
 
 

@@ -12,12 +12,15 @@ from scipy.special import chdtrc
 
 from filters.bounds import steady_state
 from filters.consistency.nees import LAGS, Whiteness, whiteness
-from filters.engine.batch import Estimates
+from filters.engine.batch import Prepared
 from filters.gaussian.kalman import KalmanFilter
 from filters.models import named_model
-from filters.named import text_of
+from filters.named import NamedMaker, text_of
+from filters.runs import FilteredRuns
+from thruster_env.core.streams import filter_keys
 from thruster_env.core.text_tables import Table, Unfolded
 from thruster_env.model.affine import AffineModel
+from thruster_env.model.continuous import ContinuousModel
 from tuning.api.result import Result, frame
 from tuning.identification.objective import climb
 from tuning.series.column import Column, seconds_text
@@ -117,10 +120,36 @@ class SeriesFit(Result):
         slowest = np.abs(rates[~hidden]).max(initial=0.0)
         return math.inf if slowest >= 1.0 else -self.column.dt / math.log(max(slowest, 1e-300))
 
+    @property
+    def plant(self) -> ContinuousModel:
+        """The model in continuous time, for data with steps of any length.
+
+            ekf = filters.make_filter("ekf", fit.plant.at(fit.column.dt))
+            filters.run(ekf, z, dt=np.diff(t), noise=fit.plant.noise)
+
+        Raises:
+            ValueError: for a model of equal steps, as one with a season.
+        """
+        mean = self.column.mean if self.level is None else self.level
+        maker = NamedMaker(
+            self.name,
+            self.column.quantities,
+            self.chosen.values,
+            mean=tuple(np.ravel(mean).tolist()) if named_model(self.name).about_mean else None,
+            first=tuple(self.column.first.tolist()),
+            spread=self.column.scales.spread,
+        )
+        return maker.continuous(dt=self.column.dt)
+
     @cached_property
-    def estimates(self) -> Estimates:
-        """The filter on the data."""
-        return filtered(named_model(self.name).signal(self._values), self.model, self.column)
+    def estimates(self) -> FilteredRuns:
+        """The filter on the data, a batch of one, as `filters.run` gives it: `to_frame()`, `plot()`."""
+        signal = named_model(self.name).signal(self._values)
+        runs = FilteredRuns(*filtered(signal, self.model, self.column))
+        z, times = self.column.table[None], self.column.times
+        none = np.zeros((1, len(times) - 1, 0))
+        runs.data = Prepared(self.filter, filter_keys([0]), none, z, None, None, np.arange(len(times)), times)
+        return runs
 
     @property
     def _values(self) -> dict[str, float]:

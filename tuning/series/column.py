@@ -20,6 +20,7 @@ from filters.models import Scales, named_model
 from thruster_env.core.checks import as_floats, listed, one_of, short_repr
 from thruster_env.logs.columns import COUNTERS, DATE_NAMES, TIME, TIME_NAMES, parted
 from thruster_env.logs.findings import CLOCK, GAP, MISSING, Remark, sentences
+from thruster_env.logs.grid import resolution_of_digits
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 from thruster_env.logs.recorders.registry import format_of
@@ -28,7 +29,6 @@ from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 
 LEAST_ROWS = 20  # with a number
-ROUNDING, MOST_DIGITS = 1e-6, 9  # of a sample time, and of stamps
 SPARSE = 2.0  # rows of a grid a number, from which on numbers have their own times
 DIGITS = 1e-12  # of the largest number: noise that is rounding
 MOST_AXES = 6
@@ -156,7 +156,7 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
         if (
             log.irregular
             or has_gaps
-            or log.recording.jitter > _resolution(at_times.times + at_times.start, log.dt)
+            or log.recording.jitter > resolution_of_digits(at_times.times + at_times.start, log.dt)
         ):
             log, stamps = at_times, at_times.times
     for quantity, values in zip(log.measured, log.measurements.T, strict=True):
@@ -235,16 +235,6 @@ def log_of_columns(
     text = f"no column of times was found (columns {listed(table.names)}): 1 s is assumed, {way}"
     remarks = (*log.recording.remarks, Remark(CLOCK, "", text))
     return replace(log, recording=log.recording._replace(remarks=remarks))
-
-
-def _resolution(times: np.ndarray, dt: float) -> float:
-    """How far rounding moves stamps [s]: half a unit of the fewest digits that write all of them, or float64's."""
-    least = 2.0 * math.ulp(float(np.abs(times).max())) + ROUNDING * dt
-    for digits in range(-3, MOST_DIGITS):
-        unit = 10.0**-digits
-        if float(np.abs(times - unit * np.round(times / unit)).max()) <= least:
-            return 0.5 * unit + least
-    return least
 
 
 def _quantity(header: str) -> Quantity:
