@@ -100,7 +100,7 @@ class Matrix:
     __rmul__ = __mul__
 
     def __truediv__(self, other):
-        if isinstance(other, Matrix) and len(other.shape) == 2:
+        if isinstance(other, Matrix) and len(other.shape) == 2 and other.symmetric:
             raise TypeError(
                 f"a page must write C S^-1 as divide(C, S), as / divides each entry, but got {other!r}"
             )
