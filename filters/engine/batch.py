@@ -357,7 +357,7 @@ def _check_filter(filter_: Any) -> None:
 def _in_rows(model: StateSpaceModel, keys: Any, inputs: Any, measurements: Any) -> tuple[np.ndarray, Any]:
     """Measurements and inputs as arrays, those of one trajectory without further axes, as FilterPy's columns."""
     z, u = _floats("measurements", measurements), None if inputs is None else _floats("inputs", inputs)
-    if not z.size:
+    if not z.size and (z.ndim < 3 or not z.shape[1]):  # a batch without runs has rows
         raise ValueError(f"measurements must have at least one row, but got {short_repr(measurements)}")
     no_batch = keys is None and (u is None or u.ndim < 3 or u.shape[1:] == (model.inputs, 1))
     if z.ndim == 3 and z.shape[1:] == (model.m, 1) and len(z) > 1 and (no_batch or model.m > 1):

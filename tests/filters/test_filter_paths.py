@@ -193,8 +193,8 @@ def test_the_same_key_gives_the_same_numbers_and_only_ensembles_use_it(name):
         ((2, 2), (2, 6, 1), (2, 6, 1), "shapes"),
         ((2, 2), (2, 5, 2), (2, 6, 1), "shapes"),
         ((2, 2), (2, 5, 1), (2, 6, 2), "shapes"),
-        ((2, 2), (2, 5), (2, 6), "shapes"),
-        ((2, 2), (2, 0, 1), (2, 0, 1), "shapes"),
+        ((2, 2), (2, 5), (2, 6), r"of one trajectory must have shape \(K \+ 1, 1\)"),
+        ((2, 2), (2, 0, 1), (2, 0, 1), "at least one row"),
     ],
 )
 def test_a_batch_whose_shapes_do_not_fit_is_refused(keys, inputs, measurements, rule):
