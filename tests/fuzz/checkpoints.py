@@ -79,7 +79,7 @@ def kill_comparison(rng: np.random.Generator, kills: int, seconds: float) -> str
     deadline, done, progress = time.monotonic() + LAST_KILL * seconds, 0, (0, 0)
     with tempfile.TemporaryDirectory() as scratch:
         found, kept = Path(scratch) / "found", {}
-        command = [sys.executable, "-m", "tuning.cli.main", "study", "policies", "--quick", "--seeds", "1"]
+        command = [sys.executable, "-m", "tuning.cli.main", "reproduce", "policies", "--quick", "--seeds", "1"]
         command += ["--steps", "4096", "--jobs", "2", "--out", str(found), "--json", str(found / "result.json")]
         while done < kills and time.monotonic() < deadline:
             news, delay = int(rng.integers(0, 5)), float(rng.uniform(0.0, 1.0))

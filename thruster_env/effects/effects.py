@@ -155,7 +155,7 @@ class Registry:
 
         def decorate(cls: type[Registered]) -> type[Registered]:
             known = self.effects.get(name, cls)
-            if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+            if known.__module__ != cls.__module__ and known.__module__.startswith("thruster_env."):
                 raise ValueError(f"an effect must have a name of its own, but {name!r} is {known.__qualname__}")
             cls.name = name
             self.effects[name] = cls

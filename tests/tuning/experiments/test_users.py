@@ -115,7 +115,7 @@ def test_an_error_is_kept_and_the_others_go_on(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 def test_the_quick_study_goes_on_where_it_was(as_json, thruster, tmp_path, monkeypatch):  # noqa: F811
-    arguments = "study", "users", "--quick", "--trials", "3", "--out", str(tmp_path)
+    arguments = "reproduce", "users", "--quick", "--trials", "3", "--out", str(tmp_path)
     first = as_json(*arguments)
     assert [one["problem"] for one in first["cases"]] == ["altitude", "battery"]
     for one in first["cases"]:
