@@ -75,6 +75,20 @@ def test_a_tuned_file_of_a_named_model_needs_no_model_again(log, tmp_path):
     assert not any("maximum-likelihood" in sentence for sentence in tuning.estimate(log, file).sentences())
 
 
+def test_a_clock_offset_beside_a_file_changes_no_fit(tmp_path):
+    rng, file = np.random.default_rng(0), tmp_path / "run.csv"
+    z = np.cumsum(0.3 * rng.normal(size=(200, 2)), axis=0) + rng.normal(size=(200, 2))
+    table = np.column_stack([0.1 * np.arange(200), z])
+    np.savetxt(file, table, delimiter=",", header="t,x,y", comments="")
+    options = {"model": "constant", "column": "x,y"}
+    before = tuning.fit(file, **options)
+    file.with_suffix(".toml").write_text("[clock_offset]\nx = 0.05\ny = 0.05\n")
+    np.testing.assert_array_equal(tuning.fit(file, **options).r, before.r)
+    file.with_suffix(".toml").write_text("[clock_offset]\nx = 0.05\n")
+    with pytest.raises(ValueError, match="columns of a fit must have one clock, but .* has x = 0.05"):
+        tuning.fit(file, **options)
+
+
 def test_a_clock_offset_of_all_columns_moves_no_number():
     options = {"model": f"{NAME}:acceleration=1", "columns": ["x,y"]}
     log, maker = tuning.read_logs(TRACK, **options).read()

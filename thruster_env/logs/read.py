@@ -224,6 +224,9 @@ def read_log(
     of_file, start, assumption = _grid(table, column_of.get(TIME), description.dt, file, grid)
     dt = of_file.dt
     offsets = _offsets(description.clock_offset, wanted, column_of, of_file, file)
+    common = {offsets.get(channel.key, 0.0) for channel in wanted if channel.key in column_of}
+    if len(common) == 1 and any(common) and not model.input_quantities:
+        start, offsets = start - common.pop(), {}  # one clock for all: times move, and no sample is interpolated
     samples, source, parts = {}, {}, {}
     rows, dropped = np.zeros(len(of_file.times), bool), []
     for channel in wanted:

@@ -150,6 +150,9 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
         raise ValueError(f"{rule}, but got {short_repr(times)} beside it")
     named = column.split(",") if isinstance(column, str) else column
     log, stamps = log_of_columns(z, named, dt=dt, times=times), None
+    if log.offsets:
+        text = ", ".join(f"{key.partition(':')[2]} = {seconds:g}" for key, seconds in log.offsets.items())
+        raise ValueError(f"columns of a fit must have one clock, but [clock_offset] of {log.name} has {text}")
     has_gaps = len(log.measurements) > SPARSE * (~np.isnan(log.measurements)).any(axis=1).sum()
     if log.irregular or has_gaps or log.recording.jitter > 0.0:
         at_times = log_of_columns(z, named, dt=dt, times=times, grid=False)

@@ -75,13 +75,7 @@ def read_columns(
     axes, log = len(maker.quantities), source
     if not isinstance(source, Log):
         options["dt"] = options.get("dt") if maker.dt is None else maker.dt
-        offsets = options.pop("clock_offset", None) or {}
         log = log_of_columns(source, list(columns.values()) or None, axes, **options)
-        common = {offsets.get(quantity.symbol, 0.0) for quantity in log.measured}
-        if len(common) == 1 and set(offsets) <= {quantity.symbol for quantity in log.measured}:
-            log = replace(log, start=log.start - common.pop())  # of one clock: no sample is interpolated
-        else:
-            log = log_of_columns(source, list(columns.values()) or None, axes, clock_offset=offsets, **options)
     if axes not in (1, len(log.measured)):
         symbols = listed(quantity.symbol for quantity in log.measured)
         raise ValueError(f"{maker.name} of {axes} axes must have as many columns, but got {symbols}")
