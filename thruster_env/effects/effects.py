@@ -14,8 +14,8 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
-from collections import namedtuple
-from collections.abc import Callable, Mapping, Sequence
+from collections import ChainMap, namedtuple
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -143,12 +143,12 @@ Registered = TypeVar("Registered", bound=Effect)
 class Registry:
     """Effects of one kind by name, and how to make them from mappings."""
 
-    def __init__(self, argument: str, effects: Mapping[str, type[Effect]] | None = None):
-        """Name the env's argument for which this registry makes effects, and the first of them."""
+    def __init__(self, argument: str, effects: MutableMapping[str, type[Effect]] | None = None):
+        """Name the env's argument for which this registry makes effects, and another one's that it has, too."""
         self.argument = argument
-        self.effects: dict[str, type[Effect]] = {}
-        for name, effect in (effects or {}).items():
-            self.register(name)(effect)
+        self.effects: ChainMap[str, type[Effect]] = ChainMap({}, effects if effects is not None else {})
+        for name, effect in self.effects.items():
+            effect.name = name
 
     def register(self, name: str) -> Callable[[type[Registered]], type[Registered]]:
         """Return a class decorator that makes a frozen dataclass an effect of this name."""
