@@ -18,7 +18,7 @@ from docs.scripts import by_name
 from filters.models import named_model
 from thruster_env.core.text_tables import markdown_table
 
-SETS, CHOICES = 100, 18  # of each model, for intervals, and for the choice among models
+SETS, CHOICES = 200, 40  # of each model, for intervals, and for the choice among models
 MODELS = "constant", "constant-velocity", "constant-acceleration", "oscillator"
 LEAST_ROWS, ENOUGH, MOST_ROWS = 50, 500, 5000  # of a set; a model is chosen from ENOUGH rows on
 R = 1.0
