@@ -73,10 +73,3 @@ def test_every_line_leads_to_the_alarm(tmp_path, thruster):  # noqa: F811
         pytest.skip(
             "all but the controller was run, for gcc-arm-none-eabi or qemu-system-arm of Debian is missing"
         )
-
-
-def test_the_page_ends_on_the_controller():
-    lines = [line for language, code in BLOCKS if not language for line in code.splitlines()]
-    starts = [line.split()[0] for line in lines if not line.startswith(" ")]
-    assert starts[0] == "thruster" and starts[-1] == "qemu-system-arm"
-    assert {"identify", "tune", "estimate", "export"} <= {line.split()[1] for line in lines}

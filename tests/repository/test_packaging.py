@@ -1,4 +1,4 @@
-"""What is packed: every extra that is named exists, and a source distribution holds what its tests need."""
+"""What is packed, with which versions: pyproject.toml, constraints files, the CI file and the Makefile agree."""
 
 import re
 import shutil
@@ -7,11 +7,14 @@ import sys
 import tarfile
 import tomllib
 import zipfile
-from importlib.metadata import requires
-from importlib.util import find_spec
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 from tests.repository.test_house import FLOORS
 from thruster_env import __version__
@@ -23,9 +26,25 @@ EXTRAS = {
     extra: {re.split(r"[<>=]", line)[0] for line in lines}
     for extra, lines in PROJECT["optional-dependencies"].items()
 }
-PINNED = {line.partition("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line}
 LARGEST_WHEEL = 1_460_000  # bytes; less each time that the house shrinks
 NOT_PACKED = {".gitignore", ".ci/run"}
+CI = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
+MAKEFILE = (ROOT / "Makefile").read_text()
+TESTED = re.search(r"^TEST_EXTRAS := (.*)$", MAKEFILE, flags=re.MULTILINE)[1].split(",")
+NOT_OLDEST = {"torch"}  # constraints-oldest.txt says why
+
+
+def pinned(name):
+    lines = (ROOT / name).read_text().splitlines()
+    pairs = [line.split("==") for line in lines if line and not line.startswith("#")]
+    return {canonicalize_name(package): Version(number) for package, number in pairs}
+
+
+def required(extras):
+    """Requirements of the package and of extras by name."""
+    by_extra = PROJECT["optional-dependencies"]
+    lines = [*PROJECT["dependencies"], *(line for extra in extras for line in by_extra[extra])]
+    return {canonicalize_name(line.name): line for line in map(Requirement, lines)}
 
 
 def named_extras(text):
@@ -41,18 +60,39 @@ def test_every_extra_that_is_named_exists():
         assert package in EXTRAS[extra]
 
 
-def test_make_test_installs_every_package_that_a_test_may_need_in_a_pinned_version():
-    listed = re.search(r"^TEST_EXTRAS := (.*)$", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)[1]
-    assert set(EXTRAS) - set(listed.split(",")) == {"bench", "docs"}
-    wanted = {name.lower().replace("-", "_") for names in EXTRAS.values() for name in names}
-    assert wanted <= {name.lower().replace("-", "_") for name in PINNED}
+def test_pinned_versions_lie_within_the_ranges_and_the_oldest_are_their_lower_ends():
+    assert set(EXTRAS) - set(TESTED) == {"bench", "docs"}
+    oldest, newest = pinned("constraints-oldest.txt"), pinned("constraints.txt")
+    assert required(EXTRAS).keys() <= newest.keys()
+    for name, requirement in required(TESTED).items():
+        assert newest[name] in requirement.specifier, name
+        if requirement.marker is None or requirement.marker.evaluate({"python_version": "3.11"}):
+            (lowest,) = [Version(bound.version) for bound in requirement.specifier if bound.operator == ">="]
+            assert oldest[name] in requirement.specifier, name
+            assert (oldest[name] == lowest) == (name not in NOT_OLDEST), name
 
 
-def test_whatever_of_rl_zoo3_imports_requests_is_brought_by_the_extra():
-    if find_spec("rl_zoo3") is None:  # importing it would change Gymnasium's TimeLimit for all tests
-        pytest.skip("rl_zoo3 is not installed")
-    theirs = {re.split(r"[^\w-]", line)[0] for line in requires("rl_zoo3")}
-    assert "requests" in EXTRAS["peers"] or "requests" in theirs
+def test_the_ci_file_tries_every_python_and_makes_what_is_there():
+    named = [line.rsplit(" ", 1)[1] for line in PROJECT["classifiers"] if re.search(r"Python :: 3\.\d+$", line)]
+    tests = CI["jobs"]["tests"]["strategy"]["matrix"]
+    assert named == tests["python"] and PROJECT["requires-python"] == f">={named[0]}"
+    assert {"python": named[0], "versions": "oldest", "constraints": "constraints-oldest.txt"} in tests["include"]
+    assert {"python": named[-1], "versions": "newest", "constraints": ""} in tests["include"]
+    targets = set(re.findall(r"^([\w-]+):.*##", MAKEFILE, flags=re.MULTILINE))
+    commands = [step.get("run", "") for job in CI["jobs"].values() for step in job["steps"]]
+    words = [word for command in commands if command.startswith("make ") for word in command.split()[1:]]
+    made = {word for word in words if not re.search("[={}]|constraints", word)}
+    assert {"lint", "test", "test-slow", "docs"} <= made <= targets
+
+
+def test_the_version_is_one_literal_that_everything_else_tells():
+    def read(name, pattern):
+        return re.search(pattern, (ROOT / name).read_text(), flags=re.MULTILINE)[1]
+
+    assert PROJECT["dynamic"] == ["version"] and version("thruster-env") == __version__
+    assert read("thruster_env/__init__.py", r'^__version__ = "(\d+\.\d+\.\d+(?:(?:a|b|rc)\d+)?)"$') == __version__
+    assert read("CITATION.cff", r"^version: (.*)$") == __version__
+    assert read("CHANGELOG.md", r"^## \[(.*?)\] - (?:Unreleased|\d{4}-\d{2}-\d{2})$") == __version__
 
 
 def test_every_package_is_known_wherever_packages_are_listed():

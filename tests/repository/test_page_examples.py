@@ -14,6 +14,7 @@ from tuning.cli.app import app
 
 ROOT = Path(__file__).parents[2]
 PAGES = {str(path.relative_to(ROOT / "docs")): path.read_text() for path in sorted((ROOT / "docs").rglob("*.md"))}
+PAGES["README.md"] = (ROOT / "README.md").read_text()
 FENCE = re.compile(r"```(\w*)\n(.*?)```", flags=re.DOTALL)
 LINE = re.compile(r"^(?: {4})?thruster ((?:.*\\\n)*.+)$", flags=re.MULTILINE)
 
@@ -47,6 +48,7 @@ NOT_RUN = {  # programs, by page and what is in them
 }
 QUICK = (
     ("trials=30", "trials=3"),
+    ("trials=50", "trials=3"),
     ("runs=200, steps=1000", "runs=24, steps=8"),
     ('.file], "outliers"', '.file], "outliers", seeds=4'),
 )  # smaller numbers
@@ -140,29 +142,3 @@ def test_the_commands_of_a_page_lead_from_one_to_the_next(page, thruster, tmp_pa
         done = thruster(*shlex.split(line, comments=True))
         assert done.returncode in (0, 3), (line, done.stderr)  # 3: no trial of so few was consistent
     sys.modules.pop("my_pendulum", None)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_the_one_number_of_the_page_on_problems_is_tuned_reported_and_evaluated(thruster, tmp_path, monkeypatch):
-    """Its Q is singular: one acceleration drives two states."""
-    others = "make_env", "runs"
-    code = [one for one in programs("problems.md") if "tracker" in one and not any(part in one for part in others)]
-    (tmp_path / "mine.py").write_text("\n".join(code))
-    monkeypatch.syspath_prepend(tmp_path)
-    for name in ("one_number", "pair"):
-        whose = "--problem", f"mine:{name}"
-        tuned = thruster("tune", *whose, "--filter", "kf", "--trials", 4, "--out", "t.json")
-        assert tuned.returncode in (0, 3) and "oracle" in tuned.stdout, tuned.stderr
-        for command in (
-            ("report", "t.json"),
-            ("evaluate", "--tuned", "t.json", "--seeds", 3),
-            ("verify", "t.json"),
-            ("compare", "--filter", "kf", "--filter", "ekf", "--seeds", 3),
-        ):
-            done = thruster(*command, *whose)
-            assert done.returncode == 0, (command, done.stderr)
-    by_gradient = "--problem", "mine:one_number", "--trials", 2, "--method", "gradient"
-    done = thruster("tune", "--filter", "kf", *by_gradient)
-    assert done.returncode == 0, done.stderr
-    sys.modules.pop("mine", None)

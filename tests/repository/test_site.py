@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from docs._ext.equations import inline, latex_of, readable
-from docs._ext.generated import ORDER, commands
-from filters.registry import FILTERS
+from docs._ext.equations import inline
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -53,69 +51,3 @@ def test_what_the_reference_names_is_there():
 @pytest.mark.parametrize(("text", "latex"), EQUATIONS.items(), ids=range(len(EQUATIONS)))
 def test_an_equation_is_set(text, latex):
     assert inline(text) == latex
-
-
-def test_lines_of_an_equation_stand_below_each_other_beside_their_labels():
-    latex = latex_of("predict: x = y\nupdate:  z = x,\n         y = z")
-    assert latex == (r"\begin{aligned}\text{predict:} & x = y \\ \text{update:} & z = x, \\ & y = z\end{aligned}")
-
-
-@pytest.mark.parametrize("name", sorted(set(FILTERS) - {"open-loop"}))
-def test_a_filter_shows_its_equations(name):
-    lines = readable([line.removeprefix("    ") for line in FILTERS[name].__doc__.split("\n")])
-    blocks = [lines[place + 2] for place, line in enumerate(lines) if line == ".. math::"]
-    assert blocks and all(block.count("{") == block.count("}") for block in blocks)
-    assert "&" in blocks[0] and "|" not in blocks[0]
-
-
-def test_prose_keeps_its_bars_asterisks_and_underscores():
-    assert readable(["|e| of x_ and `*args`"]) == [r"\|e\| of x\_ and `*args`"]
-    assert readable(["All `Log`s."]) == [r"All `Log`\ s."]
-    assert readable(["One.", "", "    [columns]", "    thrust = 1"])[2] == ".. code-block:: text"
-
-
-def test_tables_of_an_env_become_tables():
-    lines = readable(["## Action space", "| num | max |", "|---|---|", "| 0 | V |"])
-    assert [line for line in lines if line] == [
-        ".. rubric:: Action space",
-        ".. list-table::",
-        "    :header-rows: 1",
-        "    * - num",
-        "      - max",
-        "    * - 0",
-        "      - V",
-    ]
-
-
-def test_tutorials_are_the_scripts_in_examples():
-    assert sorted(path.stem for path in (ROOT / "examples").glob("*.py")) == sorted(ORDER)
-
-
-def test_examples_of_the_command_line_page_can_be_copied():
-    text = commands()
-    assert (
-        "```console\n$ thruster filters ukf\n$ thruster filters --problem" in text
-        and "Example: thruster" not in text
-    )
-    assert "* `--json FILE`: " in text and "* `--seed INTEGER`: " in text
-    assert re.search(
-        r"^\* `verify`: Recompute the held-out metrics .*, and say whether they hold\.$", text, re.MULTILINE
-    )
-    assert not re.search(r"^\* `\w+`: .*\.\.\.$", text, re.MULTILINE)  # no summary is cut
-    assert not re.search(r"^\* `[^`]*<", text, re.MULTILINE) and "[default: (" not in text
-
-
-def test_no_line_to_install_is_cut():
-    page = (ROOT / "docs" / "index.md").read_text()
-    lines = re.findall(r"^    (pip .*)$", page, flags=re.MULTILINE)
-    assert len(lines) == 2 and max(map(len, lines)) <= 36  # letters in a block on a phone of 390 pixels
-
-
-@pytest.mark.parametrize(
-    "words", ["session", "positive", "real time", "restart", "gate", "missing", "overconfident"]
-)
-def test_a_search_leads_to_a_title_or_a_word_of_the_glossary(words):
-    pages = [page.read_text() for page in (ROOT / "docs").rglob("*.md") if "tutorials" not in page.parts]
-    titles = [line for page in pages for line in re.findall(r"^#+ (.*)$", page, flags=re.MULTILINE)]
-    terms = re.findall(r"^(\w.*)\n(?=\w|  )", (ROOT / "docs" / "glossary.md").read_text(), flags=re.MULTILINE)
-    assert any(re.search(rf"\b{words}\b", one, re.IGNORECASE) for one in [*titles, *terms])
