@@ -52,7 +52,7 @@ def likelihood(
         model: holds Q and R, at which the gradient is taken.
         inputs: (B, K, p).
         measurements: (B, K + 1, m); NaN where missing.
-        q_slopes: dQ/dparameter, (parameters, n, n), symmetric.
+        q_slopes: dQ/dparameter, (parameters, n, n), symmetric; (parameters, t, t) if the state has rotations.
         r_slopes: dR/dparameter, (parameters, m, m), symmetric.
         filter: one of `differentiated.runs.KINDS`, or your own; its model is replaced by `model`.
         own_slopes: slopes of the filter's `own_parameters`, (parameters, count); zero if None.
@@ -97,7 +97,7 @@ def _derivatives(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood with gradient, (B, 1 + p), and the information, (B, p, p), or nothing in its place."""
     inputs, measurements, q_slopes, r_slopes = (np.ascontiguousarray(as_floats(value)) for value in arguments)
-    n, m, p = model.n, model.m, len(q_slopes)
+    n, m, p = model.t, model.m, len(q_slopes)
     arrays = {"inputs": inputs, "measurements": measurements, "q_slopes": q_slopes, "r_slopes": r_slopes}
     check_shapes(arrays, model, (p, n, n), (p, m, m))
     slopes = ModelSlopes.of(model, p, process_noise_cov=q_slopes, measurement_noise_cov=r_slopes)
@@ -173,9 +173,9 @@ def sensitivity(
         raise ValueError(f"degrees of freedom must be above 2, but got {degrees!r}")
     inputs, measurements = (np.ascontiguousarray(as_floats(a)) for a in (inputs, measurements))
     slopes = ModelSlopes(*(np.ascontiguousarray(slope, dtype=np.float64) for slope in slopes))
-    n, m, p = model.n, model.m, len(slopes.constants)
+    n, t, m, p = model.n, model.t, model.m, len(slopes.constants)
     arrays = {"inputs": inputs, "measurements": measurements, **slopes._asdict()}
-    check_shapes(arrays, model, (p, len(model.constants)), (p, n, n), (p, m, m), (p, n), (p, n, n))
+    check_shapes(arrays, model, (p, len(model.constants)), (p, t, t), (p, m, m), (p, n), (p, t, t))
     counts = 1.0 - np.array(np.zeros(m) if predicted is None else predicted, dtype=np.float64)
     if counts.shape != (m,):
         raise ValueError(f"predicted must be true or false for each of {m} channels, but got {predicted!r}")
@@ -221,7 +221,8 @@ def state_score(
         q_slopes: dQ/dparameter, (parameters, n, n), symmetric.
         r_slopes: dR/dparameter, (parameters, m, m), symmetric.
         score: "log-score" or "squares".
-        weights: of the squares, (n,), one by default; those of a log score are one.
+        weights: of the squares, (n,), one by default; those of a log score are one. With rotations (t,): the
+            error is the d with move(m, d) = x of `thruster_env.model.turns`.
         filter: as `filters.sensitivity.likelihood` takes it; the (extended) Kalman filter by default.
         own_slopes: as `filters.sensitivity.likelihood` takes them.
 
@@ -234,13 +235,13 @@ def state_score(
     one_of("score", score, (LOG_SCORE, SQUARES))
     arrays = (inputs, measurements, states, q_slopes, r_slopes)
     inputs, measurements, states, q_slopes, r_slopes = (np.ascontiguousarray(as_floats(a)) for a in arrays)
-    n, m, p = model.n, model.m, len(q_slopes)
+    n, t, m, p = model.n, model.t, model.m, len(q_slopes)
     sequences = {"inputs": inputs, "measurements": measurements, "states": states}
-    wanted_shapes = (*measurements.shape[:2], n), (p, n, n), (p, m, m)
+    wanted_shapes = (*measurements.shape[:2], n), (p, t, t), (p, m, m)
     check_shapes({**sequences, "q_slopes": q_slopes, "r_slopes": r_slopes}, model, *wanted_shapes)
-    of_squares = np.ones(n) if weights is None else as_floats(weights)
-    if of_squares.shape != (n,):
-        raise ValueError(f"weights must have the shape ({n},), but got {of_squares.shape}")
+    of_squares = np.ones(t) if weights is None else as_floats(weights)
+    if of_squares.shape != (t,):
+        raise ValueError(f"weights must have the shape ({t},), but got {of_squares.shape}")
     slopes = ModelSlopes.of(model, p, process_noise_cov=q_slopes, measurement_noise_cov=r_slopes)
     wanted = Wanted(information=False, constants=False, tails=False, score=score)
     truth, arguments = Truth(states, of_squares), (model, inputs, measurements, slopes, wanted)

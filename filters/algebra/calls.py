@@ -61,7 +61,7 @@ def _function(
     """One function for all equal operations, so that it is compiled once."""
     if operation is matrices.multiply:
         return _product(by_transpose, *shapes)
-    if operation not in _FUNCTIONS and getattr(tangents, operation.name, None) is operation:
+    if operation not in _FUNCTIONS and operation.compute.__module__ == tangents.__name__:
         raise ValueError(
             "a filter of rotations must have functions that can be traced, and a prediction and an update of at "
             f"most {MOST} operations each, but this one has not: use 'ekf', fewer states, measurements or "

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from filters.algebra.matrices import operation, same
+from filters.algebra.matrices import Operation, never, operation, same
 from filters.algebra.operations import sym, wrap
 from filters.algebra.points import ones, outer
 from thruster_env.graphs.graphs import Number
 from thruster_env.graphs.tracing import traced
 from thruster_env.model import turns as steps
+from thruster_env.model.traced import slopes_along
 
 _traced = cache(traced)
 
@@ -33,6 +34,30 @@ def _computed(function: Callable, turns: Any, *vectors: Any) -> np.ndarray:
         columns = [[v[:, j] if v.ndim == 2 else v for v in vectors] for j in range(points[0])]
         return np.array([_traced(function)(*map(list, column), turns) for column in columns], dtype=object).T
     return np.array(_traced(function)(*map(list, vectors), turns), dtype=object)
+
+
+def _differentiable(of: Operation, function: Callable) -> None:
+    """Give an operation its derivative: that of the graph of its function, along changes of all vectors."""
+
+    def slope(*arguments: Any) -> np.ndarray:
+        *parts, turns = arguments
+        count = len(parts) // 2
+        pairs = [
+            (number, 0.0 if change is None else change.ravel()[i])
+            for vector, change in zip(parts[:count], parts[count:], strict=True)
+            for i, number in enumerate(vector.ravel())
+            if isinstance(number, Number)  # others are constants
+        ]
+        value = _computed(function, turns, *parts[:count])
+        numbers, changes = (np.array(part, dtype=object) for part in zip(*pairs, strict=True))
+        return slopes_along(value, (numbers, changes))
+
+    def shape(*shapes: Any) -> tuple[int, ...]:
+        return of.shape(*shapes[: len(shapes) // 2], shapes[-1])
+
+    along = Operation(slope, shape, never)
+    along.name = f"slope_of_{of.name}"
+    of.derivative(lambda result, arguments, slopes: along(*arguments[:-1], *slopes[:-1], arguments[-1]))
 
 
 def move(model, x, d):
@@ -131,3 +156,15 @@ def inverse_reset_slopes(d, turns):
 def reset_slopes(d, turns):
     """G, the derivative of the step between tangents."""
     return _computed(steps.reset_slopes, turns, d)
+
+
+for _operation, _function in (
+    (moved, steps.move),
+    (apart, steps.difference),
+    (normalised, steps.unit),
+    (slopes_of_stored, steps.slopes_of_stored),
+    (slopes_of_tangent, steps.slopes_of_tangent),
+    (reset_slopes, steps.reset_slopes),
+    (inverse_reset_slopes, steps.inverse_reset_slopes),
+):
+    _differentiable(_operation, _function)

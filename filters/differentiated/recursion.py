@@ -27,6 +27,7 @@ from filters.algebra.operations import (
     wrap,
 )
 from filters.algebra.points import density, density_slope, dot, heavier, outlier_weight, root
+from filters.algebra.tangents import differences
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.pages.kernels import Stage, as_calls, as_programs, as_tuple, stage_of, with_extras
 from filters.pages.page import Equations, NumbersMemory, Page, PagedModel
@@ -37,7 +38,6 @@ from thruster_env.model.shape import (
     Functions,
     Shape,
     constants_reader,
-    number_offsets,
     starts_of,
 )
 from thruster_env.model.traced import MOST
@@ -65,17 +65,17 @@ class Memory(NumbersMemory):
     """
 
     def __init__(self, shape: Shape, page: Page):
-        n, m, layout = shape.n, shape.m, number_offsets(shape.n, shape.m)
+        n, m, t, layout = shape.n, shape.m, shape.t, shape.offsets
         tail = layout.constants + shape.constants
         self.tail, self.predicted_tail = tail, tail + m + 2
         own_at = self.predicted_tail + m + 2
         x = input_matrix(Place("rows", 0), (n,))
-        super().__init__(shape, page, x, input_matrix(Place("rows", n), (n, n), symmetric=True, like=x), own_at)
+        super().__init__(shape, page, x, input_matrix(Place("rows", n), (t, t), symmetric=True, like=x), own_at)
         self.Q_root, self.prior_root = root(self.Q), root(self.P)  # where a filter starts P is that of the prior
         model = PagedModel(self)
         predicted = (x, self.P) if page.represent is None else as_tuple(page.represent(model, x, self.P))
         started = page.started(model)
-        self.begun, self.notes = n + n * n, m + m * m
+        self.begun, self.notes = n + t * t, m + m * m
         starts = starts_of(*(prod(matrix.shape) for matrix in predicted))
         self.extras_from = max(self.begun, starts[-1])
         of_extras = starts_of(self.extras_from, *(prod(matrix.shape) for matrix in started.values()))[1:]
@@ -85,18 +85,18 @@ class Memory(NumbersMemory):
         )[1:]
         self.slope = self.state  # of the score
         self.noted, self.weighed, self.depth = starts_of(self.state + 1, self.notes, self.notes)[1:]
-        r, c, size, self.prior, own_slopes = starts_of(n * n, m * m, shape.constants, 1, self.begun)[1:]
+        r, c, size, self.prior, own_slopes = starts_of(t * t, m * m, shape.constants, 1, self.begun)[1:]
         self.u, self.z = self.read("rows", self.input, shape.inputs), self.read("rows", self.measured, m)
         self.ratio = self.ratio_in("rows", self.input)
         self.tails = [self.read("numbers", first, m + 2) for first in (tail, self.predicted_tail)]
         self.truth = self.read("rows", self.true, n)
-        self.weights = self.read("numbers", own_at + page.own_size, n, n, symmetric=True)
+        self.weights = self.read("numbers", own_at + page.own_size, t, t, symmetric=True)
         self.constants_slope = self.read("move", c, shape.constants)
         self.size = self.read("move", size)
         self.moves: dict[Matrix, Matrix] = {
             self.x: self.read("change", 0, n),
-            self.P: self.read("change", n, n, n, symmetric=True),
-            self.Q: self.read("move", 0, n, n, symmetric=True),
+            self.P: self.read("change", n, t, t, symmetric=True),
+            self.Q: self.read("move", 0, t, t, symmetric=True),
             self.R: self.read("move", r, m, m, symmetric=True),
         }
         self.predicted = [self.x, self.P]
@@ -154,14 +154,15 @@ def density_of(
     return {memory.level: level}, slopes
 
 
-def score_of_truth(memory: Memory, off: Matrix, cov: Matrix, moves: dict, score: str) -> tuple[dict, dict]:
-    """A score of the estimate, given its error without the states that do not count, and its slope."""
+def score_of_truth(
+    memory: Memory, known: Matrix, off: Matrix, cov: Matrix, moves: dict, score: str
+) -> tuple[dict, dict]:
+    """A score of the estimate, given its error without the states that are not known, and its slope."""
     if score == SQUARES:
         weighted = memory.weights @ off
         doff = slopes_of([off], moves)[0]
         slope = None if doff is None else dot(weighted, doff) * -2.0
         return {memory.level: dot(weighted, off) * -1.0}, {memory.slope: slope}
-    known = present(memory.truth)
     s = uncorrelated(known, cov)
     of = factor(s)
     w = quotient(off, of)
@@ -266,9 +267,9 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
     ]
     mean, cov, v, s, _, changed = with_extras(page.update(model, x, p, memory.z))
     if wanted.of_truth:
-        known = present(memory.truth)
-        off = mask_missing(known, wrap(memory.truth - mean, model.state_angles))
-        of_truth = score_of_truth(memory, off, cov, moves, wanted.score)
+        known = present(differences(model, memory.truth, memory.truth) if model.turns else memory.truth)
+        off = mask_missing(known, differences(model, memory.truth, mean))
+        of_truth = score_of_truth(memory, known, off, cov, moves, wanted.score)
         stages.append(belief_stage((mean, cov, changed), *of_truth))
         return stages
     stages.append(belief_stage((mean, cov, changed), *density_of(memory, v, s, moves, memory.tails[0], wanted)))
@@ -296,7 +297,7 @@ def _accumulator(memory: Memory, works: list[Callable], wanted: Wanted, page: Pa
     inputs_count, channels, informative = memory.shape.inputs, memory.shape.m, wanted.information
     first_true, true_states = memory.true, memory.shape.n if wanted.of_truth else 0
     nan = np.nan
-    substeps = number_offsets(memory.shape.n, memory.shape.m).substeps
+    substeps = memory.shape.offsets.substeps
 
     def accumulate(
         inputs,

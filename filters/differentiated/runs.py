@@ -26,6 +26,7 @@ from filters.starts import Starts, as_the_prior_says
 from thruster_env.core.angles import wrapped_where
 from thruster_env.core.threads import spread
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import refuse_rotations
 
 # The filters that have derivatives: those with a page, but for a schedule of gains and the steady one.
 
@@ -75,6 +76,8 @@ def differentiable(model: StateSpaceModel, filter_: Filter | None) -> Differenti
         raise ValueError(f"a filter with derivatives must have schedule=1, but got {filter_.schedule}")
     form = {"form": "covariance"} if filter_.forms else {}  # of the same estimates
     used = replace(filter_, model=model, **form)
+    if not used.takes_rotations:
+        refuse_rotations(model)
     return Differentiable(used.kernel_model, used.written_page, used.own_parameters)
 
 
@@ -82,10 +85,10 @@ class ModelSlopes(NamedTuple):
     """Derivatives of a model with respect to p parameters, each scaled so that 1 is a sensible change of it."""
 
     constants: np.ndarray  # (p, c)
-    process_noise_cov: np.ndarray  # (p, n, n), symmetric
+    process_noise_cov: np.ndarray  # (p, n, n), or of the tangent (p, t, t); symmetric
     measurement_noise_cov: np.ndarray  # (p, m, m), symmetric
     prior_mean: np.ndarray  # (p, n)
-    prior_cov: np.ndarray  # (p, n, n), symmetric
+    prior_cov: np.ndarray  # as Q
 
     @classmethod
     def of(cls, model: StateSpaceModel, parameters: int, **moving: np.ndarray) -> ModelSlopes:
@@ -112,7 +115,7 @@ class Density(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """True states of B runs, NaN where they do not count, and the weight (n,) of each state's squared error."""
+    """True states of B runs, NaN where they do not count, and the weight (n,), or (t,), of each squared error."""
 
     states: np.ndarray  # (B, K + 1, n)
     weights: np.ndarray
@@ -187,7 +190,7 @@ class RepeatedRuns:
         m, density = model.m, density or Density(np.inf, np.ones(model.m))
         begun = as_the_prior_says(model, len(measurements)) if starts is None else starts
         states, weights = truth or Truth(np.zeros((len(measurements), 0, 0)), np.zeros(0))
-        self._recursion = recursion_of(model.functions, model.shape, wanted, page)
+        self._recursion = recursion_of(model.functions, model.any_shape, wanted, page)
         self._blocks, self._informative = blocks, wanted.information
         turns = 1 if (density.seen > 0).all() else 2  # channels that are predicted only come after the others
         tails = [tail_of(np.inf, m), tail_of(density.degrees, m)]
@@ -230,18 +233,18 @@ def _following(used: PageFilter, model: StateSpaceModel, slopes: ModelSlopes) ->
 
 
 def _begins(model: StateSpaceModel, starts: Starts) -> np.ndarray:
-    """Mean and covariance of each run at its beginning, (B, n + n^2)."""
+    """Mean and covariance of each run at its beginning, (B, n + t^2)."""
     free, count = starts.free[:, None], len(starts.free)
-    means = wrapped_where(np.where(free, starts.means, model.prior_mean), model.shape.state_angles)
+    means = wrapped_where(np.where(free, starts.means, model.prior_mean), model.any_shape.state_angles)
     covs = np.where(free[..., None], starts.covs, model.prior_cov)
-    return np.concatenate([means, covs.reshape(count, model.n**2)], axis=1)
+    return np.concatenate([means, covs.reshape(count, model.t**2)], axis=1)
 
 
 def moves_of(slopes: ModelSlopes, own_slopes: np.ndarray, model: StateSpaceModel) -> np.ndarray:
     """Rows of parameters as in `Memory`."""
-    p, nn, mm = len(slopes.constants), model.n**2, model.m**2
-    noise = slopes.process_noise_cov.reshape(p, nn), slopes.measurement_noise_cov.reshape(p, mm)
-    prior = slopes.prior_mean, slopes.prior_cov.reshape(p, nn)
+    p, tt, mm = len(slopes.constants), model.t**2, model.m**2
+    noise = slopes.process_noise_cov.reshape(p, tt), slopes.measurement_noise_cov.reshape(p, mm)
+    prior = slopes.prior_mean, slopes.prior_cov.reshape(p, tt)
     of_constants = slopes.constants, _relative(slopes.constants, model)[:, None]
     return np.concatenate([*noise, *of_constants, *prior, own_slopes], axis=1)
 

@@ -3,6 +3,7 @@
 import ctypes
 import shutil
 import subprocess
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -13,8 +14,11 @@ import filters
 from filters.bounds import path_bound, posterior_bound
 from filters.c.project import c_filter, write_project
 from filters.consistency.report import consistency_report
+from filters.differentiated.runs import ModelSlopes
 from filters.estimators.foreign import Estimator, ForeignFilter
 from filters.registry import FILTERS
+from filters.sensitivity import sensitivity, state_score
+from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 from thruster_env.env.model_env import ModelEnv
 from thruster_env.model import rotations
@@ -422,3 +426,65 @@ def test_what_is_no_rotation_is_refused():
     filter_ = filters.ExtendedKalmanFilter(model=model)
     with pytest.raises(ValueError, match="'attitude' must be a quaternion"):
         filter_.predict(filter_.init()._replace(mean=np.ones(7)), np.zeros(3))
+
+
+def slopes_by_differences(of, count, step=1e-4):
+    """Central differences of values (B,) by parameters (count,), (B, count)."""
+    return np.array([of(e) - of(-e) for e in step * np.eye(count)]).T / (2 * step)
+
+
+def test_derivatives_of_the_likelihood():
+    """Along Q, R, a constant and the prior: exact through the steps of the tangent."""
+    model, (_, gyro, z) = attitude_model(), simulated(2, 12, 5.0)
+    z[0, 3:6, 2] = np.nan
+    q = np.zeros((4, 6, 6))
+    q[0, :3, :3], q[0, 1, 4] = model.process_noise_cov[:3, :3], 1e-8
+    q[0] += q[0].T
+    r, c, mean = np.zeros_like(q), np.array([[0.0], [0.0], [DT], [0.0]]), np.zeros((4, 7))
+    r[1], mean[3] = model.measurement_noise_cov, [0.0, 0.02, 0.0, -0.01, 0.0, 0.01, 0.0]
+    slopes = ModelSlopes(c, q, r, mean, 1e-3 * r)
+
+    def value(e):
+        changed = model.replace(
+            process_noise_cov=model.process_noise_cov + np.tensordot(e, q, 1),
+            measurement_noise_cov=model.measurement_noise_cov + np.tensordot(e, r, 1),
+            prior_cov=model.prior_cov + 1e-3 * np.tensordot(e, r, 1),
+            constants=tuple(np.array(model.constants) + e @ c),
+        )
+        x = model.prior_mean + e @ mean
+        x[:4] /= np.linalg.norm(x[:4])
+        filter_ = filters.ExtendedKalmanFilter(model=changed.replace(prior_mean=x))
+        return filters.run(filter_, inputs=gyro, measurements=z).log_likelihoods.sum(axis=1)
+
+    computed = sensitivity(model, gyro, z, slopes)
+    np.testing.assert_allclose(computed.values, value(np.zeros(4)), rtol=1e-12)
+    np.testing.assert_allclose(computed.gradients, slopes_by_differences(value, 4), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", slow_but(["ekf", "iekf", "ukf"], ["ekf"]))
+def test_derivatives_of_errors(kind):
+    """Errors are those of the tangent; a quaternion with a missing component does not count."""
+    model, (truth, gyro, z) = attitude_model("body" if kind == "ekf" else "world"), simulated(2, 12, 5.0)
+    counts, weights = np.ones((2, 13, 6)), np.arange(1.0, 7.0)
+    truth[1, 4, 2] = truth[1, 7, 5] = np.nan
+    counts[1, 4, :3] = counts[1, 7, 4] = 0.0
+    q, r = np.zeros((2, 6, 6)), np.zeros((2, 6, 6))
+    q[0, :3, :3], r[1] = model.process_noise_cov[:3, :3], model.measurement_noise_cov
+    filter_ = filters.make_filter(kind, model)
+
+    def value(score, e):
+        changed = model.replace(
+            process_noise_cov=model.process_noise_cov + np.tensordot(e, q, 1),
+            measurement_noise_cov=model.measurement_noise_cov + np.tensordot(e, r, 1),
+        )
+        nothing = np.zeros((0, 6, 6))
+        return state_score(changed, gyro, z, truth, nothing, nothing, score, filter=filter_).values
+
+    for score in ("squares", "log-score"):
+        computed = state_score(model, gyro, z, truth, q, r, score, filter=filter_).gradients
+        np.testing.assert_allclose(computed, slopes_by_differences(partial(value, score), 2), rtol=1e-5, atol=1e-6)
+    if kind == "ekf":
+        means = filters.run(filter_, inputs=gyro, measurements=z).means
+        errors = np.where(counts, errors_of(np.where(np.isnan(truth), means, truth), means), 0.0)
+        squares = state_score(model, gyro, z, truth, q, r, "squares", weights, filter=filter_).values
+        np.testing.assert_allclose(squares, -np.einsum("bki,i->b", errors**2, weights), rtol=1e-12)

@@ -171,15 +171,15 @@ class Traced:
         if self._jacobian is not None:
             return self._jacobian(x, *inputs)
         value = self._value(x, *inputs)
-        return np.array([_along(value, (x, unit)) for unit in np.eye(len(x))], dtype=object).T
+        return np.array([slopes_along(value, (x, unit)) for unit in np.eye(len(x))], dtype=object).T
 
     def _by_constants(self, x, scales, *arguments):
         inputs, (dc, _) = arguments[: self._input_count], arguments[self._input_count :]
-        return _along(self._value(x, *inputs), (inputs[-1], dc))
+        return slopes_along(self._value(x, *inputs), (inputs[-1], dc))
 
     def _slope(self, x, scales, *arguments):
         inputs, (dx, *moves) = arguments[: self._input_count], arguments[self._input_count :]
-        return _along(self._matrix(x, scales, *inputs), (x, dx), *((inputs[-1], dc) for dc in moves[:1]))
+        return slopes_along(self._matrix(x, scales, *inputs), (x, dx), *((inputs[-1], dc) for dc in moves[:1]))
 
     def _values_of_points(self, points, *inputs):
         return np.array([self._value(x, *inputs) for x in points.T]).T
@@ -188,7 +188,7 @@ class Traced:
         inputs, (changes, *moves) = arguments[: self._input_count], arguments[self._input_count :]
         of_constants = [(inputs[-1], dc) for dc in moves[:1]]
         pairs = zip(points.T, changes.T, strict=True)
-        return np.array([_along(self._value(x, *inputs), (x, dx), *of_constants) for x, dx in pairs]).T
+        return np.array([slopes_along(self._value(x, *inputs), (x, dx), *of_constants) for x, dx in pairs]).T
 
 
 def _graph_of(*arguments) -> Graph:
@@ -226,15 +226,17 @@ def _value_at(function: Callable, arguments: list) -> np.ndarray:
             return np.array([np.nan])
 
 
-def _along(y: np.ndarray, *moves: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """The slope of y along changes of Numbers, pairs of arrays (numbers, changes)."""
+def slopes_along(y: np.ndarray, *moves: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """The slope of y along changes of Numbers, pairs of vectors (numbers, changes)."""
     pairs = [
         (number, change) for numbers, changes in moves for number, change in zip(numbers, changes, strict=True)
     ]
     graph = pairs[0][0].graph
-    directions: dict = {number.place: graph.number(change) for number, change in pairs}
-    if len(directions) < len(pairs):
-        raise TypeError("numbers that move must differ from one another, but some are equal")
+    directions: dict = {}
+    for number, change in pairs:
+        change = graph.number(change)
+        if directions.setdefault(number.place, change) is not change:
+            raise TypeError("equal numbers must move alike, but some differ")
     directions = {position: None if change.value == 0.0 else change for position, change in directions.items()}
     slopes = along([graph.number(number) for number in y.ravel()], directions)
     return np.array([0.0 if slope is None else slope for slope in slopes], dtype=object).reshape(y.shape)
