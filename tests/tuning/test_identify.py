@@ -3,8 +3,6 @@
 import math
 import pickle
 import signal
-from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -65,33 +63,11 @@ def test_constants_and_noise_are_found_together_within_their_standard_errors(fou
 
 
 @pytest.mark.slow
-def test_an_end_at_zero_is_not_to_be_widened(found):
-    first, second = found.objective.coordinates.free[:2]
-    coordinates = SimpleNamespace(free=(replace(first, low=0.0, log=False, default=None), second))
-    ends = found._replace(
-        objective=SimpleNamespace(coordinates=coordinates),
-        values={**found.values, first.name: 0.0},
-        at_end={**found.at_end, first.name: True, second.name: True},
-    )
-    assert ends._end_sentences() == [
-        f"At zero, where the range ends: {first.name}. The data require none of them.",
-        f"At an end of the range: {second.name}. A wider one may fit better.",
-    ]
-    assert found._end_sentences() == []
-
-
-@pytest.mark.slow
 def test_standard_errors_are_the_scatter_of_estimates(found, data):
     some = [identify(recorded(8, first=100 * i), pendulum, FREE, start=TRUTH, starts=1) for i in range(1, 9)]
     for name in TRUTH:
         scatter = np.std([one.values[name] for one in some], ddof=1)
         assert 0.45 < scatter / found.standard_errors[name] < 2.0, name  # chi with 7 degrees of freedom
-
-
-@pytest.mark.slow
-def test_the_same_numbers_come_out_of_one_seed(data, found):
-    again = identify(data, pendulum, FREE, starts=3)
-    assert again.values == found.values and again.standard_errors == found.standard_errors
 
 
 def test_what_stands_in_a_product_alone_trades_off_and_is_not_determined(data):
