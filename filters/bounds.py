@@ -6,8 +6,11 @@ wrapped error of an angle is at most half a turn, so a bound on its plain error 
 
 from __future__ import annotations
 
+import hashlib
+import importlib
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache, partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +18,7 @@ import numpy as np
 from filters.engine.batch import run
 from filters.gaussian.extended import ExtendedKalmanFilter
 from thruster_env.core.checks import as_floats, at_least, correlations, covariance_root, with_progress
-from thruster_env.core.compiled import function_fingerprint, is_interpreting, sources_hash
+from thruster_env.core.compiled import function_fingerprint, is_interpreting
 from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.matrices import multiplier, quadratic_form
 from thruster_env.core.sources import Source, matrix_reader, vector_reader, vector_writer
@@ -258,6 +261,15 @@ def gathering_code(model: StateSpaceModel) -> tuple[Loops, str]:
     functions = model.functions
     fingerprint = function_fingerprint(*(function for function in functions if function is not None))
     return _gatherer(functions, model.shape, is_interpreting()), fingerprint + _sources_hash()
+
+
+def sources_hash(*packages: str) -> str:
+    """Hash of all source files of packages."""
+    digest = hashlib.sha256()
+    for package in packages:
+        for path in sorted(Path(importlib.import_module(package).__path__[0]).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 @cache

@@ -390,11 +390,6 @@ class Sum(NamedTuple):
         )
 
 
-def is_named(name: str) -> bool:
-    """Whether a text is the name of a model, or a sum of such names."""
-    return all(part.partition(":")[0].strip().lower() in NAMES for part in parts_of(name))
-
-
 def parts_of(name: str) -> list[str]:
     """The texts that a sum has between its signs; the "+" of a number such as 8.64e+04 is none."""
     return re.split(r"(?<!\d[eE])\+|\+(?!\d)", name)

@@ -17,13 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from filters.models import WITH_SETTINGS, is_named, named_model, parts_of
+from filters.models import NAMES, WITH_SETTINGS, named_model, parts_of
 from filters.plants import FINE, PLANTS
 from thruster_env.core.checks import at_least, finite, one_of, positive, short_repr
 from thruster_env.model.affine import AffineModel, affine_functions
-from thruster_env.model.continuous import AtDt, ContinuousModel
+from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.quantities import Quantity
-from thruster_env.model.state_space import StateSpaceModel
 
 AUTO = "auto"  # in place of a name: the simplest model that predicts unseen data as well as the best
 R, AXES, DT, MEAN = "R", "axes", "dt", "mean"  # settings of every model of `filters.models` beside its numbers
@@ -160,27 +159,16 @@ def model_named(text: Any) -> NamedMaker | Callable[..., ContinuousModel] | None
     return _plant(name.strip(), settings) if name.strip() in PLANTS else _maker(text)
 
 
+def is_named(name: str) -> bool:
+    """Whether a text is the name of a model, or a sum of such names."""
+    return all(part.partition(":")[0].strip().lower() in NAMES for part in parts_of(name))
+
+
 def is_model_name(text: Any) -> bool:
     """Whether something is the name of a model, perhaps with settings, and no "module:object"."""
     if not isinstance(text, str) or re.fullmatch(r"[\w.]+:[A-Za-z_][\w.]*", text):
         return False
     return text.partition(":")[0].strip() in PLANTS or is_named(text)
-
-
-def model_for_step(text: Any, dt: float | None) -> Callable[..., StateSpaceModel] | None:
-    """The function of numbers that makes the model of a name for a sample time [s]; None for another text.
-
-    Raises:
-        ValueError: for a wrong setting, or a model without a sample time.
-    """
-    maker = model_named(text)
-    if maker is None:
-        return None
-    dt = maker.dt if isinstance(maker, NamedMaker) and maker.dt is not None else dt
-    if dt is None:
-        way_out = f"{maker.name}:dt=..." if isinstance(maker, NamedMaker) else "give it by a function"
-        raise ValueError(f"a model by name must have a sample time, but {text} has no dt here: {way_out}")
-    return partial(maker if isinstance(maker, NamedMaker) else AtDt(maker), dt=dt)
 
 
 def _plant(name: str, settings: str) -> Callable[..., ContinuousModel]:

@@ -72,20 +72,6 @@ def check_same_quantities(tuned_for: Mapping, model: StateSpaceModel, dt: float 
         raise ValueError(f"{rule}, but {file} was tuned for {', '.join(differing)}")
 
 
-def check_same_model(tuned_for: Mapping, model: StateSpaceModel, dt: float | None, file: str | Path) -> None:
-    """Raise ValueError, with what differs, unless a model is the very one that a tuned file is for.
-
-    Arguments are those of `check_same_quantities`; the model has the file's Q and R.
-    """
-    check_same_quantities(tuned_for, model, dt, file)
-    model = of_one_step(model)
-    if model.digest != tuned_for["digest"]:
-        raise ValueError(
-            f"a tuned file must be for the model it is used with, but {file} was tuned for a model of digest "
-            f"{tuned_for['digest']} (here {model.digest})"
-        )
-
-
 def check_model_data(data) -> None:
     """Raise ValueError unless data are such as `model_data` makes."""
     sound = isinstance(data, dict) and set(data) == set(KEYS) and isinstance(data["digest"], str)

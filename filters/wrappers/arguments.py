@@ -12,7 +12,9 @@ import importlib
 import inspect
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from os import PathLike, fspath
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -21,20 +23,13 @@ import numpy as np
 from filters.augmented import Unknown, augmented_model
 from filters.estimators.foreign import is_foreign
 from filters.filter import Filter
-from filters.named import model_for_step
+from filters.named import NamedMaker, model_named
 from filters.registry import filter_type, make_filter
-from filters.tuned_file import (
-    AUGMENTED,
-    FACTORS,
-    NOISE,
-    PRIOR,
-    check_same_model,
-    check_same_quantities,
-    compared,
-    read_tuned_file,
-)
+from filters.tuned_file import AUGMENTED, FACTORS, NOISE, PRIOR, check_same_quantities, compared, read_tuned_file
 from thruster_env.core.checks import short_repr
 from thruster_env.env.model_env import Split
+from thruster_env.logs.log import of_one_step
+from thruster_env.model.continuous import AtDt
 from thruster_env.model.state_space import StateSpaceModel
 
 OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
@@ -42,6 +37,22 @@ APPENDED = "appended_entries"  # attribute of an env: entries of its observation
 HOOK = "measured_inputs"  # method of an env; what it returns is a `Split`, or None for an ordinary model
 
 # Where a wrapper's model comes from: the env, a factory that the caller names, or the caller.
+
+
+def model_for_step(text: Any, dt: float | None) -> Callable[..., StateSpaceModel] | None:
+    """The function of numbers that makes the model of a name for a sample time [s]; None for another text.
+
+    Raises:
+        ValueError: for a wrong setting, or a model without a sample time.
+    """
+    maker = model_named(text)
+    if maker is None:
+        return None
+    dt = maker.dt if isinstance(maker, NamedMaker) and maker.dt is not None else dt
+    if dt is None:
+        way_out = f"{maker.name}:dt=..." if isinstance(maker, NamedMaker) else "give it by a function"
+        raise ValueError(f"a model by name must have a sample time, but {text} has no dt here: {way_out}")
+    return partial(maker if isinstance(maker, NamedMaker) else AtDt(maker), dt=dt)
 
 
 def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | StateSpaceModel]:
@@ -89,6 +100,20 @@ def made_model(what: str, make: Callable, arguments: Mapping) -> StateSpaceModel
 
 
 # The filter of a tuned file, with the model of the env or of the caller.
+
+
+def check_same_model(tuned_for: Mapping, model: StateSpaceModel, dt: float | None, file: str | Path) -> None:
+    """Raise ValueError, with what differs, unless a model is the very one that a tuned file is for.
+
+    Arguments are those of `check_same_quantities`; the model has the file's Q and R.
+    """
+    check_same_quantities(tuned_for, model, dt, file)
+    model = of_one_step(model)
+    if model.digest != tuned_for["digest"]:
+        raise ValueError(
+            f"a tuned file must be for the model it is used with, but {file} was tuned for a model of digest "
+            f"{tuned_for['digest']} (here {model.digest})"
+        )
 
 
 def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:

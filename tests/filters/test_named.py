@@ -8,8 +8,9 @@ import pytest
 
 import filters
 from filters.models import NAMED, kalman_filter, named_model
-from filters.named import axes_named, is_model_name, model_for_step, model_named, text_of
+from filters.named import axes_named, is_model_name, model_named, text_of
 from filters.plants import pendulum
+from filters.wrappers.arguments import model_for_step
 
 
 @pytest.mark.parametrize(

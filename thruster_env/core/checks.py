@@ -196,15 +196,6 @@ def vector(name: str, value, size: int | None = None) -> np.ndarray:
     return array
 
 
-def without_column(value: Any) -> Any:
-    """A column (n, 1), as FilterPy and MATLAB have a mean, as (n,); any other value as it is."""
-    try:
-        array = np.asarray(value)
-    except ValueError:  # of a list of different lengths
-        return value
-    return array[:, 0] if array.ndim == 2 and array.shape[1] == 1 else value
-
-
 def covariance(
     name: str,
     value,

@@ -6,25 +6,22 @@ variable NUMBA_DISABLE_JIT=1, the same functions run as Python.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import dis
 import functools
 import hashlib
-import importlib
 import inspect
 import os
-import shutil
-import tempfile
 import threading
 import types
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from thruster_env.core.files import is_private
-from thruster_env.core.user_functions import OURS, code_text, codes_in, names_read
+import numpy as np
+
+from thruster_env.core.user_functions import OURS, codes_in, is_plain, names_read
 
 # No "nnan" and "ninf": with them isfinite and isnan are compiled away, and failures would pass unseen.
 FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
@@ -118,6 +115,51 @@ def with_callees(functions: Iterable[Callable]) -> Iterator[Callable]:
             waiting += [part for part in (*cells, *names) if isinstance(part, types.FunctionType)]
 
 
+def code_text(function: Callable) -> str:
+    """Byte code and constants of a plain function, and the values that it reads.
+
+    Functions that it calls are not followed. Compilation makes constants of values that a function reads, wherever
+    they are: a number imported from another file, an attribute of a module, a cell of its closure.
+    """
+    code = function.__code__
+    return " ".join([_byte_code(code), *(f"{name} {_plain(value)}" for name, value in values_read(function))])
+
+
+def values_read(function: Callable) -> list[tuple[str, Any]]:
+    """Names and values of all numbers, texts, tuples and arrays that a plain function reads, sorted by name."""
+    code, cells = function.__code__, function.__closure__ or ()
+    names = names_read(code)
+    captured = dict(zip(code.co_freevars, (cell.cell_contents for cell in cells), strict=True))
+    return sorted(
+        {**_values_in(captured, code.co_freevars, ""), **_values_in(function.__globals__, names, "")}.items()
+    )
+
+
+def _values_in(scope: dict, names, prefix: str, above: tuple = ()) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for name in names:
+        value = scope.get(name)
+        if isinstance(value, types.ModuleType) and value not in above:
+            values |= _values_in(vars(value), names, f"{prefix}{name}.", (*above, value))
+        elif value is not None and is_plain(value):
+            values[prefix + name] = value
+    return values
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"array {value.dtype.str} {value.shape} {value.tobytes().hex()}"
+    return f"({' '.join(map(_plain, value))})" if isinstance(value, tuple) else repr(value)
+
+
+def _byte_code(code: types.CodeType) -> str:
+    constants = [
+        _byte_code(constant) if isinstance(constant, types.CodeType) else repr(constant)
+        for constant in code.co_consts
+    ]
+    return " ".join([code.co_name, code.co_code.hex(), *constants, *code.co_names])
+
+
 def function_fingerprint(*functions: Callable) -> str:
     """Hash of the byte code of functions, of all that they call by name, and of the values that these read.
 
@@ -130,27 +172,3 @@ def function_fingerprint(*functions: Callable) -> str:
             with contextlib.suppress(OSError, TypeError):  # from a prompt: the byte code tells changes apart
                 digest.update(Path(inspect.getsourcefile(function) or "").read_bytes())
     return digest.hexdigest()
-
-
-def sources_hash(*packages: str) -> str:
-    """Hash of all source files of packages."""
-    digest = hashlib.sha256()
-    for package in packages:
-        for path in sorted(Path(importlib.import_module(package).__path__[0]).rglob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def private_folder() -> str | None:
-    """A temporary folder that no other user can write, because the code loaded from it is run."""
-    try:
-        folder = Path(tempfile.gettempdir()) / f"thruster-env-{os.getuid() if hasattr(os, 'getuid') else 'code'}"
-        try:
-            folder.mkdir(mode=0o700)
-        except FileExistsError:
-            if not is_private(folder):
-                folder = Path(tempfile.mkdtemp(prefix="thruster-env-"))  # lasts as long as the process
-                atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        return str(folder)
-    except OSError:
-        return None

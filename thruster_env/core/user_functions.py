@@ -28,37 +28,6 @@ import numpy as np
 # What a function computes, as text: its byte code, its constants and the values that it finds under its names.
 
 
-def code_text(function: Callable) -> str:
-    """Byte code and constants of a plain function, and the values that it reads.
-
-    Functions that it calls are not followed. Compilation makes constants of values that a function reads, wherever
-    they are: a number imported from another file, an attribute of a module, a cell of its closure.
-    """
-    code = function.__code__
-    return " ".join([_byte_code(code), *(f"{name} {_plain(value)}" for name, value in values_read(function))])
-
-
-def values_read(function: Callable) -> list[tuple[str, Any]]:
-    """Names and values of all numbers, texts, tuples and arrays that a plain function reads, sorted by name."""
-    code, cells = function.__code__, function.__closure__ or ()
-    names = names_read(code)
-    captured = dict(zip(code.co_freevars, (cell.cell_contents for cell in cells), strict=True))
-    return sorted(
-        {**_values_in(captured, code.co_freevars, ""), **_values_in(function.__globals__, names, "")}.items()
-    )
-
-
-def _values_in(scope: dict, names, prefix: str, above: tuple = ()) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for name in names:
-        value = scope.get(name)
-        if isinstance(value, types.ModuleType) and value not in above:
-            values |= _values_in(vars(value), names, f"{prefix}{name}.", (*above, value))
-        elif value is not None and is_plain(value):
-            values[prefix + name] = value
-    return values
-
-
 def is_plain(value: Any) -> bool:
     """Whether a value is a number, a text, an array of these, a tuple of such, or None."""
     if isinstance(value, tuple):
@@ -67,12 +36,6 @@ def is_plain(value: Any) -> bool:
     return (
         value is None or isinstance(value, plain) or (isinstance(value, np.ndarray) and not value.dtype.hasobject)
     )
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, np.ndarray):
-        return f"array {value.dtype.str} {value.shape} {value.tobytes().hex()}"
-    return f"({' '.join(map(_plain, value))})" if isinstance(value, tuple) else repr(value)
 
 
 def names_read(code: types.CodeType) -> list[str]:
@@ -86,14 +49,6 @@ def codes_in(code: types.CodeType) -> Iterator[types.CodeType]:
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
             yield from codes_in(constant)
-
-
-def _byte_code(code: types.CodeType) -> str:
-    constants = [
-        _byte_code(constant) if isinstance(constant, types.CodeType) else repr(constant)
-        for constant in code.co_consts
-    ]
-    return " ".join([code.co_name, code.co_code.hex(), *constants, *code.co_names])
 
 
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "scipy", "numba", "torch"} - {"__main__"}  # not a user's functions

@@ -7,12 +7,15 @@ compiled. The code is freed with the last object that holds its `Code`.
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import hashlib
 import itertools
 import os
+import shutil
 import struct
 import sys
+import tempfile
 import threading
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,7 +29,6 @@ import numpy as np
 from llvmlite import binding as llvm
 from llvmlite import ir
 
-from thruster_env.core.compiled import private_folder
 from thruster_env.core.files import is_private
 
 FOLDER = "thruster-env-code"  # within the folder of numba's cache or of the user's
@@ -164,6 +166,21 @@ def _compiled(text: str, unrolled: bool) -> bytes:
     finally:
         module.close()
         context.close()
+
+
+def private_folder() -> str | None:
+    """A temporary folder that no other user can write, because the code loaded from it is run."""
+    try:
+        folder = Path(tempfile.gettempdir()) / f"thruster-env-{os.getuid() if hasattr(os, 'getuid') else 'code'}"
+        try:
+            folder.mkdir(mode=0o700)
+        except FileExistsError:
+            if not is_private(folder):
+                folder = Path(tempfile.mkdtemp(prefix="thruster-env-"))  # lasts as long as the process
+                atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        return str(folder)
+    except OSError:
+        return None
 
 
 @cache

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from thruster_env.core.angles import difference
-from thruster_env.core.checks import covariance, positive, vector, without_column
+from thruster_env.core.checks import covariance, positive, vector
 from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import Source, as_value
@@ -121,6 +121,15 @@ def _by_letters(make: Callable) -> Callable[..., AffineModel]:
         return make(**arguments)
 
     return with_letters
+
+
+def without_column(value: Any) -> Any:
+    """A column (n, 1), as FilterPy and MATLAB have a mean, as (n,); any other value as it is."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # of a list of different lengths
+        return value
+    return array[:, 0] if array.ndim == 2 and array.shape[1] == 1 else value
 
 
 @_by_letters

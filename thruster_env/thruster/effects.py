@@ -5,7 +5,6 @@ None of them is in a filter's model, except the dead band of a preset.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import Field, asdict, dataclass
@@ -13,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from thruster_env.core.checks import finite, one_of, positive, short_repr, vector
+from thruster_env.core.checks import finite, positive, short_repr, vector
 from thruster_env.core.streams import PARAMETERS, REFERENCE_SIGNAL
 from thruster_env.effects.effects import (
     LONGEST,
@@ -32,7 +31,7 @@ from thruster_env.effects.effects import (
 )
 from thruster_env.graphs.draws import Draws
 from thruster_env.graphs.graphs import where
-from thruster_env.thruster.parameters import ThrusterParameters, checked
+from thruster_env.thruster.parameters import ThrusterParameters
 
 # Ambient flow U_0 along the thruster's axis [m/s]: signals that add to the constant `ambient_velocity`.
 
@@ -441,35 +440,6 @@ class LogNormal(_Distribution):
 DISTRIBUTIONS = {cls.name: cls for cls in (Uniform, LogNormal)}
 
 
-def make_uncertainty(uncertainty) -> dict[str, Uniform | LogNormal]:
-    """Distributions by parameter from None or a mapping such as {"load_gain": {"name": "uniform", ...}}.
-
-    Raises ValueError if an argument is wrong; the message states the rule and the value.
-    """
-    if uncertainty is None:
-        return {}
-    if not isinstance(uncertainty, Mapping):
-        raise ValueError(
-            f"uncertainty must be a mapping from parameters to distributions, but got {short_repr(uncertainty)}"
-        )
-    distributions = {}
-    for parameter, distribution in uncertainty.items():
-        one_of("a name in uncertainty", parameter, UNCERTAIN)
-        distributions[parameter] = distribution
-        if isinstance(distribution, (Uniform, LogNormal)):
-            continue
-        names = ", ".join(DISTRIBUTIONS)
-        rule = f"the distribution of {parameter} must be a mapping with arguments and a name out of {names}"
-        if not isinstance(distribution, Mapping) or distribution.get("name") not in tuple(DISTRIBUTIONS):
-            raise ValueError(f"{rule}, but got {short_repr(distribution)}")
-        arguments = {key: value for key, value in distribution.items() if key != "name"}
-        try:
-            distributions[parameter] = DISTRIBUTIONS[distribution["name"]](**arguments)
-        except TypeError:
-            raise ValueError(f"{rule}, but got {short_repr(distribution)}") from None
-    return distributions
-
-
 def drawn_parameters(nominal: ThrusterParameters, uncertain: Mapping, draws: Draws) -> ThrusterParameters:
     """The parameters of an episode, from its draws of step 0; of keys that are arrays, arrays.
 
@@ -485,26 +455,3 @@ def drawn_parameters(nominal: ThrusterParameters, uncertain: Mapping, draws: Dra
         for name, (distribution, numbers) in uncertain.items()
     }
     return nominal._replace(**{name: getattr(nominal, name) * factor for name, factor in factors.items()})
-
-
-def extreme_parameters(nominal: ThrusterParameters, uncertainty: Mapping) -> list[ThrusterParameters]:
-    """The nominal parameters and corners of the region they are drawn from, which bound the integration's step.
-
-    All corners for up to five uncertain parameters; of more, those with one parameter or all of them extreme.
-    """
-    names = list(uncertainty)
-    if len(names) <= 5:
-        corners = list(itertools.product(*(uncertainty[name].extremes for name in names)))
-    else:
-        ends = [uncertainty[name].extremes for name in names]
-        corners = [tuple(end[side] for end in ends) for side in (0, 1)]
-        corners += [
-            tuple(end[side] if i == k else 1.0 for i, end in enumerate(ends))
-            for k in range(len(names))
-            for side in (0, 1)
-        ]
-    scaled = (
-        {name: getattr(nominal, name) * factor for name, factor in zip(names, corner, strict=True)}
-        for corner in corners
-    )
-    return [nominal, *(checked(nominal._replace(**values)) for values in scaled if values)]

@@ -15,12 +15,14 @@ from thruster_env.env.env import PlantEnv, PlantVectorEnv
 from thruster_env.env.model_env import ModelledEnv
 from thruster_env.graphs.draws import Draws
 from thruster_env.render.renderer import MODES
-from thruster_env.thruster.analysis import state_range
+from thruster_env.thruster.analysis import equilibrium, state_range, steady_state
+from thruster_env.thruster.dynamics import Constants, thrust_and_torque
 from thruster_env.thruster.effects import Constant, drawn_parameters
 from thruster_env.thruster.equations import page_of
 from thruster_env.thruster.linear import PUBLISHED_NOISE, make_linear_plant
+from thruster_env.thruster.model import observe_jacobian
 from thruster_env.thruster.parameters import INPUTS, ThrusterParameters
-from thruster_env.thruster.plant import Plant, half_thrust, make_plant, make_task, thrust_scale
+from thruster_env.thruster.plant import Plant, make_plant, make_task, thrust_scale
 from thruster_env.thruster.rendering import ChartEntry, Renderer
 
 if TYPE_CHECKING:
@@ -29,6 +31,18 @@ if TYPE_CHECKING:
 
 
 # What every env and vector env offers to filters.
+
+
+def overlay_of(label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
+    """Overlay of a belief on a rendered thruster: the state and its thrust, each with a standard deviation."""
+    # A model may have more states, such as parameters, behind these two.
+    (omega, flow), (omega_std, flow_std) = mean[:2].tolist(), np.sqrt(np.diag(cov))[:2].tolist()
+    if not isinstance(model.constants, Constants):  # a linear plant's model
+        return Overlay(label, None, None, omega, omega_std, flow, flow_std)
+    thrust, _ = thrust_and_torque((omega, flow), model.constants)
+    slopes = np.array(observe_jacobian((omega, flow), model.constants)[0])
+    thrust_std = float(slopes @ cov @ slopes) ** 0.5
+    return Overlay(label, thrust, thrust_std, omega, omega_std, flow, flow_std)
 
 
 class ModelledThruster(ModelledEnv):
@@ -51,8 +65,6 @@ class ModelledThruster(ModelledEnv):
 
     def overlay(self, label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
         """The belief that a rendered thruster shows beside the truth."""
-        from thruster_env.thruster.model import overlay_of
-
         return overlay_of(label, model, mean, cov)
 
 
@@ -80,6 +92,13 @@ def renderer_of(
 
 
 # `BowThruster-v0`: voltage in, noisy thrust out, the state hidden.
+
+
+def half_thrust(plant: Plant) -> float:
+    """Steady thrust at half of max_voltage [N]: the reference where no other one is given."""
+    if plant.linear is None:
+        return steady_state(plant.parameters, plant.max_voltage / 2).thrust
+    return float(equilibrium(plant.linear, (plant.max_voltage / 2, 0.0))[2])
 
 
 class BowThrusterEnv(ModelledThruster, PlantEnv):

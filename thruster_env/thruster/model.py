@@ -55,7 +55,6 @@ from thruster_env.thruster.parameters import (
     read_preset,
 )
 from thruster_env.thruster.plant import Plant, make_plant
-from thruster_env.thruster.rendering import Overlay
 
 
 def transition(x, u, c):
@@ -187,18 +186,6 @@ def thrust_of(x, c):
 
 
 MODEL_ARGUMENTS = tuple(inspect.signature(model_of_plant).parameters)[1:]
-
-
-def overlay_of(label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
-    """Overlay of a belief on a rendered thruster: the state and its thrust, each with a standard deviation."""
-    # A model may have more states, such as parameters, behind these two.
-    (omega, flow), (omega_std, flow_std) = mean[:2].tolist(), np.sqrt(np.diag(cov))[:2].tolist()
-    if not isinstance(model.constants, Constants):  # a linear plant's model
-        return Overlay(label, None, None, omega, omega_std, flow, flow_std)
-    thrust, _ = thrust_and_torque((omega, flow), model.constants)
-    slopes = np.array(observe_jacobian((omega, flow), model.constants)[0])
-    thrust_std = float(slopes @ cov @ slopes) ** 0.5
-    return Overlay(label, thrust, thrust_std, omega, omega_std, flow, flow_std)
 
 
 def _linear_model(plant: Plant, linear: LinearModel) -> StateSpaceModel:

@@ -382,13 +382,6 @@ def read_preset(path: str | Path) -> PresetFile:
         raise ValueError(f"{error} (in {path})") from None
 
 
-def preset_mapping(path: str | Path) -> dict[str, Any]:
-    """The thruster in a preset file, as a mapping that `make_plant` takes as its preset."""
-    read = read_preset(path)
-    band = {} if read.dead_band == (0.0, 0.0) else {"dead_band": list(read.dead_band)}
-    return {**read.parameters._asdict(), **band}
-
-
 def _checked(content: dict) -> PresetFile:
     unknown = sorted(set(content) - set(SECTIONS))
     if unknown or not all(isinstance(part, dict) for part in content.values()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from thruster_env.core.checks import (
     at_least,
     between,
     finite,
+    one_of,
     positive,
     short_repr,
     within,
@@ -37,13 +39,13 @@ from thruster_env.thruster.analysis import (
 from thruster_env.thruster.dynamics import Constants
 from thruster_env.thruster.effects import (
     AMPLIFIER_EFFECTS,
+    DISTRIBUTIONS,
     FLOW_SIGNALS,
     REFERENCE_SIGNALS,
+    UNCERTAIN,
     LogNormal,
     Uniform,
     dead_band_of,
-    extreme_parameters,
-    make_uncertainty,
 )
 from thruster_env.thruster.parameters import (
     CHANNELS,
@@ -51,6 +53,7 @@ from thruster_env.thruster.parameters import (
     MAX_CHANNELS,
     PRESETS,
     ThrusterParameters,
+    checked,
     derive_constants,
     is_file,
     preset_and_dead_band,
@@ -103,6 +106,58 @@ class Plant(NamedTuple):
     def dropping_channels(self) -> tuple[int, ...]:
         """Numbers of the channels whose measurements may be missing."""
         return dropping_channels(self.sensors)
+
+
+def make_uncertainty(uncertainty) -> dict[str, Uniform | LogNormal]:
+    """Distributions by parameter from None or a mapping such as {"load_gain": {"name": "uniform", ...}}.
+
+    Raises ValueError if an argument is wrong; the message states the rule and the value.
+    """
+    if uncertainty is None:
+        return {}
+    if not isinstance(uncertainty, Mapping):
+        raise ValueError(
+            f"uncertainty must be a mapping from parameters to distributions, but got {short_repr(uncertainty)}"
+        )
+    distributions = {}
+    for parameter, distribution in uncertainty.items():
+        one_of("a name in uncertainty", parameter, UNCERTAIN)
+        distributions[parameter] = distribution
+        if isinstance(distribution, (Uniform, LogNormal)):
+            continue
+        names = ", ".join(DISTRIBUTIONS)
+        rule = f"the distribution of {parameter} must be a mapping with arguments and a name out of {names}"
+        if not isinstance(distribution, Mapping) or distribution.get("name") not in tuple(DISTRIBUTIONS):
+            raise ValueError(f"{rule}, but got {short_repr(distribution)}")
+        arguments = {key: value for key, value in distribution.items() if key != "name"}
+        try:
+            distributions[parameter] = DISTRIBUTIONS[distribution["name"]](**arguments)
+        except TypeError:
+            raise ValueError(f"{rule}, but got {short_repr(distribution)}") from None
+    return distributions
+
+
+def extreme_parameters(nominal: ThrusterParameters, uncertainty: Mapping) -> list[ThrusterParameters]:
+    """The nominal parameters and corners of the region they are drawn from, which bound the integration's step.
+
+    All corners for up to five uncertain parameters; of more, those with one parameter or all of them extreme.
+    """
+    names = list(uncertainty)
+    if len(names) <= 5:
+        corners = list(itertools.product(*(uncertainty[name].extremes for name in names)))
+    else:
+        ends = [uncertainty[name].extremes for name in names]
+        corners = [tuple(end[side] for end in ends) for side in (0, 1)]
+        corners += [
+            tuple(end[side] if i == k else 1.0 for i, end in enumerate(ends))
+            for k in range(len(names))
+            for side in (0, 1)
+        ]
+    scaled = (
+        {name: getattr(nominal, name) * factor for name, factor in zip(names, corner, strict=True)}
+        for corner in corners
+    )
+    return [nominal, *(checked(nominal._replace(**values)) for values in scaled if values)]
 
 
 def largest_known_voltage(preset) -> float:
@@ -286,13 +341,6 @@ def thrust_scale(plant: Plant) -> float:
     if plant.linear is None:
         return steady_state(plant.parameters, plant.max_voltage).thrust
     return float(abs(equilibrium(plant.linear, (plant.max_voltage, 0.0))[2]))
-
-
-def half_thrust(plant: Plant) -> float:
-    """Steady thrust at half of max_voltage [N]: the reference where no other one is given."""
-    if plant.linear is None:
-        return steady_state(plant.parameters, plant.max_voltage / 2).thrust
-    return float(equilibrium(plant.linear, (plant.max_voltage / 2, 0.0))[2])
 
 
 def state_limits(plant: Plant) -> np.ndarray:

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,7 +31,7 @@ from thruster_env.thruster.effects import REFERENCE_SIGNALS
 from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.linear import make_linear_plant, operating_points
 from thruster_env.thruster.model import model_of_plant
-from thruster_env.thruster.parameters import CHANNELS, is_file, preset_mapping
+from thruster_env.thruster.parameters import CHANNELS, is_file, read_preset
 from thruster_env.thruster.plant import (
     DEFAULT_DT,
     DEFAULT_MAX_VOLTAGE,
@@ -112,6 +113,13 @@ class ClosedLoop(Excitation):
             out[:, k] = action[:, 0]
             report = copies.step(out[:, k])
         return out
+
+
+def preset_mapping(path: str | Path) -> dict[str, Any]:
+    """The thruster in a preset file, as a mapping that `make_plant` takes as its preset."""
+    read = read_preset(path)
+    band = {} if read.dead_band == (0.0, 0.0) else {"dead_band": list(read.dead_band)}
+    return {**read.parameters._asdict(), **band}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,16 +17,11 @@ from thruster_env.thruster.analysis import (
     steady_state,
 )
 from thruster_env.thruster.dynamics import rates, thrust_and_torque
-from thruster_env.thruster.effects import (
-    UNCERTAIN,
-    Uniform,
-    drawn_parameters,
-    extreme_parameters,
-)
+from thruster_env.thruster.effects import UNCERTAIN, Uniform, drawn_parameters
 from thruster_env.thruster.env import BowThrusterVectorEnv
 from thruster_env.thruster.equations import copies_of
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
-from thruster_env.thruster.plant import Task, make_plant
+from thruster_env.thruster.plant import Task, extreme_parameters, make_plant
 
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds
 UNIFORM, LOG_NORMAL = {"name": "uniform", "low": 0.8, "high": 1.3}, {"name": "log-normal", "std": 0.1}
