@@ -26,6 +26,7 @@ from thruster_env.core.derivatives import jacobian, runge_kutta
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.model.state_space import StateSpaceModel, takes_input
+from thruster_env.model.turns import Turn, move, runge_kutta_munthe_kaas, slope_of_rates, with_rotations
 
 # Process noise at another sample time.
 
@@ -119,13 +120,16 @@ class ContinuousModel:
     or z = h(x, u, c) + v, with the input until then.
 
     `rates(x, u, c)` takes and returns tuples, as the functions of a `StateSpaceModel`; the constants c are a
-    NamedTuple with a field `substep`, the length of a Runge-Kutta step [s], which `at` sets.
+    NamedTuple with a field `substep`, the length of a Runge-Kutta step [s], which `at` sets. If there is a
+    `Rotation` among the states, rates have its angular rate [rad/s], three numbers in the axes of its side, in the
+    place of its quaternion, and steps are Munthe-Kaas's (`thruster_env.model.turns`).
 
     Attributes:
         rates: dx/dt without noise.
         observe: h, without noise, which returns a tuple; or a function h_i(x, c), or h_i(x, u, c), of each channel
             by its symbol, which returns a number: {"position": ..., "depth": ...}.
-        densities: S, (n, n) or n numbers, in the square of each state's unit per second.
+        densities: S, (n, n) or n numbers, in the square of each state's unit per second; (t, t) of errors if there
+            are rotations, [rad^2/s] of these.
         constants: of rates and h.
         arguments: the other fields of `StateSpaceModel`: R, prior, quantities, operating point and the like; also
             `transition` and Jacobians, of a step of `substep`, if they are known.
@@ -149,7 +153,8 @@ class ContinuousModel:
         """Check what is given; raise ValueError that states the rule and the value."""
         _check_constants(self.constants)
         mean = vector("prior_mean", self.arguments.get("prior_mean", ()))
-        object.__setattr__(self, "densities", covariance("densities", self.densities, len(mean)))
+        count = len(mean) - len(self.turns)
+        object.__setattr__(self, "densities", covariance("densities", self.densities, count))
         if isinstance(self.observe, Mapping):
             channels = self.observe
             object.__setattr__(self, "observe", _joint_observation(tuple(channels.values())))
@@ -178,10 +183,10 @@ class ContinuousModel:
             "arguments": {name: getattr(model, name) for name in retained},
         }
         constants: Any = model.constants  # a NamedTuple
-        step, n = constants.substep, model.n
-        plain = cls(**arguments, densities=np.zeros((n, n)), longest=step)
+        step, t = constants.substep, model.t
+        plain = cls(**arguments, densities=np.zeros((t, t)), longest=step)
         x, u = plain.point
-        propagated, expected = (f(x, u, model.constants) for f in (runge_kutta(rates, n), model.transition))
+        propagated, expected = (f(x, u, model.constants) for f in (plain.transition, model.transition))
         if not np.allclose(propagated, expected, rtol=1e-9, atol=1e-12):
             raise ValueError(
                 f"rates must be those of the model, whose step from {short_repr(x)} leads to "
@@ -200,7 +205,7 @@ class ContinuousModel:
         if substeps is None:
             substeps = max(1, math.ceil(dt / self.longest - RATE_ROUNDING))
         substeps = at_least("substeps", substeps, 1, 10_000)
-        arguments: dict[str, Any] = {"transition": runge_kutta(self.rates, len(self.densities)), **self.arguments}
+        arguments: dict[str, Any] = {"transition": self.transition, **self.arguments}
         arguments["observe"] = self.observe
         return StateSpaceModel(
             **arguments,
@@ -217,6 +222,18 @@ class ContinuousModel:
         return noise_of_densities(self.densities, self.slope, dt)
 
     @property
+    def turns(self) -> tuple[Turn, ...]:
+        """The rotations of the state."""
+        return with_rotations(self.arguments.get("states"), self.arguments.get("turns", ()))[1]
+
+    @property
+    def transition(self) -> Callable:
+        """One step of the rates, of length c.substep [s]."""
+        if self.turns:
+            return runge_kutta_munthe_kaas(self.rates, self.turns)
+        return runge_kutta(self.rates, len(self.densities))
+
+    @property
     def point(self) -> tuple[tuple, tuple]:
         """State and input about which the rates are linearised."""
         arguments = self.arguments
@@ -228,10 +245,13 @@ class ContinuousModel:
 
     @property
     def slope(self) -> np.ndarray:
-        """A, the derivative of the rates by the state, (n, n)."""
-        x, u = self.point
-        slopes = jacobian(self.rates, None, len(x), len(x), "u, c")
-        return np.array(slopes(x, (1.0,) * len(x), u, self.constants))
+        """A, the derivative of the rates by the state, (n, n); of errors, (t, t), if there are rotations."""
+        (x, u), turns, t = self.point, self.turns, len(self.densities)
+        if not turns:
+            return np.array(jacobian(self.rates, None, t, t, "u, c")(x, (1.0,) * t, u, self.constants))
+        by_error = jacobian(lambda d, u, c: self.rates(tuple(move(x, d, turns)), u, c), None, t, t, "u, c")
+        slopes = np.array(by_error((0.0,) * t, (1.0,) * t, u, self.constants))
+        return slope_of_rates(slopes, self.rates(x, u, self.constants), turns)
 
 
 def continuous_of(offer: Any) -> ContinuousModel | None:
