@@ -21,6 +21,7 @@ from optuna.trial import TrialState
 
 import tuning.search.study
 from docs.scripts import log_ticks, subplots
+from thruster_env.core.executors import take_share
 from thruster_env.core.files import BLUE, RUST, save_figure
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.core.threads import cores
@@ -30,7 +31,6 @@ from tuning.search.space import suggest, untuned_choice
 from tuning.search.storage import open_storage, quiet_optuna
 from tuning.search.study import open_study, run_trials
 from tuning.search.trials import CONSISTENCY, NIS, measure
-from tuning.search.workers import take_share
 from tuning.thruster.scenario import find_scenario
 
 STORAGES = ("journal", "PostgreSQL")

@@ -1,5 +1,7 @@
 """`tuning.compare`: the rows of the command, as a value; and filters that are tuned first."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -43,8 +45,9 @@ def test_compare_is_the_command_in_one_call(as_json):  # noqa: F811
     assert found.filters == ("ekf", "ekf + U_0", "enkf 7", "enkf 7 + U_0")
 
 
-def test_rows_have_the_labels_of_a_mapping(comparison):
-    own = tuning.compare({"mine": "kf", "theirs": "ekf"}, SHORT, seeds=6, progress=False)
+def test_rows_have_the_labels_of_a_mapping_and_their_numbers_from_any_executor(comparison):
+    with ThreadPoolExecutor(2) as pool:
+        own = tuning.compare({"mine": "kf", "theirs": "ekf"}, SHORT, seeds=6, executor=pool, progress=False)
     mine, theirs = (
         dict(zip(one["filter"], one["score"], strict=True)) for one in (own.to_frame(), comparison.to_frame())
     )

@@ -2,6 +2,7 @@ import json
 import os
 import signal
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from filters.augmented import Unknown
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
+from thruster_env.core.executors import IN_PROCESS, task_map
 from thruster_env.model.affine import affine_model
 from tuning.cli.main import main
 from tuning.evaluation.compare import Leaderboard, Row, compare, contender, winners
@@ -131,8 +133,10 @@ def interrupt_at(label):
 
 def test_ctrl_c_keeps_the_rows_that_are_done():
     contenders = [contender(name) for name in ("ekf", "ukf", "ckf")]
-    boards, interrupted = compare(contenders, [NOMINAL] * 2, SEEDS, interrupt_at("ukf"))
-    assert interrupted and [[row.label for row in board.rows] for board in boards] == [["ekf", "ukf"]]
+    with ThreadPoolExecutor(1) as pool, task_map(pool) as elsewhere:
+        for tasks in (IN_PROCESS, elsewhere):
+            boards, interrupted = compare(contenders, [NOMINAL] * 2, SEEDS, interrupt_at("ukf"), tasks)
+            assert interrupted and [[row.label for row in board.rows] for board in boards] == [["ekf", "ukf"]]
 
 
 @pytest.fixture

@@ -70,6 +70,14 @@ def test_standard_errors_are_the_scatter_of_estimates(found, data):
         assert 0.45 < scatter / found.standard_errors[name] < 2.0, name  # chi with 7 degrees of freedom
 
 
+@pytest.mark.slow
+def test_the_same_numbers_come_from_any_executor(data, found):
+    with ThreadPoolExecutor(1) as pool, task_map(pool) as tasks:
+        again = identify(data, pendulum, FREE, starts=3, tasks=tasks)
+    assert again.values == found.values and again.standard_errors == found.standard_errors
+    assert again.optima == found.optima and again.evaluations == found.evaluations
+
+
 def test_what_stands_in_a_product_alone_trades_off_and_is_not_determined(data):
     def model(first, second, **values):
         return pendulum(**{**TRUTH, **values, "drive": first * second})

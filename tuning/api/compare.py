@@ -17,6 +17,7 @@ from filters.logs.findings import colour_of
 from filters.registry import FILTERS, filter_type
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import at_least, short_repr
+from thruster_env.core.executors import task_map
 from thruster_env.core.files import panels
 from thruster_env.core.text_tables import TITLE, Table, verbatim
 from tuning.api.evaluate import NOMINAL
@@ -27,6 +28,7 @@ from tuning.api.markers import (
     READ,
     Argument,
     Augment,
+    ExecutorOption,
     Option,
     PresetOption,
     ProblemOption,
@@ -243,6 +245,7 @@ def compare(
     ] = None,
     preset: Annotated[str | Path | None, PresetOption] = None,
     seed: Seed = 0,
+    executor: ExecutorOption = None,
     progress: Progress = None,
 ) -> FilterComparison:
     """Rank filters on problems by errors, consistency and cost, paired with the first one on the same seeds.
@@ -283,6 +286,8 @@ def compare(
             number, or numbers by name.
         preset: the problems of another thruster.
         seed: seed of all randomness; the same seed gives the same results.
+        executor: where parts run: in N processes, in those of `mpirun`, or on a Dask scheduler's workers; in this
+            process by default. In Python also any `concurrent.futures.Executor`.
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
@@ -330,8 +335,9 @@ def compare(
 
     for each in problems:
         held_out(each)  # a clear error before any filter runs
-    with row_bar(len(contenders) * len(problems), console_for(progress)) as on_row:
-        boards, interrupted = compare_all(contenders, problems, held_out, on_row)
+    total, console = len(contenders) * len(problems), console_for(progress)
+    with task_map(executor) as tasks, row_bar(total, console) as on_row:
+        boards, interrupted = compare_all(contenders, problems, held_out, on_row, tasks)
     return FilterComparison(tuple(boards), seed, interrupted, left_out | unfit, knows)
 
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from filters.registry import filter_type
 from thruster_env.core.checks import short_repr
+from thruster_env.core.executors import task_map
 from thruster_env.core.files import check_target
 from thruster_env.logs.write import check_picture
 from tuning.api.held_out import HeldOut, covariance_check, on_held_out
@@ -17,6 +18,7 @@ from tuning.api.markers import (
     OUTPUT,
     RUNS,
     WRITTEN,
+    ExecutorOption,
     FilterOption,
     ModelOption,
     Option,
@@ -52,6 +54,7 @@ def evaluate(
     preset: Annotated[str | Path | None, PresetOption] = None,
     model: Annotated[Any, ModelOption] = None,
     seed: Seed = 0,
+    executor: ExecutorOption = None,
     progress: Progress = None,
 ) -> HeldOut:
     """Run a filter on held-out seeds of a problem and compare it with its baselines.
@@ -85,6 +88,8 @@ def evaluate(
         model: the model of the logs that it was tuned on, if that is code. In Python also what makes or offers
             one.
         seed: seed of all randomness; the same seed gives the same results.
+        executor: where parts run: in N processes, in those of `mpirun`, or on a Dask scheduler's workers; in this
+            process by default. In Python also any `concurrent.futures.Executor`.
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
@@ -108,7 +113,9 @@ def evaluate(
             raise ValueError(f"{rule}, but got {choice.name!r}")
         check_target(consistency)
     name, console = OWN if is_own(tuned) else TUNED, console_for(progress)
-    evaluation = on_held_out(choice, chosen, seed, seeds, is_tuned=is_tuned, console=console, name=name)
+    with task_map(executor) as tasks:
+        options: dict[str, Any] = {"is_tuned": is_tuned, "console": console, "name": name, "tasks": tasks}
+        evaluation = on_held_out(choice, chosen, seed, seeds, **options)
     if consistency is None:
         return evaluation
     label = evaluation.name if is_tuned else GIVEN if given else evaluation.comparison.rule

@@ -15,6 +15,7 @@ from filters.consistency.report import MOST_STATES, ConsistencyReport, compariso
 from filters.estimators.foreign import label_of
 from filters.filter import Filter
 from thruster_env.core.checks import at_least
+from thruster_env.core.executors import IN_PROCESS, TaskMap
 from thruster_env.core.text_tables import Table
 from tuning.api.progress import working
 from tuning.api.result import Result, about, drawn, frame, number
@@ -330,10 +331,12 @@ def on_held_out(
     is_tuned: bool,
     console: Console,
     name: str = TUNED,
+    tasks: TaskMap = IN_PROCESS,
 ) -> HeldOut:
     """Run a choice and its baselines on held-out seeds; arguments as in `HeldOut` and `evaluate_held_out`."""
     with working(f"{label_of(choice.name)} on {seeds} seeds of {problem.name}", console):
-        return HeldOut(choice, problem, evaluate_held_out(choice, problem, seed, seeds), is_tuned, seed, name)
+        comparison = evaluate_held_out(choice, problem, seed, seeds, tasks)
+    return HeldOut(choice, problem, comparison, is_tuned, seed, name)
 
 
 def cells_of(evaluation: Evaluation) -> dict[str, float]:

@@ -12,6 +12,7 @@ import numpy as np
 from rich.text import Text
 
 from thruster_env.core.checks import finite, short_repr
+from thruster_env.core.executors import task_map
 from thruster_env.core.files import save_figure
 from thruster_env.core.text_tables import Table
 from thruster_env.logs.log import Log
@@ -24,6 +25,7 @@ from tuning.api.markers import (
     READ,
     SEARCH,
     WRITTEN,
+    ExecutorOption,
     FilterOption,
     LogsArgument,
     Option,
@@ -306,6 +308,7 @@ def identify(
     out: Annotated[str | Path | None, Option(OUTPUT, type=Path, file=WRITTEN, unset=DEFAULT_OUT)] = None,
     plot: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
     seed: Seed = 0,
+    executor: ExecutorOption = None,
     progress: Progress = None,
 ) -> Identified:
     """Find the maximum-likelihood parameters for recorded runs, and say which of them the runs determine.
@@ -347,6 +350,8 @@ def identify(
             default.
         plot: profile likelihoods, .png, .svg or .pdf.
         seed: seed of all randomness; the same seed gives the same results.
+        executor: where starts run: in N processes, in those of `mpirun`, or on a Dask scheduler's workers; in this
+            process by default. In Python also any `concurrent.futures.Executor`.
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Returns:
@@ -378,7 +383,8 @@ def identify(
 
         options: dict[str, Any] = {"filter": filter, "predicted": unseen, "starts": starts, "seed": seed}
         options |= {"degrees": degrees, "gate": gate, "progress": tell}
-        identification = identify_runs(family.data, family.model, parameters, **options)
+        with task_map(executor) as tasks:
+            identification = identify_runs(family.data, family.model, parameters, **options, tasks=tasks)
     checked = validate(identification, family.shifted(proving)) if proving else validate(identification)
     result = Identified(identification, checked, family, tuple(runs), tuple(proving))
     curves: Sequence[Profile] = ()

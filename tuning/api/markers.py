@@ -7,6 +7,7 @@ the signature, help from the docstring, and the rest from these markers in `Anno
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -84,6 +85,7 @@ class PythonOnly:
 
 
 Progress = Annotated[bool | None, PythonOnly(True)]
+ExecutorOption = Annotated[Executor | str | None, Option(RUNS, metavar="processes:N|mpi|dask:ADDRESS", type=str)]
 Seed = Annotated[int, Option(RUNS, least=0)]
 Augment = Annotated[Sequence[str] | Mapping[str, Any], Option(FILTER, metavar="NAME[:STD[:WALK]]", type=list[str])]
 FilterOption = Option(FILTER, ("--filter",), type=str, choices="filters")

@@ -11,8 +11,9 @@ from rich.console import RenderableType
 
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import short_repr
+from thruster_env.core.executors import task_map
 from thruster_env.core.text_tables import Table
-from tuning.api.markers import CodeProblem, ModelOption, PresetOption, Progress, TunedFile
+from tuning.api.markers import CodeProblem, ExecutorOption, ModelOption, PresetOption, Progress, TunedFile
 from tuning.api.problems import given_for
 from tuning.api.progress import console_for, working
 from tuning.api.result import Result
@@ -108,6 +109,7 @@ def verify(
     problem: CodeProblem = None,
     model: Annotated[Any, ModelOption] = None,
     preset: Annotated[str | Path | None, PresetOption] = None,
+    executor: ExecutorOption = None,
     progress: Progress = None,
 ) -> Verification:
     """Recompute the held-out metrics of a tuned file on its seeds, and say whether they hold.
@@ -126,12 +128,15 @@ def verify(
         model: the model of the logs that it was tuned on, if that is code. In Python also what makes or offers
             one.
         preset: the preset with which it was tuned, by default as the tuned file names it:
+        executor: where parts run: in N processes, in those of `mpirun`, or on a Dask scheduler's workers; in this
+            process by default. In Python also any `concurrent.futures.Executor`.
         progress: whether to show progress; by default only in terminals and notebooks.
 
     Raises:
         ValueError: if the file is not a complete, unchanged tuned file, or has no metrics.
     """
-    with working(f"recomputing the metrics of {tuned}", console_for(progress)):
+    console = console_for(progress)
+    with task_map(executor) as tasks, working(f"recomputing the metrics of {tuned}", console):
         problems = given_for(tuned, problem, model, preset)
         content, (choice, _, seed) = read_tuned_file(tuned), read_tuned(tuned, problems)
         held_out = content.get("held_out")
@@ -142,7 +147,7 @@ def verify(
         count, differences = 0, []
         for name, stored in held_out.items():
             scenario = problem_in(content, name, tuned, problems)
-            comparison = evaluate_held_out(choice, scenario, seed, _count(stored, tuned))
+            comparison = evaluate_held_out(choice, scenario, seed, _count(stored, tuned), tasks)
             pairs = _numbers(stored), _numbers(_as_old_as(stored, metrics(comparison)))
             names = list(dict.fromkeys([*pairs[0], *pairs[1]]))
             differing = [Difference(f"{name}: {key}", *(part.get(key) for part in pairs)) for key in names]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from filters.filter import Filter
 from filters.particles.kernels import WeightedFilter
 from filters.registry import FILTERS, filter_type, make_filter
 from thruster_env.core.checks import one_of, tell
+from thruster_env.core.executors import IN_PROCESS, TaskMap
 from tuning.evaluation.baselines import (
     GIVEN,
     NOISE,
@@ -175,6 +176,11 @@ def _studied(name: Any, problem: Problem, seed: int, trials: int, ensemble_size:
     return Known(choices[source], source if kind.has_covariance else "")
 
 
+def unchanged(problem: Problem) -> Problem:
+    """The problem itself."""
+    return problem
+
+
 class Contender(NamedTuple):
     """A filter in a comparison, which can be made for any scenario."""
 
@@ -182,7 +188,7 @@ class Contender(NamedTuple):
     choose: Callable[[Problem], Choice]
     unknown: Mapping[str, Unknown | None] = {}  # constants that it estimates, too; None for a default
     knows: str = ""  # of the plant's Q and R: one of `KNOWLEDGE`, or "tuned"
-    suit: Callable[[Problem], Problem] = lambda problem: problem  # as the filter assumes it
+    suit: Callable[[Problem], Problem] = unchanged  # as the filter assumes it
     known: Callable[[Problem], Known] | None = None  # choice and source of Q and R where the problem decides it
 
     def filter(self, scenario: Problem) -> Filter:
@@ -300,20 +306,25 @@ def contender(
         one_of("knows", knows, KNOWLEDGE)
     numbers = {key: value for key, value in numbers.items() if value is not None}
 
-    def knowing(scenario: Problem) -> Known:
-        keeps = knows is None and unknown and scenario.true is not None
-        return known("true" if keeps else knows, name, scenario, seed, trials, numbers.get("ensemble_size"))
-
-    def chosen(scenario: Problem) -> Choice:
-        choice = knowing(scenario).choice
-        return choice._replace(numbers={**choice.numbers, **numbers})
-
     unknown = unknown or {}
+    knowing = partial(_known_on, knows, name, bool(unknown), seed, trials, numbers)
     size = [str(numbers.get("ensemble_size", ensemble_sizes_of(kind).untuned))] if kind.has_ensemble else []
     options = [f"{key} {_in_words(value)}" for key, value in numbers.items() if key != "ensemble_size"]
     added = [f"+ {SYMBOLS.get(constant, constant)}" for constant in unknown]
     label = " ".join([kind.label, *size, *options, *added])
-    return Contender(label, chosen, unknown, known=knowing)
+    return Contender(label, partial(_choice_with, numbers, knowing), unknown, known=knowing)
+
+
+def _known_on(
+    knows: str | None, name: Any, augments: bool, seed: int, trials: int, numbers: Mapping, scenario: Problem
+) -> Known:
+    keeps = knows is None and augments and scenario.true is not None
+    return known("true" if keeps else knows, name, scenario, seed, trials, numbers.get("ensemble_size"))
+
+
+def _choice_with(numbers: Mapping, knowing: Callable[[Problem], Known], scenario: Problem) -> Choice:
+    choice = knowing(scenario).choice
+    return choice._replace(numbers={**choice.numbers, **numbers})
 
 
 def _in_words(value) -> str:
@@ -335,17 +346,19 @@ def compare(
     scenarios: Iterable[Problem],
     seeds: Sequence[int] | Callable[[Problem], Sequence[int]],
     on_row: Callable[[Problem, str], None] = lambda scenario, label: None,
+    tasks: TaskMap = IN_PROCESS,
 ) -> tuple[list[Leaderboard], bool]:
     """Run filters over scenarios, all on the same seeds.
 
-    Ctrl-C ends it after the running filter and keeps finished results; a second one ends it at once.
+    Ctrl-C ends it after a running filter and keeps finished results; a second one ends it at once.
 
     Args:
         contenders: the filters; the others are compared with the first one.
         scenarios: the problems of the comparison.
         seeds: at least 2, held-out ones for a comparison of tuned filters; or a function that returns the seeds of
             a problem.
-        on_row: called before each filter's run with the scenario and the filter's label.
+        on_row: called with the first scenario and filter's label that are not finished, before each is.
+        tasks: what runs each filter on each scenario.
 
     Returns:
         A leaderboard for each scenario, and whether it was interrupted.
@@ -357,49 +370,105 @@ def compare(
     labels = [contender.label for contender in contenders]
     if not labels or len(set(labels)) < len(labels):
         raise ValueError(f"a comparison must be of different filters, but got {', '.join(labels) or 'none'}")
-    boards: list[Leaderboard] = []
-    interrupted = False
+    pairs = [(contender, scenario) for scenario in scenarios for contender in contenders]
     # All filters are made before the first one runs, so that an error in the last one is raised at once.
-    teams = [(scenario, [contender.filter(scenario) for contender in contenders]) for scenario in scenarios]
+    entries = dict(tasks(entry_of, pairs))
+    chosen = {id(scenario): seeds(scenario) if callable(seeds) else seeds for _, scenario in pairs}
+    runs = [
+        (entries[index].filter, scenario, hashable(chosen[id(scenario)]), contender is contenders[0])
+        for index, (contender, scenario) in enumerate(pairs)
+    ]
+    waiting, finished, interrupted = dict(enumerate(pairs)), {}, False
     try:
         with stop_on_interrupt() as stopped:
-            for scenario, filters in teams:
-                chosen = seeds(scenario) if callable(seeds) else seeds
-                data = data_of(scenario, chosen)
-                board = Leaderboard(scenario, chosen, scenario.bound(data), [])
-                boards.append(board)
-                for contender, filter_ in zip(contenders, filters, strict=True):
+            on_row(pairs[0][1], pairs[0][0].label)
+            for index, result in tasks(measured_on, runs):
+                finished[index] = result
+                del waiting[index]
+                if stopped():
+                    raise KeyboardInterrupt
+                for contender, scenario in [*waiting.values()][:1]:
                     on_row(scenario, contender.label)
-                    row = _row(contender.label, filter_, data, board)
-                    source, note = contender.origin(scenario)
-                    board.rows.append(row._replace(knows=source, note=note, beliefs=contender.beliefs(scenario)))
-                    if stopped():
-                        raise KeyboardInterrupt
     except KeyboardInterrupt:
         interrupted = True
-    boards = [board for board in boards if board.rows]
+    finally:
+        data_and_bound.cache_clear()
+    boards: list[Leaderboard] = []
+    for index, (contender, scenario) in enumerate(pairs):
+        if index not in finished:
+            continue
+        bound = finished[index].bound
+        if bound is not None:
+            boards.append(Leaderboard(scenario, chosen[id(scenario)], bound, []))
+        if boards and boards[-1].scenario is scenario:  # the first filter, with which it is compared, is finished
+            boards[-1].rows.append(_row(contender.label, entries[index], finished[index], boards[-1]))
     if not boards:
         raise KeyboardInterrupt
     return boards, interrupted
 
 
-def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
-    runs, seconds = timed_runs(filter_, data, board.scenario.scale)
-    evaluation = with_restarts(compute_metrics(filter_, runs, data, board.scenario.scale), filter_, runs, data)
-    evaluation = evaluation._replace(time_constants=time_constants_on(filter_, board.scenario))
+class Entry(NamedTuple):
+    """A filter for a scenario, and what its row says of it."""
+
+    filter: Filter
+    knows: str
+    note: str
+    beliefs: Mapping[str | int, Unknown]
+
+
+def entry_of(contender: Contender, scenario: Problem) -> Entry:
+    """The entry of a contender."""
+    return Entry(contender.filter(scenario), *contender.origin(scenario), contender.beliefs(scenario))
+
+
+class Measured(NamedTuple):
+    """Metrics of a filter on a scenario's seeds, and the seconds that its runs took."""
+
+    evaluation: Evaluation
+    seconds: float
+    steps: int
+    bound: np.ndarray | None  # of the scenario, if it was asked for
+
+
+def hashable(seeds: Sequence[int]) -> Sequence[int]:
+    """The same seeds; a list as a tuple."""
+    return tuple(seeds) if isinstance(seeds, list) else seeds
+
+
+@lru_cache(maxsize=1)
+def data_and_bound(scenario: Problem, seeds: Sequence[int]) -> tuple[Data, np.ndarray]:
+    """Data of some seeds and the bound on them: filters of the same scenario follow one another."""
+    data = data_of(scenario, seeds)
+    return data, scenario.bound(data)
+
+
+def measured_on(filter_: Filter, scenario: Problem, seeds: Sequence[int], with_bound: bool) -> Measured:
+    """Run a filter on a scenario's seeds."""
+    data, bound = data_and_bound(scenario, seeds)
+    runs, seconds = timed_runs(filter_, data, scenario.scale)
+    evaluation = with_restarts(compute_metrics(filter_, runs, data, scenario.scale), filter_, runs, data)
+    evaluation = evaluation._replace(time_constants=time_constants_on(filter_, scenario))
+    return Measured(evaluation, seconds, data.measurements[..., 0].size, bound if with_bound else None)
+
+
+def _row(label: str, entry: Entry, result: Measured, board: Leaderboard) -> Row:
+    evaluation = result.evaluation
     first = board.rows[0].evaluation if board.rows else evaluation
-    particles = isinstance(filter_, WeightedFilter)
+    particles = isinstance(entry.filter, WeightedFilter)
     return Row(
         label=label,
-        filter_name=filter_.name,
+        filter_name=entry.filter.name,
         evaluation=evaluation,
         above_bound=np.array([part.value for part in evaluation.rmse]) / board.bound - 1.0,
         nees=evaluation.median_nees if particles else evaluation.nees.value,
         nees_is_median=particles,
-        microseconds=1e6 * seconds / data.measurements[..., 0].size,
+        microseconds=1e6 * result.seconds / result.steps,
         ratios=rmse_ratios(evaluation.mean_squares, first.mean_squares, evaluation.weights),
         score_ratio=score_ratio(evaluation, first),
         likelihood_gain=likelihood_gain(evaluation, first),
+        knows=entry.knows,
+        beliefs=entry.beliefs,
+        note=entry.note,
     )
 
 

@@ -20,6 +20,7 @@ from filters.consistency.nees import Interval
 from filters.consistency.time_constants import TimeConstants
 from filters.starts import Restarts
 from thruster_env.core.checks import with_progress
+from thruster_env.core.executors import IN_PROCESS, TaskMap
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import (
     BY_IMPORTANCE,
@@ -117,7 +118,9 @@ class Comparison(NamedTuple):
         return {name: likelihood_gain(self.tuned, evaluations[name]) for name in self.baselines}
 
 
-def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
+def evaluate_held_out(
+    choice: Choice, scenario: Problem, seed: int, count: int = HELD_OUT_SEEDS, tasks: TaskMap = IN_PROCESS
+) -> Comparison:
     """A choice and its baselines on seeds that the study never saw, with the bound on these seeds.
 
     Baselines of an ensemble filter have as many members as the choice, or more: `baseline_size`.
@@ -127,6 +130,7 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
         scenario: the problem.
         seed: of the study; its training seeds scale the scaled default.
         count: number of held-out seeds; a problem of logs has a fixed number, and ignores it.
+        tasks: what runs each of the filters.
     """
     seeds = scenario.held_out_seeds(seed, count)
     data = data_of(scenario, seeds)
@@ -141,12 +145,16 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
         "given": known.get(GIVEN),
         "noise": known.get(NOISE),
     }
-    done: list[tuple[Choice, Evaluation]] = []
-    for candidate in with_progress("filters on held-out seeds", list(choices.values())):
-        if candidate is not None and _evaluation_in(candidate, done) is None:  # baselines may be the same filter
-            done.append((candidate, evaluate(candidate.filter(scenario), data, scenario.scale)))
+    different: list[Choice] = []  # of which baselines may be the same filter
+    for candidate in choices.values():
+        if candidate is not None and _index_in(different, candidate) < 0:
+            different.append(candidate)
+    runs = [(candidate.filter(scenario), data, scenario.scale) for candidate in different]
+    with_bar = zip(with_progress("filters on held-out seeds", runs), tasks(evaluate, runs), strict=True)
+    by_index = dict(result for _, result in with_bar)
     evaluations = {
-        role: None if choice is None else _evaluation_in(choice, done) for role, choice in choices.items()
+        role: None if candidate is None else by_index[_index_in(different, candidate)]
+        for role, candidate in choices.items()
     }
     untuned, tuned = evaluations.pop("untuned"), evaluations.pop("tuned")
     assert untuned is not None and tuned is not None  # these two choices are never None
@@ -176,9 +184,9 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
     )
 
 
-def _evaluation_in(choice: Choice, done: Sequence[tuple[Choice, Evaluation]]) -> Evaluation | None:
-    """The evaluation of the same filter, if there is one."""
-    return next((evaluation for before, evaluation in done if same_filter(choice, before)), None)
+def _index_in(choices: Sequence[Choice], choice: Choice) -> int:
+    """The index of the same filter among choices; -1 if it is not among them."""
+    return next((index for index, before in enumerate(choices) if same_filter(choice, before)), -1)
 
 
 # Versions of the packages that numerical results depend on.

@@ -9,13 +9,7 @@ interval contains the variation of policies and of episodes.
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -25,9 +19,9 @@ import numpy as np
 from scipy.stats import t as student
 
 from filters.consistency.nees import Interval
+from thruster_env.core.executors import Where, task_map
 from thruster_env.core.files import write_whole
-from thruster_env.core.modules import safe_paths
-from thruster_env.core.threads import cores, one_thread
+from thruster_env.core.threads import one_thread
 from tuning.policies.environments import make_environments
 from tuning.policies.learn import train
 from tuning.policies.saved import FINAL, Policy, Scores, classical_policy, load, score
@@ -35,7 +29,7 @@ from tuning.policies.setup import Part, TrainingConfiguration, make_configuratio
 from tuning.problems.data import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.storage import quiet_optuna
-from tuning.search.study import open_study, run_study, without_interrupts
+from tuning.search.study import open_study, run_study
 from tuning.thruster.scenario import Scenario, find_scenario
 
 TASK = "manoeuvre"
@@ -202,7 +196,7 @@ class Result(NamedTuple):
 def run_comparison(
     comparison: Comparison,
     folder: str | Path,
-    jobs: int | None = None,
+    executor: Where = None,
     on_run: OnRun = lambda run, done, count: None,
 ) -> list[Result]:
     """Do all runs that the folder does not contain yet, and return all results.
@@ -212,64 +206,24 @@ def run_comparison(
     Args:
         comparison: the comparison.
         folder: folder for a file of results and a folder of the training of each run.
-        jobs: number of processes; that of the cores if None.
+        executor: as for `thruster_env.core.executors.task_map`; on other hosts they must share the folder.
         on_run: called after each run.
 
     Raises:
-        ValueError: if a file of results is damaged, or a process was killed.
+        ValueError: if a file of results is damaged, or workers die again and again.
         KeyboardInterrupt: on Ctrl-C.
     """
     folder, runs = Path(folder), runs_of(comparison)
     results = {run.name: _read(folder, run, comparison.episodes) for run in runs}
     missing = [run for run in runs if results[run.name] is None]
     done = len(runs) - len(missing)
-    context = multiprocessing.get_context("spawn")
-    workers = min(jobs or cores(), max(1, len(missing)))
-    with safe_paths():  # a process that tracks the shared counter starts here
-        pool = ProcessPoolExecutor(workers, context, _prepare, (context.Value("i", 0),))
-    try:
-        with without_interrupts(), safe_paths():
-            futures: dict[Future, Run] = {
-                pool.submit(_do, run, folder, comparison.episodes): run for run in missing
-            }
-        for future in as_completed(futures):
-            future.result()
-            run, done = futures[future], done + 1
+    with task_map(executor) as tasks:
+        for index, _ in tasks(_do, [(run, folder, comparison.episodes) for run in missing]):
+            run, done = missing[index], done + 1
             results[run.name] = _read(folder, run, comparison.episodes)
             on_run(run, done, len(runs))
-    except BrokenProcessPool:
-        raise ValueError(
-            "processes must live until their runs are done, but one was killed: the same call continues"
-        ) from None
-    except BaseException:
-        for process in list((pool._processes or {}).values()):
-            process.terminate()
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
     in_order = (results[run.name] for run in runs)
     return [result for result in in_order if result is not None]  # all are there now
-
-
-def _prepare(counter) -> None:
-    """Give a process one core, leave Ctrl-C to its parent, and end it when the parent has ended.
-
-    Otherwise it would continue its run, and the next call would start the same run in the same folder.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    with counter.get_lock():
-        core, counter.value = counter.value, counter.value + 1
-    if hasattr(os, "sched_setaffinity"):
-        available = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {available[core % len(available)]})
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-    os._exit(1)
 
 
 def _do(run: Run, folder: Path, episodes: int) -> None:

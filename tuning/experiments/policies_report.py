@@ -18,7 +18,7 @@ from filters.consistency.nees import Interval
 from filters.logs.findings import colour_of
 from thruster_env.core.files import DARK, check_target, new_figure, save_figure, tidy, write_whole
 from thruster_env.core.text_tables import Table, markdown_table, with_tables
-from tuning.api.markers import OUTPUT, RUNS, Option
+from tuning.api.markers import OUTPUT, RUNS, ExecutorOption, Option
 from tuning.api.result import Printed
 from tuning.cli.output import progress_of
 from tuning.experiments.policies import (
@@ -419,7 +419,7 @@ def reproduce(
     seeds: Annotated[int | None, Option(RUNS, least=1, most=1000)] = None,
     steps: Annotated[int | None, Option(RUNS, least=1, most=10**12)] = None,
     recurrent: Annotated[bool, Option(RUNS)] = False,
-    jobs: Annotated[int | None, Option(RUNS, least=1, most=1000)] = None,
+    executor: ExecutorOption = "processes",
     out: Annotated[Path, Option(OUTPUT)] = FOLDER,
     page: Annotated[Path | None, Option(OUTPUT, metavar="FILE.md")] = None,
 ) -> Printed:
@@ -436,7 +436,8 @@ def reproduce(
         seeds: training seeds of each learned policy; 5 by default.
         steps: training steps of each policy; by default those of `thruster train`.
         recurrent: also PPO with an LSTM on raw measurements: many hours.
-        jobs: number of processes; as many as cores.
+        executor: where policies are trained: in N processes (as many as cores), in those of `mpirun`, or on a Dask
+            scheduler's workers, which must share the folder.
         out: folder of results; existing ones are not recomputed.
         page: page whose tables are rewritten, with the pictures beside it.
     """
@@ -446,7 +447,7 @@ def reproduce(
     target = page or out / PAGE
     check_page(target)
     with progress_of("policies", out) as progress:
-        results = run_comparison(comparison, out, jobs, lambda run, *counts: progress(run.name, *counts))
+        results = run_comparison(comparison, out, executor, lambda run, *counts: progress(run.name, *counts))
     written = write_report(results, comparison, target, rough=quick)
     rows = {noise: rows_of(results, noise) for noise in comparison.noises}
     conclusions, files = answers(results), [str(path) for path in written]

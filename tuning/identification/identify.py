@@ -15,6 +15,7 @@ import numpy as np
 from filters.adaptive import RobustExtendedKalmanFilter
 from filters.starts import Starts
 from thruster_env.core.checks import at_least, short_repr
+from thruster_env.core.executors import IN_PROCESS, TaskMap
 from thruster_env.core.streams import START_POINTS, derived_generator
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
@@ -149,6 +150,7 @@ def identify(
     simulation_first: bool = True,
     against: bool = True,
     progress: Progress | None = None,
+    tasks: TaskMap = IN_PROCESS,
 ) -> Identification:
     """Find the values of free parameters under which a filter's innovations are most likely.
 
@@ -188,7 +190,9 @@ def identify(
         simulation_first: see above.
         against: whether each parameter is tested against leaving it out (`null_tests.null_tests`), and the search
             begins once more without effects that may be zero.
-        progress: called with the number of the start, the log-likelihood and the values, after every rise.
+        progress: called with the number of the start, the log-likelihood and the values, after every rise, of
+            starts that run elsewhere at their end.
+        tasks: what runs each start.
 
     Returns:
         `Identification`. After Ctrl-C, the best so far, with `interrupted`.
@@ -214,17 +218,21 @@ def identify(
                 progress(number, evaluation.value, coordinates.named(at))
 
         objective = _with_starts(objective, first, simulation_first, asked, tell)
-        ascents = []
-        for number, point in enumerate(points):
-            points[number] = point = _finite_start(objective, point, first)
-            tell_of = partial(tell, number=number)
-            ascents.append(_climb_from(objective, point, simulation_first, asked, tell_of))
+        from_one = from_start if tasks.is_remote else partial(from_start, stop=asked, tell=tell)
+        ends: dict[int, tuple[np.ndarray, Ascent]] = {}
+        begins = [(objective, number, point, first, simulation_first) for number, point in enumerate(points)]
+        for number, (point, ascent, evaluations) in tasks(from_one, begins):
+            ends[number] = point, ascent
+            if tasks.is_remote:
+                objective.evaluations += evaluations
+                tell(ascent.at, ascent.found, number)
             if asked():
                 break
+        ascents = [ends[number][1] for number in sorted(ends)]
         if not any(math.isfinite(ascent.found.value) for ascent in ascents):
             raise ValueError(
                 "the filter must stay finite on all runs from at least one start, but it does from none of "
-                f"{short_repr([coordinates.named(point) for point in points[: len(ascents)]])}"
+                f"{short_repr([coordinates.named(ends[number][0]) for number in sorted(ends)])}"
             )
         optima = tuple(
             Optimum(
@@ -234,7 +242,7 @@ def identify(
                 ascent.iterations,
                 ascent.converged,
             )
-            for point, ascent in zip(points, ascents, strict=False)
+            for point, ascent in (ends[number] for number in sorted(ends))
         )
         plain = from_nothing(objective, first, asked, tell) if against and not asked() else None
         best = max([*ascents, *([] if plain is None else [plain])], key=lambda ascent: ascent.found.value)
@@ -313,6 +321,22 @@ def _gated(objective: Objective, best: Ascent, gate: float, stop, tell) -> tuple
         spent += objective.evaluations
     objective.evaluations = spent
     return objective, best
+
+
+def from_start(
+    objective: Objective,
+    number: int,
+    point: np.ndarray,
+    first: np.ndarray,
+    simulation_first: bool,
+    stop: Callable[[], bool] = lambda: False,
+    tell: Callable[..., None] = lambda *_, **__: None,
+) -> tuple[np.ndarray, Ascent, int]:
+    """The start as it was used, the end of the search from it, and the number of evaluations."""
+    before = objective.evaluations
+    point = _finite_start(objective, point, first)
+    ascent = _climb_from(objective, point, simulation_first, stop, partial(tell, number=number))
+    return point, ascent, objective.evaluations - before
 
 
 def _climb_from(objective: Objective, point, simulation_first: bool, stop, tell) -> Ascent:

@@ -117,10 +117,17 @@ class Objective:
 
     def with_changes(self, **changes) -> Objective:
         """The same with other data, filter, degrees, simulation, starts or gate."""
-        names = "filter", "degrees", "predicted", "simulation", "starts", "gate"
-        settings = {name: getattr(self, name) for name in names}
         data = changes.pop("data", self.data)
-        return Objective(data, self._model, self.coordinates, **{**settings, **changes})
+        return Objective(data, self._model, self.coordinates, **{**self._settings, **changes})
+
+    def __reduce__(self) -> tuple[Callable[..., Objective], tuple]:
+        """Copy it by its arguments: what follows from them is computed anew where they arrive."""
+        return partial(Objective, **self._settings), (self.data, self._model, self.coordinates)
+
+    @property
+    def _settings(self) -> dict[str, Any]:
+        names = "filter", "degrees", "predicted", "simulation", "starts", "gate"
+        return {name: getattr(self, name) for name in names}
 
     def model_at(self, at: np.ndarray) -> StateSpaceModel:
         """The model at coordinates, as the filter runs on it."""

@@ -71,22 +71,6 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-@contextmanager
-def without_interrupts() -> Iterator[None]:
-    """Within this context Ctrl-C waits, and new processes ignore it: their parent ends them.
-
-    Otherwise they would receive it while they load packages, and each would print a traceback.
-    """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 class StudyResult(NamedTuple):
     """The result of a study, before held-out evaluation."""
 

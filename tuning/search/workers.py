@@ -23,8 +23,8 @@ from typing import Any
 
 import optuna
 
+from thruster_env.core.executors import take_share, without_interrupts
 from thruster_env.core.modules import working_folder_last
-from thruster_env.core.threads import cores
 from tuning.problems.assumed import within
 from tuning.problems.data import Data
 from tuning.problems.find import find_same
@@ -38,7 +38,6 @@ from tuning.search.study import (
     open_study,
     run_trials,
     stop_on_interrupt,
-    without_interrupts,
 )
 
 MODULE = "tuning.search.workers"
@@ -205,15 +204,6 @@ def _watch(
 def _cause(process: subprocess.Popen) -> str:
     code = process.returncode
     return f"signal {-code}" if code < 0 else f"exit code {code}"
-
-
-def take_share(workers: int) -> None:
-    """Let this process use the number of threads that is its share of the cores; it may run on any core."""
-    if hasattr(os, "sched_setaffinity"):
-        allowed = os.sched_getaffinity(0)
-        os.sched_setaffinity(0, sorted(allowed)[: max(1, len(allowed) // workers)])
-        cores()  # is cached
-        os.sched_setaffinity(0, allowed)
 
 
 def main() -> None:

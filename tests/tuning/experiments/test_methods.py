@@ -2,6 +2,7 @@
 
 import json
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -78,7 +79,8 @@ def test_all_methods_have_equal_data_and_starts_and_held_out_runs_are_others():
 
 def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     few = FAST._replace(methods=("likelihood", "noise-estimation"), sets=2)
-    first = run_protocol(few, tmp_path)
+    with ThreadPoolExecutor(1) as pool:
+        first = run_protocol(few, tmp_path, pool)
     assert len(first) == len(list(jobs_of(few))) == 1 + 2 * 2 * 2
     monkeypatch.setattr(runs, "run_method", None)
     again = run_protocol(few, tmp_path)

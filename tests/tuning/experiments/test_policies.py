@@ -167,18 +167,18 @@ def test_what_is_done_is_kept_after_an_interruption_and_done_once(tmp_path, monk
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_comparison(comparison, tmp_path, 1, interrupt)
+        run_comparison(comparison, tmp_path, None, interrupt)
     (kept,) = tmp_path.glob("runs/*.json")
     written = kept.read_bytes(), kept.stat().st_mtime_ns
     seen = []
-    results = run_comparison(comparison, tmp_path, 1, lambda run, done, count: seen.append((run.name, done)))
+    results = run_comparison(comparison, tmp_path, None, lambda run, done, count: seen.append((run.name, done)))
     assert [found.run for found in results] == planned and len(seen) == 1 and seen[0][1] == 2
     assert (kept.read_bytes(), kept.stat().st_mtime_ns) == written
     assert all(len(found.scores.returns) == 2 and found.curve for found in results)
-    run_comparison(comparison, tmp_path, 1, lambda run, done, count: pytest.fail("nothing is left to do"))
+    run_comparison(comparison, tmp_path, None, lambda run, done, count: pytest.fail("nothing is left to do"))
     kept.write_text(kept.read_text()[:100])
     with pytest.raises(ValueError, match=r"json must be a whole file of results, but cannot be read"):
-        run_comparison(comparison, tmp_path, 1)
+        run_comparison(comparison, tmp_path)
 
 
 @pytest.mark.slow

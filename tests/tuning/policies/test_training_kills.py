@@ -1,7 +1,6 @@
 """What a training that was killed leaves behind is cleared away or put back, and it goes on."""
 # ruff: noqa: F811 - fixtures come by import and go by name
 
-import multiprocessing
 import os
 import shutil
 
@@ -12,7 +11,6 @@ pytest.importorskip("sb3_contrib")
 
 from tests.fuzz.checkpoints import kill_training
 from tests.learners import contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures
-from tuning.experiments import policies as comparison
 from tuning.policies.learn import mend
 from tuning.policies.saved import BEST, CHECKPOINTS, SETUP
 
@@ -56,16 +54,6 @@ def test_an_end_while_evaluations_are_written_leaves_those_of_before(copied, mon
         learn(longer, copied)
     assert (copied / "evaluations.npz").read_bytes() == before
     assert learn(longer, copied).steps == 512
-
-
-def test_a_process_of_a_comparison_ends_with_its_parent(monkeypatch):
-    ended = []
-    monkeypatch.setattr(os, "_exit", ended.append)
-    parent = multiprocessing.get_context("spawn").Process(target=int)
-    parent.start()
-    monkeypatch.setattr(multiprocessing, "parent_process", lambda: parent)
-    comparison._end_with_parent()
-    assert ended == [1] and parent.exitcode == 0
 
 
 @pytest.mark.slow

@@ -11,16 +11,15 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import suppress
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from filters.consistency.nees import Interval
+from thruster_env.core.executors import Where, task_map
 from thruster_env.core.files import write_whole
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.evaluate import compute_metrics
@@ -280,7 +279,10 @@ def jobs_of(protocol: Protocol) -> Iterator[tuple[Case, str, int]]:
 
 
 def run_protocol(
-    protocol: Protocol, folder: Path, jobs: int = 1, on_result: OnResult = lambda text, done, count: None
+    protocol: Protocol,
+    folder: Path,
+    executor: Where = None,
+    on_result: OnResult = lambda text, done, count: None,
 ) -> list[Result]:
     """Do what no file in the folder is there of, and return all results.
 
@@ -289,7 +291,7 @@ def run_protocol(
     Args:
         protocol: how much is done.
         folder: for a file a result.
-        jobs: processes.
+        executor: as for `thruster_env.core.executors.task_map`.
         on_result: called after each result.
 
     Raises:
@@ -299,24 +301,14 @@ def run_protocol(
     missing = [job for job in wanted if not file_of(folder, *job, protocol).is_file()]
     done = len(wanted) - len(missing)
     on_result("", done, len(wanted))
-    if jobs == 1:
-        for job in missing:
-            done += 1
-            if not file_of(folder, *job, protocol).is_file():
-                _one(*job, protocol, folder)
-            on_result(f"{job[0].name}, {job[1]}", done, len(wanted))
-    elif missing:
-        with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-            waiting = {pool.submit(_one, *job, protocol, folder): job for job in missing}
-            try:
-                for future in as_completed(waiting):
-                    future.result()
-                    done += 1
-                    case, method, _ = waiting[future]
-                    on_result(f"{case.name}, {method}", done, len(wanted))
-            except KeyboardInterrupt:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
+    with task_map(executor) as tasks:
+        for index, content in tasks(content_of, [(*job, protocol, folder) for job in missing]):
+            done, (case, method, _) = done + 1, missing[index]
+            file = file_of(folder, *missing[index], protocol)
+            if content is not None:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                write_whole(file, json.dumps(content, indent=1))
+            on_result(f"{case.name}, {method}", done, len(wanted))
     return read(folder, protocol)
 
 
@@ -338,14 +330,14 @@ def file_of(folder: Path, case: Case, method: str, set_index: int, protocol: Pro
     return folder / plain(case.name) / f"{plain(method.removesuffix(ONLY))}-{set_index}-{budget}.json"
 
 
-def _one(case: Case, method: str, set_index: int, protocol: Protocol, folder: Path) -> None:
+def content_of(case: Case, method: str, set_index: int, protocol: Protocol, folder: Path) -> dict[str, Any] | None:
+    """The content of a result's file; None if another host has written it meanwhile."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    file = file_of(folder, case, method, set_index, protocol)
-    if file.is_file():  # of another host, meanwhile
-        return
-    result = reference(case, protocol) if method == REFERENCE else run_method(case, method, set_index, protocol)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(file, json.dumps(_as_data(result), indent=1))
+    if file_of(folder, case, method, set_index, protocol).is_file():
+        return None
+    return _as_data(
+        reference(case, protocol) if method == REFERENCE else run_method(case, method, set_index, protocol)
+    )
 
 
 def _as_data(result: Result) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from thruster_env.core.files import new_figure, save_figure, tidy, write_whole
 from thruster_env.core.text_tables import markdown_table, with_tables
-from tuning.api.markers import OUTPUT, Option
+from tuning.api.markers import OUTPUT, ExecutorOption, Option
 from tuning.api.markers import RUNS as RUNS_PANEL
 from tuning.api.result import Printed
 from tuning.cli.output import progress_of
@@ -261,7 +261,7 @@ def reproduce(
     seconds: Annotated[float | None, Option(RUNS_PANEL, least=0.1, most=1e4)] = None,
     many: Annotated[int | None, Option(RUNS_PANEL, least=10, most=10**5)] = None,
     starts: Annotated[int | None, Option(RUNS_PANEL, least=1, most=100)] = None,
-    jobs: Annotated[int, Option(RUNS_PANEL, least=1, most=1000)] = 1,
+    executor: ExecutorOption = None,
     quick: Annotated[bool, Option(RUNS_PANEL)] = False,
     out: Annotated[Path, Option(OUTPUT)] = FOLDER,
     page: Annotated[Path | None, Option(OUTPUT, metavar="FILE.md")] = None,
@@ -282,7 +282,8 @@ def reproduce(
         seconds: seconds of one core; 100.
         many: runs of the reference; 2000.
         starts: starts of the reference; 20.
-        jobs: processes.
+        executor: where results are computed: in N processes, in those of `mpirun`, or on the workers of a Dask
+            scheduler; in this process by default.
         quick: a test run without meaningful results.
         out: folder of results, which several hosts may share; existing ones are not recomputed.
         page: page whose tables are rewritten, with the picture beside it.
@@ -294,7 +295,7 @@ def reproduce(
     protocol = protocol._replace(**{name: value for name, value in changes.items() if value is not None})
     text = None if page is None else page.read_text(encoding="utf-8")
     with progress_of("methods", out) as progress:
-        results = run_protocol(protocol, out, jobs, progress)
+        results = run_protocol(protocol, out, executor, progress)
     makers = tables(results, protocol)
     picture, written = "methods_groups.png", []
     if page is None or text is None or picture in text:

@@ -1,0 +1,221 @@
+"""Independent tasks on any `concurrent.futures.Executor`: in other processes, or on other hosts.
+
+A task is a function that has a name and arguments that can be pickled, so that every executor carries it, and
+gives the same result wherever it runs. If workers die, the tasks that they had are run again.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from typing import Any
+
+from thruster_env.core.checks import at_least, short_repr
+from thruster_env.core.modules import safe_paths, to_install, working_folder_last
+from thruster_env.core.threads import cores
+
+MOST_PROCESSES = 1000
+MOST_LOSSES = 3  # of workers, one after the other, without a finished task
+FORMS = "processes:N, mpi or dask:ADDRESS"
+Where = Executor | str | None  # of tasks: an executor, one of `FORMS`, or None for this process
+
+
+class TaskMap:
+    """Runs tasks on an executor, made by `task_map`."""
+
+    def __init__(self, where: Where) -> None:
+        """Take an executor, or one of `FORMS`, which is opened by the first tasks."""
+        self._open = opener_of(where) if isinstance(where, str) else None
+        self._executor = None if isinstance(where, str) else where
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether tasks run elsewhere than in this thread."""
+        return self._open is not None or self._executor is not None
+
+    def __call__(self, function: Callable[..., Any], tasks: Iterable[tuple]) -> Iterator[tuple[int, Any]]:
+        """Yield (index, function(*task)) of each task, as soon as it is finished; in order in this process.
+
+        If the caller stops to iterate, for instance after Ctrl-C, tasks that have not begun are cancelled.
+
+        Args:
+            function: a function of a module, or a `functools.partial` of one.
+            tasks: the arguments of each call.
+
+        Raises:
+            ValueError: if a task cannot be pickled, or workers die again and again.
+        """
+        left, losses = dict(enumerate(tasks)), 0
+        while left and self.is_remote:
+            try:
+                for index, result in self._finished(function, left):
+                    del left[index]
+                    losses = 0
+                    yield index, result
+            except BrokenExecutor as error:
+                losses += 1
+                self.close()
+                if losses == MOST_LOSSES:
+                    rule = "workers must live until their tasks are done, but died"
+                    raise ValueError(f"{rule} {losses} times without finishing one: {error}") from None
+                again = "again" if self._open else "in this process"
+                warnings.warn(f"a worker has died: {len(left)} tasks are run {again}", stacklevel=3)
+        for index in list(left):
+            yield index, function(*left.pop(index))
+
+    def _finished(self, function: Callable[..., Any], tasks: dict[int, tuple]) -> Iterator[tuple[int, Any]]:
+        packed = {index: packed_task(function, task) for index, task in tasks.items()}
+        futures: dict[Future, int] = {}
+        try:
+            with without_interrupts(), safe_paths():
+                if self._executor is None:
+                    assert self._open is not None  # or nothing would be remote
+                    self._executor = self._open()
+                for index, content in packed.items():
+                    futures[self._executor.submit(run_packed, content)] = index
+            for future in as_completed(list(futures)):
+                yield futures.pop(future), future.result()
+        finally:
+            for future in futures:
+                future.cancel()
+
+    def close(self) -> None:
+        """End an executor that was opened here, at once: nobody waits for a task that is left."""
+        executor, self._executor = self._executor, None
+        if executor is None or self._open is None:
+            return
+        processes = executor._processes if isinstance(executor, ProcessPoolExecutor) else {}
+        for process in list((processes or {}).values()):
+            process.terminate()
+        executor.shutdown(wait=bool(processes))
+
+
+@contextmanager
+def task_map(where: Where = None) -> Iterator[TaskMap]:
+    """Within this context run tasks on an executor.
+
+        with task_map("processes:4") as tasks:
+            for index, result in tasks(function, [(1.0,), (2.0,)]): ...
+
+    Args:
+        where: an executor, which stays open; "processes:N", N processes of this host; "processes", one for each
+            core; "mpi", the processes of `mpirun -n N python -m mpi4py.futures`; "dask:ADDRESS", the workers of a
+            Dask scheduler; None for this process.
+
+    Raises:
+        ValueError: for anything else, or if the package of an executor is not installed.
+    """
+    if not (where is None or isinstance(where, str | Executor)):
+        raise ValueError(
+            f"executor must be {FORMS}, or a concurrent.futures.Executor, but got {short_repr(where)}"
+        )
+    tasks = TaskMap(where)
+    try:
+        yield tasks
+    finally:
+        tasks.close()
+
+
+IN_PROCESS = TaskMap(None)
+
+
+def packed_task(function: Callable[..., Any], task: tuple) -> bytes:
+    """A function and its arguments as bytes; ValueError if these hold something without a name."""
+    try:
+        return pickle.dumps((function, task))
+    except Exception as error:  # a function within a function, or what a class of the user's raises
+        rule = "models and problems must be made of named functions for an executor"
+        raise ValueError(f"{rule}, but cannot be pickled: {error}") from None
+
+
+def run_packed(content: bytes) -> Any:
+    """The result of a packed task; the user's modules may lie in the working folder."""
+    with working_folder_last():
+        function, task = pickle.loads(content)
+        return function(*task)
+
+
+# Executors by name.
+
+
+def opener_of(name: str) -> Callable[[], Executor]:
+    """What opens the executor of this name; ValueError if it is none of `FORMS`."""
+    kind, _, rest = name.partition(":")
+    if kind == "processes":
+        rule = "executor (--executor) processes"
+        count = cores() if name == kind else at_least(rule, rest, 1, MOST_PROCESSES)
+        return lambda: ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), prepare_process, (count,))
+    if name == "mpi":
+        return _mpi
+    if kind == "dask" and rest:
+        return lambda: _dask(rest)
+    raise ValueError(f"executor (--executor) must be {FORMS}, but got {name!r}")
+
+
+def _mpi() -> Executor:
+    try:
+        from mpi4py.futures import MPIPoolExecutor
+    except ImportError as error:
+        raise ValueError(f"mpi must have mpi4py and an MPI, but {error}: {to_install('cluster')}") from None
+    return MPIPoolExecutor()
+
+
+def _dask(address: str) -> Executor:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise ValueError(f"dask must have distributed, which is not installed: {to_install('cluster')}") from None
+    try:
+        client = Client(address, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"dask must have a scheduler that answers, but {address} does not: {error}") from None
+    return client.get_executor()
+
+
+# Processes of this host.
+
+
+def prepare_process(count: int) -> None:
+    """Prepare one of `count` processes: it leaves Ctrl-C to its parent, and ends when that has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    take_share(count)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+    os._exit(1)
+
+
+def take_share(workers: int) -> None:
+    """Let this process use the number of threads that is its share of the cores; it may run on any core."""
+    if hasattr(os, "sched_setaffinity"):
+        allowed = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, sorted(allowed)[: max(1, len(allowed) // workers)])
+        cores()  # is cached
+        os.sched_setaffinity(0, allowed)
+
+
+@contextmanager
+def without_interrupts() -> Iterator[None]:
+    """Within this context Ctrl-C waits, and new processes ignore it: their parent ends them.
+
+    Otherwise they would receive it while they load packages, and each would print a traceback.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
