@@ -142,7 +142,7 @@ def _constants(*values: float) -> Any:
     return _form(len(values) - 1)(*values)
 
 
-def model_named(text: Any) -> NamedMaker | Callable[..., ContinuousModel] | None:
+def model_named(text: Any) -> NamedMaker | Callable[..., Any] | None:
     """What makes the model of NAME[:KEY=VALUE,...]; None for a text that is no such name.
 
     Args:
@@ -171,7 +171,7 @@ def is_model_name(text: Any) -> bool:
     return text.partition(":")[0].strip() in PLANTS or is_named(text)
 
 
-def _plant(name: str, settings: str) -> Callable[..., ContinuousModel]:
+def _plant(name: str, settings: str) -> Callable[..., Any]:
     """A function of `filters.plants`, with some of its arguments."""
     make = PLANTS[name]
     known = {

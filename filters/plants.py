@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from filters.attitude import attitude
 from thruster_env.core.checks import one_of, positive, short_repr
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.model.continuous import ContinuousModel
@@ -479,7 +480,9 @@ def battery(
     )
 
 
-PLANTS: Mapping[str, Callable[..., ContinuousModel]] = {
+# Functions of numbers that make a model in continuous time, or one of a sample time dt.
+PLANTS: Mapping[str, Callable[..., Any]] = {
+    "attitude": attitude,
     "coordinated-turn": coordinated_turn,
     "unicycle": unicycle,
     "bicycle": bicycle,

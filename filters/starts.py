@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from filters.gaussian.multiple_models import MultipleModelFilter
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import as_floats
 from thruster_env.core.sources import as_value
+from thruster_env.model import rotations, turns
 from thruster_env.model.shape import number_offsets, observation_slopes, transition_slopes
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -24,6 +26,7 @@ PRIOR, MEASUREMENT = "prior", "measurement"
 STARTS = (PRIOR, MEASUREMENT)  # where recorded runs may begin
 WIDE = 10.0  # standard deviations of the prior, of which a free start has one
 FAINT = 1e-6  # part of the strongest direction, below which a direction is not seen
+STEPS, DAMPINGS, MOST_STARTS = 30, 1e9, 4  # of Gauss and Newton, at most, the most damping, and starts
 
 
 # Restarts from the prior, in words: how many, the first step and state, and the likely cause.
@@ -394,3 +397,82 @@ def cov_of_measured_starts(model: StateSpaceModel, first: np.ndarray) -> np.ndar
     unseen = np.eye(model.n) - observed
     cov = observed @ (wide_cov(model, reach) / scaling) @ observed + unseen @ (model.prior_cov / scaling) @ unseen
     return (cov + cov.T) / 2 * scaling
+
+
+def first_measured(measurements: np.ndarray) -> np.ndarray:
+    """The first value (B, m) of each channel of measurements (B, K + 1, m); NaN where there is none."""
+    first = (~np.isnan(measurements)).argmax(axis=1)
+    return np.take_along_axis(measurements, first[:, None], axis=1)[:, 0]
+
+
+# The first state of a model with rotations: a prior that is wide holds for each attitude alike, but a filter that
+# linearises needs one that is near.
+
+
+def begun_at(model: StateSpaceModel, first: np.ndarray) -> np.ndarray:
+    """The most likely states (B, n) at first measurements (B, m), NaN where missing, of the prior N(m_0, P_0).
+
+        min_x |R^-1/2 (z - h(x))|^2 + |P_0^-1/2 difference(x, m_0)|^2
+
+    by damped steps of Gauss and Newton in the tangent, from the best of 24 attitudes of each rotation. What the
+    measurement does not determine, such as a heading without a magnetometer, is the prior's.
+
+    Source: Levenberg (1944), "A method for the solution of certain non-linear problems in least squares",
+    Quarterly of Applied Mathematics 2(2); tangents: `thruster_env.model.turns`.
+    """
+    return np.array([_begun_at(model, z) for z in np.atleast_2d(first)])
+
+
+def _begun_at(model: StateSpaceModel, z: np.ndarray) -> np.ndarray:
+    shape, c, of, mean = model.any_shape, model.given_constants, model.turns, model.prior_mean
+    fed, scales, measured = shape.fed(as_value(np.zeros(model.inputs))), as_value(model.scales), ~np.isnan(z)
+    slopes = observation_slopes(model.functions, shape)
+    known = np.diag(model.prior_cov) > 0.0
+    of_r = np.linalg.cholesky(model.measurement_noise_cov[np.ix_(measured, measured)])
+    of_p = np.linalg.cholesky(model.prior_cov[np.ix_(known, known)])
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        v = difference(z, np.array(model.functions.observe(as_value(x), *fed, c)), shape.measurement_angles)
+        off = np.array(turns.difference(x, mean, of))
+        return np.concatenate([np.linalg.solve(of_r, v[measured]), np.linalg.solve(of_p, off[known])])
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        h = np.array(slopes(as_value(x), scales, *fed, c)).reshape(model.m, model.n)
+        h = h @ np.array(turns.slopes_of_stored(x, of))
+        off = np.array(turns.inverse_reset_slopes(turns.difference(x, mean, of), of))
+        rows = np.linalg.solve(of_r, -h[measured][:, known]), np.linalg.solve(of_p, off[np.ix_(known, known)])
+        return np.concatenate(rows)
+
+    def climbed(x: np.ndarray) -> tuple[float, np.ndarray]:
+        damping, r = 1e-3, residuals(x)
+        for _ in range(STEPS):
+            j, step = jacobian(x), np.zeros(model.t)
+            normal = j.T @ j
+            step[known] = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -j.T @ r)
+            further = np.array(turns.move(x, step, of))
+            after = residuals(further)
+            is_better = bool(np.sum(after**2) < np.sum(r**2))
+            if is_better:
+                x, r = further, after
+            damping = max(damping / 10.0, 1e-12) if is_better else damping * 10.0
+            if damping > DAMPINGS or (is_better and np.abs(step).max() < 1e-8):
+                break
+        return float(np.sum(r**2)), x
+
+    nearest = [mean]
+    for turn in of:
+        starts = np.repeat(nearest, len(ATTITUDES), axis=0)
+        starts[:, turn.stored : turn.stored + 4] = np.tile(ATTITUDES, (len(nearest), 1))
+        nearest = sorted(starts, key=lambda start: float(np.sum(residuals(start) ** 2)))[:MOST_STARTS]
+    return min(map(climbed, nearest), key=lambda ended: ended[0])[1]
+
+
+def _attitudes() -> np.ndarray:
+    """The rotations (24, 4) that turn a cube into itself: each face up, then quarter turns about that axis."""
+    quarters = [(k * 0.5 * np.pi, 0.0, 0.0) for k in range(4)]
+    up = [(0.0, k * 0.5 * np.pi, 0.0) for k in range(4)] + [(0.0, 0.0, 0.5 * np.pi), (0.0, 0.0, -0.5 * np.pi)]
+    pairs = product(map(rotations.exponential, up), map(rotations.exponential, quarters))
+    return np.array([rotations.product(*pair) for pair in pairs])
+
+
+ATTITUDES = _attitudes()

@@ -18,6 +18,7 @@ from filters.differentiated.runs import ModelSlopes
 from filters.estimators.foreign import Estimator, ForeignFilter
 from filters.registry import FILTERS
 from filters.sensitivity import sensitivity, state_score
+from filters.starts import begun_at
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 from thruster_env.env.model_env import ModelEnv
@@ -488,3 +489,15 @@ def test_derivatives_of_errors(kind):
         errors = np.where(counts, errors_of(np.where(np.isnan(truth), means, truth), means), 0.0)
         squares = state_score(model, gyro, z, truth, q, r, "squares", weights, filter=filter_).values
         np.testing.assert_allclose(squares, -np.einsum("bki,i->b", errors**2, weights), rtol=1e-12)
+
+
+def test_a_run_begins_at_its_first_measurement():
+    """From anywhere, to the deviation of the sensors; without a magnetometer the tilt is known."""
+    model, turned = attitude_model(degrees=115.0), Turned.random(6, random_state=1)
+    z = np.column_stack([turned.inv().apply(vector) for vector in (GRAVITY, FIELD)])
+    begun = begun_at(model, z)[:, [1, 2, 3, 0]]
+    assert np.rad2deg((Turned.from_quat(begun).inv() * turned).magnitude()).max() < 0.5
+    x, y, zz, w = (
+        Turned.from_quat(begun_at(model, np.where(np.arange(6) < 3, z, np.nan))[:, [1, 2, 3, 0]]).as_quat().T
+    )
+    np.testing.assert_allclose(np.column_stack([2 * (x * zz - w * y), 2 * (y * zz + w * x)]), z[:, :2], atol=1e-2)

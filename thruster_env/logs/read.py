@@ -188,7 +188,8 @@ def read_log(
             topics have stamps of one clock (`thruster_env.logs.recorders.bags`).
         inputs_act: whether the input of a row acts "from" it on, as a command that is sent then, or "until" it, as
             a current that is sampled with the voltage. By default "until" for a model whose measurements have
-            feed-through, h(x, u, c), and "from" for others.
+            feed-through, h(x, u, c), or whose states have rotations, as a gyroscope is sampled with them, and
+            "from" for others.
         name: of a log that is not a file.
         table: of the file, if it was read before.
 
@@ -203,7 +204,7 @@ def read_log(
     description = description_file.updated(
         Description(columns or {}, {}, clock_offset or {}, dt, stamps, inputs_act)
     )
-    act = description.inputs_act or ("until" if model.feeds else "from")
+    act = description.inputs_act or ("until" if model.feeds or model.turns else "from")
     until = one_of("inputs_act", act, INPUTS_ACT) == "until"
     wanted = quantities_of(model)
     form = format_of(path) if is_file else None

@@ -109,6 +109,14 @@ def stored_of(values: Sequence, turns: Sequence[Turn], of_rotation: float) -> li
     return result
 
 
+def tangent_of(values: Sequence, turns: Sequence[Turn], of_rotation: Any) -> list:
+    """The values of stored numbers for each component of an error, and another one for rotation vectors."""
+    result = list(values)
+    for turn in reversed(turns):
+        result[turn.stored : turn.stored + 4] = [of_rotation] * 3
+    return result
+
+
 # The steps, on sequences of components: floats, arrays of them, or numbers that are traced.
 
 

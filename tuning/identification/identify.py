@@ -263,6 +263,8 @@ def _with_starts(objective: Objective, first: np.ndarray, simulation_first: bool
     At the start of the search a run may seem not to: the model may be far off there. So the model is identified
     with free starts of these runs, and whether they are needed is asked again.
     """
+    if objective.first_model.turns:
+        return objective.with_changes(starts=_starts_at(objective, first))
     if not math.isfinite(objective.value(first)) or objective.moves_prior(first):
         return objective
     if not _starts_at(objective, first).free.any():
@@ -341,7 +343,7 @@ def from_start(
 
 def _climb_from(objective: Objective, point, simulation_first: bool, stop, tell) -> Ascent:
     bounds = objective.coordinates.low, objective.coordinates.high
-    if simulation_first:
+    if simulation_first and not objective.first_model.turns:  # without a filter's correction attitudes drift
         simulation = objective.with_changes(simulation=True)
         nearest = climb(simulation, point, *bounds, stop=stop, iterations=15)
         objective.evaluations += simulation.evaluations

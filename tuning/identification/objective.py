@@ -140,7 +140,7 @@ class Objective:
             roots = np.sqrt(self._noise_factors(at, model))
             model = model.replace(measurement_noise_cov=model.measurement_noise_cov * np.outer(roots, roots))
         if self.simulation:
-            model = model.replace(process_noise_cov=np.zeros((model.n, model.n)))
+            model = model.replace(process_noise_cov=np.zeros((model.t, model.t)))
         return model
 
     def _given_model(self, **values: float) -> StateSpaceModel:
@@ -226,7 +226,12 @@ class Objective:
         return Evaluation(value, scores.sum(axis=0), result.information.sum(axis=0), scores, part_values)
 
     def moves_prior(self, at: np.ndarray) -> bool:
-        """Whether some free parameter moves the prior of the first state, which is then what it says."""
+        """Whether some free parameter moves the prior of the first state, which is then what it says.
+
+        A run of a model with rotations always begins where its first measurement says.
+        """
+        if self.first_model.turns:
+            return False
         slopes = self._models.slopes(at, self._smooth)
         rough = [self._models.pair(at, j) for j in self.rough]
         apart = [

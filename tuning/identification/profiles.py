@@ -168,7 +168,7 @@ def validation_of(
     counted = np.arange(runs.measurements.shape[1]) >= starts.counted_from[:, None]
     scored = ~np.isnan(runs.measurements) & counted[..., None]
     visible = runs._replace(measurements=np.where(hidden, np.nan, runs.measurements))
-    estimates, nothing = estimates_of(model, visible, starts), np.zeros((model.n, model.n))
+    estimates, nothing = estimates_of(model, visible, starts), np.zeros((model.t, model.t))
     known = starts._replace(covs=np.zeros_like(starts.covs))
     simulated = estimates_of(model.replace(process_noise_cov=nothing, prior_cov=nothing), visible, known)
 
@@ -178,7 +178,7 @@ def validation_of(
 
     one_step, simulation = rmse(estimates), rmse(simulated)
     rows = np.where(scored, runs.measurements, np.nan).reshape(-1, model.m)
-    rows = on_one_branch(rows, model.shape.measurement_angles)
+    rows = on_one_branch(rows, model.any_shape.measurement_angles)
     spread = np.array([rows[~np.isnan(rows[:, i]), i].std() for i in range(model.m)])
     fit = 100 * (1 - simulation / np.where(spread > 0, spread, np.nan))
     weighted = np.linalg.solve(estimates.innovation_covs, estimates.innovations[..., None])[..., 0]
@@ -226,10 +226,10 @@ def _less_predicted(model: StateSpaceModel, runs: Data, estimates: Estimates, hi
     """Measurements minus their prediction from the estimates, if some channels are hidden; else zeros."""
     if not hidden.any():
         return np.zeros_like(runs.measurements)
-    observe, c, fed = model.functions.observe, model.given_constants, model.shape.fed
+    observe, c, fed = model.functions.observe, model.given_constants, model.any_shape.fed
     inputs = inputs_until(runs.inputs)
     predicted = [
         [observe(as_value(x), *fed(as_value(u)), c) for x, u in zip(*run, strict=True)]
         for run in zip(estimates.means.tolist(), inputs.tolist(), strict=True)
     ]
-    return difference(runs.measurements, np.array(predicted), model.shape.measurement_angles)
+    return difference(runs.measurements, np.array(predicted), model.any_shape.measurement_angles)

@@ -12,7 +12,7 @@ from filters.differentiated.runs import ModelSlopes
 from filters.engine.batch import Estimates, run
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.sensitivity import sensitivity
-from filters.starts import Starts, as_the_prior_says, wide_cov
+from filters.starts import Starts, as_the_prior_says, begun_at, first_measured, wide_cov
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import short_repr
 from thruster_env.core.streams import filter_keys
@@ -40,7 +40,8 @@ def starts_of(model: StateSpaceModel, runs: Data, unseen: Sequence[bool] | None 
     is chi-squared with n degrees of freedom for a run that begins as the prior says. Where it is beyond the
     quantile of 1 - LEVEL the run begins elsewhere: its filter begins with N(m, W), and its lead-in does not count.
     What does is the likelihood of the later rows, given the first ones. A state that the first rows do not
-    determine begins at the prior mean.
+    determine begins at the prior mean. Of a model with rotations each run begins where its first measurement says
+    (`filters.starts.begun_at`).
 
     Args:
         model: of the filter.
@@ -54,6 +55,9 @@ def starts_of(model: StateSpaceModel, runs: Data, unseen: Sequence[bool] | None 
     starts = as_the_prior_says(model, count)
     measured = np.where(np.zeros(model.m, dtype=bool) if unseen is None else unseen, np.nan, runs.measurements)
     starts.leads[:] = [_lead(run_measurements) for run_measurements in measured]
+    if model.turns:
+        first = first_measured(measured)
+        return starts._replace(free=starts.leads > 0, means=begun_at(model, first))
     rows = max(int(starts.leads.max()), 1)
     measured, inputs = measured[:, :rows], runs.inputs[:, : rows - 1]
     measured = np.where((np.arange(rows) < starts.leads[:, None])[..., None], measured, np.nan)

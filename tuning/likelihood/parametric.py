@@ -30,7 +30,7 @@ FUNCTIONS = "transition", "observe", "transition_jacobian", "observe_jacobian"
 
 def same_functions(first: StateSpaceModel, other: StateSpaceModel) -> bool:
     """Whether models differ in numbers alone, for which there are slopes."""
-    return (first.functions, first.shape, first.substeps) == (other.functions, other.shape, other.substeps)
+    return (first.functions, first.any_shape, first.substeps) == (other.functions, other.any_shape, other.substeps)
 
 
 class ParametricModel:
@@ -176,7 +176,7 @@ class CapturedConstants(NamedTuple):
             return None
         try:
             lifted = captured.with_constants(models[0])
-            traced_model(lifted.functions, lifted.shape)
+            traced_model(lifted.functions, lifted.any_shape)
         except Exception:  # whatever a user's function raises of numbers that it does not know
             return None
         return captured

@@ -364,11 +364,19 @@ def family_of(
         longest = max(logs, key=lambda log: log.steps)
         maker, parameters, _ = with_numbers(replace(maker, quantities=tuple(longest.measured)), longest)
         return NamedFamily(logs, maker, parameters, list(free))
+    offered = offer_of(model)
+    numbers = free_numbers(offered)  # which make Q and R
+    free, noise = free or numbers, noise and not numbers
     if not free:
         raise ValueError("free (--free) must name at least one parameter of the model, but got none")
-    offered = offer_of(model)
     family = LoggedFamily(logs, in_discrete_time(offered), list(free), noise=noise, dt=logs[0].dt)
     return AnyStepFamily(family, logs) if stamped else family
+
+
+def free_numbers(offered: Any) -> list[str]:
+    """The numbers of a function of `filters.plants` that are free if none is named, but for those that it has."""
+    names = getattr(getattr(offered, "func", offered), "free", ())
+    return [name for name in names if name not in getattr(offered, "keywords", {})]
 
 
 class LoggedFamily(ModelFamily):

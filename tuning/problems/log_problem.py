@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from filters.consistency.time_constants import Run
-from filters.starts import MEASUREMENT, STARTS, cov_of_measured_starts
+from filters.starts import MEASUREMENT, STARTS, cov_of_measured_starts, first_measured
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
@@ -170,7 +170,7 @@ class LogProblem(AssumedProblem):
                 max(block.rows for block in self.parts.blocks) - 1,
             )
         if start == MEASUREMENT:
-            self._first = _first_measured(self.data(self.parts.training).seen.measurements)
+            self._first = first_measured(self.data(self.parts.training).seen.measurements)
             self.model()  # an error on a start that nothing sees
 
     @property
@@ -209,7 +209,7 @@ class LogProblem(AssumedProblem):
         """The model with a prior that is wide where a measurement sees it, for `ROBUST` filters; see the class."""
         if name not in ROBUST or self._start is not None:
             return model
-        first = _first_measured(self.data(self.parts.training).seen.measurements)
+        first = first_measured(self.data(self.parts.training).seen.measurements)
         try:
             return model.replace(prior_cov=cov_of_measured_starts(model, first))
         except ValueError:  # no measurement sees a state at the prior mean
@@ -354,9 +354,3 @@ def _name(logs: Sequence[Log]) -> str:
     """What logs are called together: the first one's name, and how many there are more."""
     more = f" and {len(logs) - 1} more" if len(logs) > 1 else ""
     return f"{logs[0].name}{more}"
-
-
-def _first_measured(measurements: np.ndarray) -> np.ndarray:
-    """The first value (B, m) of each channel of measurements (B, K + 1, m); NaN where there is none."""
-    first = (~np.isnan(measurements)).argmax(axis=1)
-    return np.take_along_axis(measurements, first[:, None], axis=1)[:, 0]
