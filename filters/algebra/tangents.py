@@ -80,29 +80,29 @@ def differences(model, Y, y):
     return wrap(Y - y if len(Y.shape) == 1 else Y - outer(y, ones(Y)), angles)
 
 
-def reset(model, p, d):
+def reset(model, p, x, d):
     """G P G': a covariance about x in the tangent at move(model, x, d); see `thruster_env.model.turns`."""
     if not model.turns:
         return p
-    G = reset_slopes(d, model.turns)
+    G = reset_slopes(x, d, model.turns)
     return sym(G @ p @ G.T)
 
 
-def reset_back(model, p, d):
+def reset_back(model, p, x, d):
     """G^-1 P G^-1': a covariance about move(model, x, d) in the tangent at x."""
     if not model.turns:
         return p
-    J = inverse_reset_slopes(d, model.turns)
+    J = inverse_reset_slopes(x, d, model.turns)
     return sym(J @ p @ J.T)
 
 
-def reset_columns(model, h, d):
+def reset_columns(model, h, x, d):
     """H G: a Jacobian by the tangent at move(model, x, d) as one by d."""
-    return h @ reset_slopes(d, model.turns) if model.turns else h
+    return h @ reset_slopes(x, d, model.turns) if model.turns else h
 
 
 def unit(x, turns):
-    """The state x with quaternions of length 1."""
+    """The state x with quaternions and directions of length 1."""
     return normalised(x, turns) if turns else x
 
 
@@ -146,16 +146,16 @@ def slopes_of_tangent(y, turns):
     return _computed(steps.slopes_of_tangent, turns, y)
 
 
-@operation(lambda d, turns: (d[0], d[0]))
-def inverse_reset_slopes(d, turns):
+@operation(lambda x, d, turns: (d[0], d[0]))
+def inverse_reset_slopes(x, d, turns):
     """The inverse of G."""
-    return _computed(steps.inverse_reset_slopes, turns, d)
+    return _computed(steps.inverse_reset_slopes, turns, x, d)
 
 
-@operation(lambda d, turns: (d[0], d[0]))
-def reset_slopes(d, turns):
+@operation(lambda x, d, turns: (d[0], d[0]))
+def reset_slopes(x, d, turns):
     """G, the derivative of the step between tangents."""
-    return _computed(steps.reset_slopes, turns, d)
+    return _computed(steps.reset_slopes, turns, x, d)
 
 
 for _operation, _function in (

@@ -46,7 +46,7 @@ def update(model, x, P, z):
     S = sym(H @ P @ H.T + R)
     K = divide(P @ H.T, S)
     d = K @ v
-    return move(model, x, d), reset(model, joseph(P, K, H, R), d), v, S, log_density(v, S, measured)
+    return move(model, x, d), reset(model, joseph(P, K, H, R), x, d), v, S, log_density(v, S, measured)
 
 
 # The square-root form of the Kalman filter carries the root L of P = L L', by orthogonal Theta from the right that
@@ -184,7 +184,7 @@ def update_iterated(model, x, P, z):
     for i in range(model.own.iterations):
         H, y = mask_missing(measured, model.H(at)), model.h(at)
         on_tangent = y - H @ d if i else y
-        H = reset_columns(model, H, d) if i else H
+        H = reset_columns(model, H, x, d) if i else H
         v = mask_missing(measured, wrap(z - on_tangent, model.measurement_angles))
         S = sym(H @ P @ H.T + R)
         K = divide(P @ H.T, S)
@@ -192,7 +192,7 @@ def update_iterated(model, x, P, z):
         at = move(model, x, d)
         innovations.append((v, S))
     v, S = innovations[0]
-    return at, reset(model, joseph(P, K, H, R), d), v, S, log_density(v, S, measured)
+    return at, reset(model, joseph(P, K, H, R), x, d), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

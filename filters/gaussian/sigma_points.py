@@ -43,7 +43,7 @@ def unscented_state(model, X):
     """Mean and covariance of states at the points."""
     D = differences(model, without_first(X), first(X))
     s = (D @ ones(D)) * model.own.weight
-    return move(model, first(X), s), reset(model, scatter(model, D, s), s)
+    return move(model, first(X), s), reset(model, scatter(model, D, s), first(X), s)
 
 
 def scatter(model, D, s):
@@ -123,7 +123,7 @@ def update_unscented(model, x, P, z):
     K = divide(C, S)
     rest = scatter(model, (L * g) @ U - K @ D, K @ s) + sym(K @ R @ K.T)
     d, P = K @ v, of_best_gain(rest, P, C, S, K)
-    return move(model, x, d), reset(model, P, d), v, S, log_density(v, S, measured)
+    return move(model, x, d), reset(model, P, x, d), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

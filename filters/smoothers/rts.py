@@ -85,8 +85,8 @@ def back(model, x, P, linked, later):
     """Correct the estimate of a step by that of the next one, `later`."""
     (mean, G, C), (later_x, later_P) = linked, later
     change = differences(model, later_x, mean)
-    d, later_P = G @ change, reset_back(model, later_P, change)
-    return move(model, x, d), reset(model, sym(C + sym(G @ later_P @ G.T)), d)
+    d, later_P = G @ change, reset_back(model, later_P, mean, change)
+    return move(model, x, d), reset(model, sym(C + sym(G @ later_P @ G.T)), x, d)
 
 
 def smooth_backwards(

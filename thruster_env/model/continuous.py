@@ -223,8 +223,13 @@ class ContinuousModel:
 
     @property
     def turns(self) -> tuple[Turn, ...]:
-        """The rotations of the state."""
-        return with_rotations(self.arguments.get("states"), self.arguments.get("turns", ()))[1]
+        """The rotations and poses of the state; ValueError if there are directions."""
+        turns = with_rotations(self.arguments.get("states"), self.arguments.get("turns", ()))[1]
+        for turn in turns:
+            if turn.kind == "direction":
+                rule = "states in continuous time must be numbers, rotations and poses"
+                raise ValueError(f"{rule}, but {turn.name!r} is a direction: give the transition of a step")
+        return turns
 
     @property
     def transition(self) -> Callable:

@@ -1,15 +1,17 @@
-"""Rotations in the state of a model: four stored numbers, three of error, and the steps between them.
+"""Parts of a model's state that are no numbers: rotations, directions, poses; the steps between such states.
 
-The state x of n stored numbers has a tangent of t = n - (number of rotations). Errors, and so P, Q and the prior
-covariance, live there, with a rotation vector [rad] in the place of each quaternion:
+The state x of n stored numbers has a tangent of t = n - (number of such parts): each stores one more number than
+its errors have. Errors, and so P, Q and the prior covariance, live there, with a rotation vector [rad] in the
+place of each quaternion:
 
     move(x, d):        q exp(d) for an error of the body, exp(d) q for one of the world; x + d for numbers
     difference(x, y):  the d with move(y, d) = x
 
-A filter that linearises uses the tangent's F and H, from Jacobians of the stored numbers, and after an update by d
-it turns P, which is about the old estimate, into the tangent at the new one (the reset): G P G', with
-G = J_r(d) for an error of the body, J_l(d) for one of the world. With this the estimates of an extended filter do
-not depend on the side.
+A pose has the exponential of its group (`thruster_env.model.poses`), a direction that of the sphere, without sides
+(`thruster_env.model.directions`). A filter that linearises uses the tangent's F and H, from Jacobians of the
+stored numbers, and after an update by d it turns P, which is about the old estimate, into the tangent at the new
+one (the reset): G P G', with G = J_r(d) for an error of the body, J_l(d) for one of the world. With this the
+estimates of an extended filter do not depend on the side.
 
 Source: Hertzberg, Wagner, Frese, Schroeder (2013), "Integrating generic sensor fusion algorithms with sound state
 representations through encapsulation of manifolds", Information Fusion 14(1); on the reset: Mueller, Hehn,
@@ -26,11 +28,12 @@ import numpy as np
 
 from thruster_env.core.checks import short_repr
 from thruster_env.core.equal_functions import makes_functions
-from thruster_env.model import rotations
+from thruster_env.model import directions, poses, rotations
 from thruster_env.model.quantities import Quantity
 
 SIDES = "body", "world"
-STORED = "wxyz"
+STORED, AXES = "wxyz", "xyz"
+Quantities = list[Quantity]
 
 
 class Rotation(NamedTuple):
@@ -46,66 +49,166 @@ class Rotation(NamedTuple):
     symbol: str = "q"
     side: str = "body"
 
+    @property
+    def quantities(self) -> Quantities:
+        """The stored numbers."""
+        return [Quantity(f"{self.name} {axis}", f"{self.symbol}_{axis}") for axis in STORED]
+
+
+class Direction(NamedTuple):
+    """A direction among the states of a model: a unit vector, with the steps of `directions`.
+
+    Attributes:
+        name: in words, such as "magnetic field".
+        symbol: of the stored numbers u_x, u_y, u_z and of the errors u_1, u_2 [rad].
+    """
+
+    name: str
+    symbol: str = "u"
+    side: str = "body"  # without a meaning here
+
+    @property
+    def quantities(self) -> Quantities:
+        """The stored numbers."""
+        return [Quantity(f"{self.name} {axis}", f"{self.symbol}_{axis}") for axis in AXES]
+
+
+class Pose(NamedTuple):
+    """A rotation and a position of the world among the states of a model, as one element of SE(3), of `poses`.
+
+    Stored are q_w ... q_z, p_x, p_y, p_z; errors are (phi [rad], rho [m]).
+
+    Attributes:
+        name: in words, such as "pose".
+        symbol: of the quaternion.
+        side: of the error, as that of a `Rotation`: the pose x is x exp(d) or exp(d) x.
+        position: symbol of the position.
+    """
+
+    name: str
+    symbol: str = "q"
+    side: str = "body"
+    position: str = "p"
+
+    @property
+    def quantities(self) -> Quantities:
+        """The stored numbers."""
+        return Rotation(*self[:3]).quantities + _vector(f"{self.name} position", self.position, "m")
+
+
+class ExtendedPose(NamedTuple):
+    """A rotation, a velocity and a position among the states of a model, as one element of SE_2(3), of `poses`.
+
+    Stored are q_w ... q_z, v_x, v_y, v_z, p_x, p_y, p_z; errors are (phi [rad], nu [m/s], rho [m]). With errors of
+    the world and `poses.strapdown` the extended filter of such a state is the invariant one.
+
+    Attributes:
+        name: in words, such as "navigation".
+        symbol: of the quaternion.
+        side: of the error, as that of a `Rotation`: the pose x is x exp(d) or exp(d) x.
+        velocity, position: symbols of the vectors of the world.
+    """
+
+    name: str
+    symbol: str = "q"
+    side: str = "body"
+    velocity: str = "v"
+    position: str = "p"
+
+    @property
+    def quantities(self) -> Quantities:
+        """The stored numbers."""
+        velocity = _vector(f"{self.name} velocity", self.velocity, "m/s")
+        position = _vector(f"{self.name} position", self.position, "m")
+        return Rotation(*self[:3]).quantities + velocity + position
+
+
+def _vector(name: str, symbol: str, unit_: str) -> Quantities:
+    return [Quantity(f"{name} {axis}", f"{symbol}_{axis}", unit_) for axis in AXES]
+
+
+PARTS = {Rotation: "rotation", Direction: "direction", Pose: "pose", ExtendedPose: "extended pose"}
+
 
 class Turn(NamedTuple):
-    """A rotation of a state: offsets of its quaternion and of its error, and the side of the error."""
+    """A part of a state that is no number: where its stored numbers and its error begin, and what it is."""
 
     stored: int
     tangent: int
     side: str
     name: str
+    kind: str
+    size: int  # of the error; one more number is stored
+
+    @property
+    def quaternion(self) -> slice:
+        """The unit vector of the stored numbers: a quaternion or a direction."""
+        return slice(self.stored, self.stored + (3 if self.kind == "direction" else 4))
+
+    def of_state(self, x: Any) -> tuple:
+        """The part's numbers of a state."""
+        return tuple(x[self.stored : self.stored + self.size + 1])
+
+    def of_tangent(self, d: Any) -> tuple:
+        """The part's numbers of an error."""
+        return tuple(d[self.tangent : self.tangent + self.size])
 
 
 def with_rotations(states: Any, known: Sequence[Turn] = ()) -> tuple[Any, tuple[Turn, ...]]:
-    """States with a quantity for each stored number, and the rotations among them; `known` if states have none.
+    """States with a quantity for each stored number, and the parts among them; `known` if states have none.
 
     Raises:
         ValueError: if a side is unknown.
     """
-    if not isinstance(states, Sequence) or not any(isinstance(state, Rotation) for state in states):
+    if not isinstance(states, Sequence) or not any(type(state) in PARTS for state in states):
         return states, tuple(known)
     quantities: list[Any] = []
     turns: list[Turn] = []
     for state in states:
-        if isinstance(state, Rotation):
-            name, symbol, side = state
-            if side not in SIDES:
-                raise ValueError(f"side of {name!r} must be 'body' or 'world', but got {short_repr(side)}")
-            turns.append(Turn(len(quantities), len(quantities) - len(turns), side, name))
-            quantities += [Quantity(f"{name} {axis}", f"{symbol}_{axis}") for axis in STORED]
+        if type(state) in PARTS:
+            if state.side not in SIDES:
+                raise ValueError(
+                    f"side of {state.name!r} must be 'body' or 'world', but got {short_repr(state.side)}"
+                )
+            stored, at = state.quantities, len(quantities)
+            kind, size = PARTS[type(state)], len(stored) - 1
+            turns.append(Turn(at, at - len(turns), state.side, state.name, kind, size))
+            quantities += stored
         else:
             quantities.append(state)
     return quantities, tuple(turns)
 
 
 def unit_mean(mean: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
-    """A mean (n,) whose quaternions have length 1 to rounding; ValueError if they do not to 1e-6."""
+    """A mean (n,) whose quaternions and directions have length 1 to rounding; ValueError if not to 1e-6."""
     mean = mean.copy()
     for turn in turns:
-        q = mean[turn.stored : turn.stored + 4]
+        q = mean[turn.quaternion]
         if not abs(np.linalg.norm(q) - 1.0) < 1e-6:
-            raise ValueError(
-                f"{turn.name!r} must be a quaternion (w, x, y, z) of length 1, but got {short_repr(q)}"
-            )
+            what = "(x, y, z)" if turn.kind == "direction" else "a quaternion (w, x, y, z)"
+            begins = "begin with " if turn.size > 3 else "be "
+            raise ValueError(f"{turn.name!r} must {begins}{what} of length 1, but got {short_repr(q)}")
         q /= np.linalg.norm(q)
     return mean
 
 
 def refuse_rotations(model: Any) -> None:
-    """Raise ValueError for a model whose state has rotations."""
+    """Raise ValueError for a model whose state has rotations, directions or poses."""
     if model.turns:
         names = " and ".join(repr(turn.name) for turn in model.turns)
+        kinds = " and ".join(dict.fromkeys(f"{turn.kind}s" for turn in model.turns))
         raise ValueError(
             f"states must be numbers and angles here, but {names} {'is' if len(model.turns) == 1 else 'are'} of "
-            "rotations: 'ekf', 'iekf', 'ukf' and 'fading' take these, in filters.run, sessions, wrapped envs and C"
+            f"{kinds}: 'ekf', 'iekf', 'ukf' and 'fading' take these, in filters.run, sessions, wrapped envs and C"
         )
 
 
 def stored_of(values: Sequence, turns: Sequence[Turn], of_rotation: float) -> list:
-    """The values of a tangent for each stored number: those of numbers, and another one for quaternions."""
+    """The values of a tangent for each stored number: those of numbers, and another one for unit vectors."""
     result = list(values)
     for turn in turns:
-        result[turn.stored : turn.stored + 3] = [of_rotation] * 4
+        unit_numbers = 3 if turn.kind == "direction" else 4
+        result[turn.stored : turn.stored + unit_numbers - 1] = [of_rotation] * unit_numbers
     return result
 
 
@@ -122,111 +225,144 @@ def tangent_of(values: Sequence, turns: Sequence[Turn], of_rotation: Any) -> lis
 
 def move(x: Sequence, d: Sequence, turns: Sequence[Turn]) -> list:
     """The state x (n) moved by d (t) of its tangent."""
-    return _joined(x, d, turns, lambda a, b: a + b, _turned)
-
-
-def _turned(q: Any, d: Any, side: str) -> rotations.Quaternion:
-    by = rotations.exponential(d)
-    return rotations.normalised(rotations.product(q, by) if side == "body" else rotations.product(by, q))
+    result: list[Any] = []
+    for turn, i, j in _parts(len(x), turns):
+        if turn is None:
+            result.append(x[i] + d[j])
+        elif turn.kind == "direction":
+            result += directions.move(turn.of_state(x), turn.of_tangent(d))
+        else:
+            part, by = turn.of_state(x), poses.exponential(turn.of_tangent(d))
+            result += _unit(turn, poses.product(*((part, by) if turn.side == "body" else (by, part))))
+    return result
 
 
 def difference(x: Sequence, y: Sequence, turns: Sequence[Turn]) -> list:
     """The d (t) of the tangent at y with move(y, d) = x, of states x and y (n)."""
     result: list[Any] = []
-    k = 0
-    by_offset = {turn.stored: turn for turn in turns}
-    while k < len(x):
-        if k in by_offset:
-            p, back = x[k : k + 4], rotations.inverse(y[k : k + 4])
-            between = (back, p) if by_offset[k].side == "body" else (p, back)
-            result += rotations.logarithm(rotations.product(*between))
-            k += 4
+    for turn, i, _ in _parts(len(x), turns):
+        if turn is None:
+            result.append(x[i] - y[i])
+        elif turn.kind == "direction":
+            result += directions.difference(turn.of_state(x), turn.of_state(y))
         else:
-            result.append(x[k] - y[k])
-            k += 1
+            part, back = turn.of_state(x), poses.inverse(turn.of_state(y))
+            between = (back, part) if turn.side == "body" else (part, back)
+            result += poses.logarithm(poses.product(*between))
     return result
 
 
 def unit(x: Sequence, turns: Sequence[Turn]) -> list:
-    """The state x (n) with quaternions of length 1."""
-    return _joined(x, None, turns, lambda a, b: a, lambda q, d, side: rotations.normalised(q))
-
-
-def _joined(x: Sequence, d: Any, turns: Sequence[Turn], of_number: Any, of_rotation: Any) -> list:
+    """The state x (n) with quaternions and directions of length 1."""
     result: list[Any] = []
-    by_offset, k = {turn.stored: turn for turn in turns}, 0
-    while len(result) < len(x):
-        at = len(result)
-        if at in by_offset:
-            part = None if d is None else tuple(d[k : k + 3])
-            result += of_rotation(tuple(x[at : at + 4]), part, by_offset[at].side)
-            k += 3
-        else:
-            result.append(of_number(x[at], None if d is None else d[k]))
-            k += 1
+    for turn, i, _ in _parts(len(x), turns):
+        result += [x[i]] if turn is None else _unit(turn, turn.of_state(x))
+    return result
+
+
+def _unit(turn: Turn, part: tuple) -> tuple:
+    return directions.unit(part) if turn.kind == "direction" else (*rotations.normalised(part[:4]), *part[4:])
+
+
+def _parts(n: int, turns: Sequence[Turn]) -> list[tuple[Turn | None, int, int]]:
+    """The parts of a state in their order, None for numbers, with offsets among the stored and in the tangent."""
+    by_offset, result, i, j = {turn.stored: turn for turn in turns}, [], 0, 0
+    while i < n:
+        turn = by_offset.get(i)
+        result.append((turn, i, j))
+        i, j = (i + 1, j + 1) if turn is None else (i + turn.size + 1, j + turn.size)
     return result
 
 
 def slopes_of_stored(x: Sequence, turns: Sequence[Turn]) -> list[list]:
     """The derivative of move(x, d) at d = 0, (n, t): of a rotation q (0, e_i)/2 or (0, e_i) q/2."""
-    n, t = len(x), len(x) - len(turns)
-    result = [[0.0] * t for _ in range(n)]
-    for i, j in _numbers(n, turns):
-        result[i][j] = 1.0
-    for turn in turns:
-        for j, column in enumerate(_quaternion_slopes(x, turn)):
-            for i, entry in enumerate(column):
-                result[turn.stored + i][turn.tangent + j] = 0.5 * entry
+    return _by_parts(len(x), turns, (1, 0), lambda turn: _stored_slopes(turn, turn.of_state(x)))
+
+
+def _stored_slopes(turn: Turn, x: tuple) -> list[list]:
+    if turn.kind == "direction":
+        return [list(row) for row in directions.basis(x)]
+    columns = _quaternion_slopes(x[:4], turn.side)
+    result = _blocks(4, 3, [[0.5 * column[i] for column in columns] for i in range(4)], turn.size + 1)
+    for k, r in enumerate(poses.vectors(x)):
+        if turn.side == "body":
+            _put(result, 4 + 3 * k, 3 + 3 * k, rotations.matrix(x[:4]))
+        else:
+            _put(result, 4 + 3 * k, 0, _negative(poses.skew(r)))
     return result
 
 
 def slopes_of_tangent(y: Sequence, turns: Sequence[Turn]) -> list[list]:
-    """The derivative of difference(x, y) by x at x = y, (t, n); a quaternion y need not have length 1."""
-    n, t = len(y), len(y) - len(turns)
-    result = [[0.0] * n for _ in range(t)]
-    for i, j in _numbers(n, turns):
-        result[j][i] = 1.0
-    for turn in turns:
-        w, a, b, c = y[turn.stored : turn.stored + 4]
-        scale = 2.0 / (w * w + a * a + b * b + c * c)
-        for j, column in enumerate(_quaternion_slopes(y, turn)):
-            for i, entry in enumerate(column):
-                result[turn.tangent + j][turn.stored + i] = scale * entry
+    """The derivative of difference(x, y) by x at x = y, (t, n); a unit vector of y need not have length 1."""
+    return _by_parts(len(y), turns, (0, 1), lambda turn: _tangent_slopes(turn, turn.of_state(y)))
+
+
+def _tangent_slopes(turn: Turn, y: tuple) -> list[list]:
+    if turn.kind == "direction":
+        length, B = directions.length(y), directions.basis(directions.unit(y))
+        return [[B[i][j] / length for i in range(3)] for j in range(2)]
+    w, a, b, c = y[:4]
+    scale = 2.0 / (w * w + a * a + b * b + c * c)
+    rows = [[scale * entry for entry in column] for column in _quaternion_slopes(y[:4], turn.side)]
+    result = _blocks(3, 4, rows, turn.size)
+    back = rotations.matrix(rotations.inverse(rotations.normalised(y[:4]))) if turn.size > 3 else ()
+    for k, r in enumerate(poses.vectors(y)):
+        if turn.side == "body":
+            _put(result, 3 + 3 * k, 4 + 3 * k, back)
+        else:
+            S = poses.skew(r)
+            by_q = [[sum(S[i][m] * rows[m][j] for m in range(3) if m != i) for j in range(4)] for i in range(3)]
+            _put(result, 3 + 3 * k, 0, by_q)
     return result
 
 
-def _quaternion_slopes(x: Sequence, turn: Turn) -> list:
-    q = tuple(x[turn.stored : turn.stored + 4])
+def _quaternion_slopes(q: tuple, side: str) -> list:
     units = [tuple(float(k == i) for k in range(4)) for i in (1, 2, 3)]
-    return [rotations.product(*((q, e) if turn.side == "body" else (e, q))) for e in units]
+    return [rotations.product(*((q, e) if side == "body" else (e, q))) for e in units]
 
 
-def _numbers(n: int, turns: Sequence[Turn]) -> list[tuple[int, int]]:
-    """Offsets, stored and of the tangent, of components that are no rotation."""
-    of_rotations = {turn.stored + k for turn in turns for k in range(4)}
-    return [(i, i - sum(turn.stored < i for turn in turns)) for i in range(n) if i not in of_rotations]
-
-
-def reset_slopes(d: Sequence, turns: Sequence[Turn]) -> list[list]:
-    """G = d difference(move(x, d + e), move(x, d))/de at e = 0, (t, t): J_r(d) or J_l(d), 1 for numbers."""
-    return _by_rotation(d, turns, rotations.left_jacobian)
-
-
-def inverse_reset_slopes(d: Sequence, turns: Sequence[Turn]) -> list[list]:
-    """The inverse of `reset_slopes`, (t, t)."""
-    return _by_rotation(d, turns, rotations.inverse_left_jacobian)
-
-
-def _by_rotation(d: Sequence, turns: Sequence[Turn], of_rotation: Any) -> list[list]:
-    """The identity with the matrix of d, or of -d for errors of the body, at each rotation."""
-    t = len(d)
-    result = [[float(i == j) for j in range(t)] for i in range(t)]
-    for turn in turns:
-        sign = -1.0 if turn.side == "body" else 1.0
-        part = [sign * d[turn.tangent + k] for k in range(3)]
-        for i, row in enumerate(of_rotation(part)):
-            result[turn.tangent + i][turn.tangent : turn.tangent + 3] = row
+def _blocks(first_rows: int, first_columns: int, first: Any, rows: int) -> list[list]:
+    """A matrix of a pose with a first block, and the identity of its vectors."""
+    columns = rows - first_rows + first_columns
+    result = [[float(i - first_rows == j - first_columns >= 0) for j in range(columns)] for i in range(rows)]
+    _put(result, 0, 0, first)
     return result
+
+
+def _put(matrix: list[list], row: int, column: int, block: Any) -> None:
+    for i, entries in enumerate(block):
+        matrix[row + i][column : column + len(entries)] = entries
+
+
+def _negative(rows: Any) -> list[list]:
+    return [[-x for x in row] for row in rows]
+
+
+def _by_parts(n: int, turns: Sequence[Turn], more: tuple[int, int], of_turn: Callable) -> list[list]:
+    """A matrix with 1 for numbers and a block for each turn; sides with `more` are as long as the stored state."""
+    sides = [n if stored else n - len(turns) for stored in more]
+    result = [[0.0] * sides[1] for _ in range(sides[0])]
+    for turn, i, j in _parts(n, turns):
+        _put(result, i if more[0] else j, i if more[1] else j, [[1.0]] if turn is None else of_turn(turn))
+    return result
+
+
+def reset_slopes(x: Sequence, d: Sequence, turns: Sequence[Turn]) -> list[list]:
+    """G = d difference(move(x, d + e), move(x, d))/de at e = 0, (t, t): J_r(d) or J_l(d), 1 for numbers."""
+    return _by_parts(len(x), turns, (0, 0), lambda turn: _reset(turn, x, d, poses.left_jacobian))
+
+
+def inverse_reset_slopes(x: Sequence, d: Sequence, turns: Sequence[Turn]) -> list[list]:
+    """The inverse of `reset_slopes`, (t, t)."""
+    return _by_parts(len(x), turns, (0, 0), lambda turn: _reset(turn, x, d, poses.inverse_left_jacobian))
+
+
+def _reset(turn: Turn, x: Any, d: Any, jacobian: Callable) -> list[list]:
+    part = turn.of_tangent(d)
+    if turn.kind == "direction":
+        G = directions.reset(turn.of_state(x), part)
+        return G if jacobian is poses.left_jacobian else directions.inverse(G)
+    return jacobian([-k for k in part] if turn.side == "body" else part)
 
 
 # Rates of a state with rotations: of its tangent, the angular rate [rad/s] in the axes of the error's side.
@@ -234,16 +370,17 @@ def _by_rotation(d: Sequence, turns: Sequence[Turn], of_rotation: Any) -> list[l
 
 @makes_functions
 def runge_kutta_munthe_kaas(rates: Callable, turns: tuple[Turn, ...]) -> Callable:
-    """Return `step(x, u, c)`, one step of order four of length c.substep [s], exact for a constant angular rate.
+    """Return `step(x, u, c)`, one step of order four of length c.substep [s], exact for constant rates.
 
         x(t) = move(x_0, d(t)),  d' = J^-1(d) rates(x, u, c),  J^-1 = I + [d]x/2 + [d]x^2/12 of the body (-[d]x/2
         of the world),  d_0 = 0
 
-    by Runge and Kutta's classical method; the further terms of J^-1 are of higher order.
+    by Runge and Kutta's classical method; the further terms of J^-1 are of higher order. Of a pose [d]x e is the
+    bracket [d, e] (`thruster_env.model.poses`).
 
     Args:
         rates: `rates(x, u, c)`, the t rates of the tangent of the n stored numbers x.
-        turns: rotations of the state, one or more.
+        turns: rotations and poses of the state, one or more.
 
     Source: Munthe-Kaas (1999), "High order Runge-Kutta methods on manifolds", Applied Numerical Mathematics 29(1).
     """
@@ -251,10 +388,10 @@ def runge_kutta_munthe_kaas(rates: Callable, turns: tuple[Turn, ...]) -> Callabl
     def slope(x: Any, d: list, u: Any, c: Any) -> list:
         result = list(rates(tuple(move(x, d, turns)), u, c))
         for turn in turns:
-            part = slice(turn.tangent, turn.tangent + 3)
+            part = slice(turn.tangent, turn.tangent + turn.size)
             side = 0.5 if turn.side == "body" else -0.5
-            once = _cross(d[part], result[part])
-            twice = _cross(d[part], once)
+            once = poses.bracket(d[part], result[part])
+            twice = poses.bracket(d[part], once)
             result[part] = [v + side * a + b / 12.0 for v, a, b in zip(result[part], once, twice, strict=True)]
         return result
 
@@ -270,10 +407,6 @@ def runge_kutta_munthe_kaas(rates: Callable, turns: tuple[Turn, ...]) -> Callabl
     return step
 
 
-def _cross(a: Sequence, b: Sequence) -> list:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
 def slope_of_rates(slopes: np.ndarray, rates: Sequence[float], turns: Sequence[Turn]) -> np.ndarray:
     """A (t, t) of d' = A d, the error's rate, from the derivative of the rates by d and the rates themselves.
 
@@ -282,7 +415,7 @@ def slope_of_rates(slopes: np.ndarray, rates: Sequence[float], turns: Sequence[T
     """
     result = np.array(slopes)
     for turn in turns:
-        part = slice(turn.tangent, turn.tangent + 3)
-        skew = np.cross(np.eye(3), rates[part])
-        result[part, part] += -skew if turn.side == "body" else skew
+        part = slice(turn.tangent, turn.tangent + turn.size)
+        columns = [poses.bracket(rates[part], unit_) for unit_ in np.eye(turn.size)]
+        result[part, part] += (-1.0 if turn.side == "body" else 1.0) * np.transpose(columns)
     return result

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation as Turned
 
 import filters
 from thruster_env.core.compiled import interpreted
-from thruster_env.model import rotations
+from thruster_env.model import poses, rotations
 from thruster_env.model.continuous import ContinuousModel
-from thruster_env.model.turns import Rotation, difference, move
+from thruster_env.model.turns import Direction, Pose, Rotation, difference, move
 
 GYRO, WALK, SENSOR = 2e-3, 2e-4, 0.05
 
@@ -162,3 +162,26 @@ def test_filters_take_it(kind):
     if kind == "ekf":
         with interpreted():
             np.testing.assert_allclose(compiled.covs, estimates().covs, atol=1e-15)
+
+
+def screw(x, u, c):
+    """Rates of the tangent of a pose."""
+    return 0.4, -0.3, 0.9, 1.0, 2.0, -3.0
+
+
+@pytest.mark.parametrize("side", ["body", "world"])
+def test_constant_rates_of_a_pose_are_a_screw(side):
+    """A step is the exponential, and errors propagate as by differences; directions have no rates."""
+    common = {"rates": screw, "observe": lambda x, c: x[1:], "constants": Constants()}
+    arguments = {"states": (Pose("camera", side=side),), "prior_mean": [0.6, 0.0, 0.8, 0.0, 1.0, 2.0, 3.0]}
+    arguments |= {"prior_cov": np.ones(6), "measurement_noise_cov": np.ones(6)}
+    model = ContinuousModel(densities=np.ones(6), arguments=arguments, **common)
+    step, by = model.at(1.0), poses.exponential(screw(0, 0, 0))
+    x, f = tuple(step.prior_mean), lambda y: step.transition(tuple(y), (), step.constants)
+    after = poses.product(*((x, by) if side == "body" else (by, x)))
+    np.testing.assert_allclose(f(x), after, atol=1e-14)
+    columns = [difference(f(move(x, d, model.turns)), f(x), model.turns) for d in 1e-7 * np.eye(6)]
+    np.testing.assert_allclose(np.transpose(columns) / 1e-7, expm(model.slope), atol=1e-5)
+    arguments = {"states": (Direction("field"),), "prior_mean": (0.0, 0.0, 1.0)}
+    with pytest.raises(ValueError, match="'field' is a direction"):
+        ContinuousModel(densities=np.ones(2), arguments=arguments, **common)
