@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from filters.pages.page import Page
 from thruster_env.core.checks import short_repr
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.modules import object_named
+from thruster_env.logs.log import in_steps_of, sample_time_of
 from thruster_env.model.state_space import StateSpaceModel
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ class Filter:
     one_model: ClassVar[bool] = True  # if not, it has others beside `model`, with their own sample times and Q
     mixable: ClassVar[bool] = True  # whether a step may begin with another mean and P than those the last one left
     any_step: ClassVar[bool] = True  # whether it multiplies Q by the step ratio of `thruster_env.logs.log`
+    by_length: ClassVar[bool] = False  # whether steps of another length have the numbers of `of_length`
     gaussian_likelihood: ClassVar[bool] = True  # whether the log-likelihood is that of N(innovation; 0, S)
     model: StateSpaceModel
 
@@ -182,6 +184,16 @@ class Filter:
     def from_first_input(self, inputs: Any, rows: int, update_first: bool) -> tuple[Filter, Any]:
         """The filter and the inputs of a run of so many rows, of those that the user gave."""
         return self, inputs
+
+    @property
+    def sample_time(self) -> float:
+        """The sample time of its model [s]; ValueError for a model in which it is no constant."""
+        return sample_time_of(self.model, f"steps of any length of {self.name!r}")
+
+    def of_length(self, length: float) -> Self:
+        """The filter for steps of another length [s], with Q in proportion to it."""
+        model = in_steps_of(self.model, length)
+        return self if model is self.model else dataclasses.replace(self, model=model)
 
     @property
     def fixed_noise(self) -> tuple[str, ...]:

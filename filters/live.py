@@ -45,7 +45,8 @@ class Live:
 
     The sample time has to be one of the model's constants, by the name `dt`, or `substep` for a part of it. A
     longer step is divided into equal ones that are at most as long, up to a million. Q of a step of length dt is
-    that of the model for its own sample time, times the ratio of the two, unless `noise` says otherwise.
+    that of the model for its own sample time, times the ratio of the two, unless `noise` says otherwise. A Kalman
+    filter has A and B of each length, `imm` the transitions of its modes within it.
 
     Args:
         filter_: any filter of such a model.
@@ -81,11 +82,13 @@ class Live:
     ):
         """Find the sample time; `start` comes next."""
         self._session = Session(filter_)
-        self._step = self._session.sample_time
+        self._step = filter_.sample_time if filter_.by_length else self._session.sample_time
         self._late = positive("late", late, zero_allowed=True)
         self._resolution = positive("resolution", resolution, zero_allowed=True)
         self._noise, self._skips = noise, skip_missing
         self._has_one_q = "Q" in filter_.fixed_noise  # which is that of a step as long as the model's
+        if noise is not None:
+            filter_.check_noise(process_noise_cov=noise)
         self._watch, self._first = watch_of(monitor_of(monitor), filter_), FirstRestart(filter_)
         self._filter = filter_
         model = filter_.model
@@ -139,7 +142,7 @@ class Live:
         measured = (
             self._nothing if z is None else self._checked(np.broadcast_to(as_floats(z), self._nothing.shape))
         )
-        self._set_length(self._step)
+        self._set_length(self._step, self._session)
         self._session.start(key, measured)
         self._first, self._last = FirstRestart(self._filter), None
         self._first.note(self._session, None, measured)
@@ -195,6 +198,58 @@ class Live:
         if self.health is not None:
             self.health = Health(self.health.ok, alarms)
 
+    def smoothed(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (n,) and covariance (n, n) at an earlier time [s], given all samples so far.
+
+        Rauch, Tung and Striebel's recursion (`filters.smooth`) over the steps since then, from the filter's
+        estimates that it keeps for late samples. With the same lag behind `time` after each sample this is a
+        fixed-lag smoother.
+
+        Args:
+            time: at most `late` before that of the belief.
+
+        Raises:
+            ValueError: for a filter without such a smoother, another time, or a restart in between.
+        """
+        from filters.filter import PageFilter  # which knows this module
+        from filters.smoothers.rts import passes, relation_of
+
+        self._has_begun()
+        relation, time = relation_of(self._filter, "smoothed"), finite("time", time)
+        steps = [event for event in self._events if event.is_prediction and event.end > time + self._near(time)]
+        begin = steps[0].begin if steps else self.time
+        if not begin - self._near(time) <= time <= self.time + self._near(time):
+            earliest = min((event.begin for event in self._events), default=self.time)
+            rule = f"time must be within late = {self._late:g} s before the belief"
+            raise ValueError(f"{rule}, {earliest:.9g} to {self.time:.9g} s, but got {time:.9g}")
+        later, session = self._session.belief(), Session(self._filter)
+        at = (later.mean, later.cov)
+        begun = [event.before for event in steps]
+        if any(belief.divergences != later.divergences for belief in begun):
+            raise ValueError(f"time must be after the last restart, but got {time:.9g}")
+        assert isinstance(self._filter, PageFilter)  # as all that have a relation
+        run = passes(self._filter, relation)
+        for event in reversed(steps):
+            parts = [(event.begin, event.end)]
+            if event.begin < time - self._near(time):
+                parts = [(event.begin, time), (time, event.end)]
+            session.load(event.before)
+            beliefs = [(session.mean.copy(), session.cov.copy())]
+            numbers: list[np.ndarray] = []
+            first = 0
+            for start, end in parts:
+                first = len(numbers)  # of the row of `time`
+                for _ in range(self._steps_between(session, start, end)):
+                    session.run("predict", u=event.signal)
+                    beliefs.append((session.mean.copy(), session.cov.copy()))
+                    numbers.append(session.numbers.copy())
+            beliefs[-1] = at
+            means, covs = (np.array(part)[None] for part in zip(*beliefs, strict=True))
+            inputs, restarted = np.tile(event.signal, (1, len(numbers), 1)), np.zeros(means.shape[:2], bool)
+            means, covs = run((means, covs, restarted), inputs, len(numbers), np.array(numbers))
+            at = means[0, first], covs[0, first]
+        return at
+
     def _has_begun(self) -> None:
         if math.isnan(self.time):
             raise ValueError("start(time) must come before predict_to and update")
@@ -221,23 +276,28 @@ class Live:
         return values
 
     def _predict(self, time: float, u: np.ndarray) -> None:
-        session = self._session
         if len(u) != self._inputs:
             raise ValueError(
                 f"predict_to(time, u) must give the input before a sample at {time:.9g} s, a later time"
             )
-        exact = resolution_of(max(abs(time), abs(self.time)), self._resolution)
-        count = count_steps(time - self.time, self._step, exact)
-        length = (time - self.time) / count
         self._remember(time, u)
-        self._set_length(length)
-        if self._noise is not None:
-            session.set_noise(process_noise_cov=self._noise(length))
-        elif not (self._has_one_q and abs(length - self._step) <= closeness(self._step, exact)):
-            session.scale_process_noise(length / self._step)
-        self._repeat(u, count)
+        self._repeat(u, self._steps_between(self._session, self.time, time))
         self._last = u
         self.time, self._acting_input = time, u
+
+    def _steps_between(self, session: Session, begin: float, end: float) -> int:
+        """The number of equal steps between two times [s], for whose length a session gets F and Q."""
+        exact = resolution_of(max(abs(begin), abs(end)), self._resolution)
+        count = count_steps(end - begin, self._step, exact)
+        length = (end - begin) / count
+        self._set_length(length, session)
+        if self._noise is not None:
+            session.set_noise(process_noise_cov=self._noise(length))
+        elif not self._filter.by_length and not (
+            self._has_one_q and abs(length - self._step) <= closeness(self._step, exact)
+        ):
+            session.scale_process_noise(length / self._step)
+        return count
 
     def _repeat(self, u: np.ndarray, count: int) -> None:
         """Predict under one input; if the result is not finite, repeat it and note the last finite belief."""
@@ -255,9 +315,13 @@ class Live:
     def _is_finite(self) -> bool:
         return bool(np.isfinite(self.mean).all() and np.isfinite(self.cov).all())
 
-    def _set_length(self, length: float) -> None:
-        self._length = length
-        self._session.set_dt(length)
+    def _set_length(self, length: float, session: Session) -> None:
+        if session is self._session:
+            self._length = length
+        if self._filter.by_length:
+            session.set_numbers(self._filter.of_length(length).numbers)
+        else:
+            session.set_dt(length)
 
     def _update(self, z: np.ndarray) -> tuple[Alarm, ...]:
         """Update with z (m,); return the alarms of the monitor."""
@@ -291,7 +355,7 @@ class Live:
         raised, self._raised = self._raised[index:], self._raised[:index]
         first = again[0]
         self._session.load(first.before)
-        self._set_length(first.length)
+        self._set_length(first.length, self._session)
         self.time = first.begin
         if self._watch is not None:
             self._watch.recall(first.tests)

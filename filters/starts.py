@@ -86,6 +86,7 @@ def restarts_of(
     *,
     process_noise_covs=None,
     measurement_noise_covs=None,
+    step_filters=None,
 ) -> Restarts | None:
     """The restarts of a filter on runs, from its `divergences` (B,); None if it never restarted.
 
@@ -97,13 +98,18 @@ def restarts_of(
     b, session, first = int(np.flatnonzero(divergences)[0]), Session(filter_), FirstRestart(filter_)
     keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
     for k, measured in enumerate(z[b]):
-        if measurement_noise_covs is not None:
-            session.set_noise(measurement_noise_cov=measurement_noise_covs[k])
+        r = None if measurement_noise_covs is None else measurement_noise_covs[k]
         if k == 0:
+            if r is not None:
+                session.set_noise(measurement_noise_cov=r)
             session.start(keys[b], measured)
         else:
+            if step_filters is not None:
+                session.set_numbers(step_filters[k - 1].numbers)
             if process_noise_covs is not None:
                 session.set_noise(process_noise_cov=process_noise_covs[k - 1])
+            if r is not None:
+                session.set_noise(measurement_noise_cov=r)
             session.step(inputs[b, k - 1], measured)
         first.note(session, inputs[b, k - 1] if k else None, measured)
         if session.divergences:

@@ -28,7 +28,7 @@ from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.streams import filter_keys
 from thruster_env.core.threads import spread
 from thruster_env.logs.grid import count_steps, resolution_of, resolution_of_digits
-from thruster_env.logs.log import in_any_steps, sample_time_place
+from thruster_env.logs.log import in_any_steps
 from thruster_env.logs.table import times_of_index
 from thruster_env.model.continuous import SAME_DT, same_dt
 from thruster_env.model.shape import LANES, with_root
@@ -80,8 +80,11 @@ def run(
     *,
     process_noise_covs: np.ndarray | None = None,
     measurement_noise_covs: np.ndarray | None = None,
+    step_filters: Sequence[Filter] | None = None,
 ) -> Estimates:
     """Filter many trajectories, or one, in one compiled call that uses all cores: `filters.run` on steps of dt.
+
+    `step_filters` are those of each step, (K,), of `Filter.of_length`, in place of the filter.
 
     Raises:
         ValueError: if shapes do not fit or an input is not finite; errors of `ForeignFilter.fill` for estimators.
@@ -97,7 +100,7 @@ def run(
         np.empty((count, times)),
         np.empty(count),
     )
-    noise = noise_rows(filter_, times, process_noise_covs, measurement_noise_covs)
+    noise = noise_rows(filter_, times, process_noise_covs, measurement_noise_covs, step_filters)
     if isinstance(filter_, ForeignFilter):
         filter_.fill(keys, inputs, z, tuple(out))
     else:
@@ -204,18 +207,28 @@ def _floats(name: str, value) -> np.ndarray:
 
 
 def noise_rows(
-    filter_: Filter, times: int, process_noise_covs, measurement_noise_covs
+    filter_: Filter,
+    times: int,
+    process_noise_covs: Any,
+    measurement_noise_covs: Any,
+    step_filters: Sequence[Filter] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows (Q, its root) of each step and (R, its root) of each measurement; no rows for the model's Q or R.
 
-    Raises ValueError for matrices that are no covariances, for wrong shapes, and if the filter cannot take them.
+    With `step_filters` the rows of steps have all numbers of these. Raises ValueError for matrices that are no
+    covariances, for wrong shapes, and if the filter cannot take them.
     """
     filter_.check_noise(process_noise_covs, measurement_noise_covs)
     model = filter_.kernel_model
-    return (
-        _noise_rows("process_noise_covs", process_noise_covs, times - 1, model.t),
-        _noise_rows("measurement_noise_covs", measurement_noise_covs, times, model.m),
-    )
+    qs = _noise_rows("process_noise_covs", process_noise_covs, times - 1, model.t)
+    rs = _noise_rows("measurement_noise_covs", measurement_noise_covs, times, model.m)
+    if step_filters is None:
+        return qs, rs
+    each = {id(step_filter): step_filter.numbers for step_filter in step_filters}
+    numbers, first = np.array([each[id(step_filter)] for step_filter in step_filters]), model.any_shape.offsets.q
+    if len(qs):
+        numbers[:, first : first + qs.shape[1]] = qs
+    return numbers, rs
 
 
 def _noise_rows(name: str, covs, count: int, size: int) -> np.ndarray:
@@ -245,11 +258,12 @@ class Prepared(NamedTuple):
     rows: np.ndarray  # those of the user's measurements
     times: np.ndarray  # of these rows [s]
     is_single: bool = False  # whether the user's trajectory has no axis of a batch
+    step_filters: Sequence[Filter] | None = None  # of each step, where they differ in more than a ratio
 
     @property
     def noise(self) -> dict[str, Any]:
-        """Q of the steps and R of the measurements, by the names of `run`."""
-        names = "process_noise_covs", "measurement_noise_covs"
+        """Q and filters of the steps and R of the measurements, by the names of `run`."""
+        names = "process_noise_covs", "measurement_noise_covs", "step_filters"
         return {name: getattr(self, name) for name in names}
 
 
@@ -278,7 +292,7 @@ def prepared(
         filter_, inputs = filter_.from_first_input(inputs, len(measurements), update_first)
     else:
         filter_.from_first_input(None, 0, update_first)
-    model_dt, fixed = _sample_time(filter_.model), getattr(filter_.model, "dt", None)
+    model_dt, fixed = _sample_time(filter_), getattr(filter_.model, "dt", None)
     if stamps is not None and len(stamps) > 1:
         dt = _steps_of(stamps, fixed if model_dt is None else model_dt, update_first)
     if not update_first:  # a row without a measurement before the first one
@@ -309,7 +323,9 @@ def prepared(
     if not unlike and noise is None:
         return plain
     same_model = filter_.kernel_model is filter_.model and not isinstance(filter_, ForeignFilter)
-    if model_dt is None or not (same_model and type(filter_).any_step):
+    if filter_.by_length and model_dt is None and fixed is None:
+        _ = filter_.sample_time  # raises ValueError with the reason
+    if model_dt is None or not (filter_.by_length or same_model and type(filter_).any_step):
         rule = "steps of different lengths (dt=), or noise=, must be for a model whose sample time is a constant, "
         rule += f"and a filter that evaluates f(x, u) at each step, but got {filter_.name!r}"
         rule += "" if fixed is None else f" for steps of {fixed:g} s"
@@ -323,23 +339,27 @@ def prepared(
     exact = resolution_of(float(times[-1]), 0.0)
     counts = np.array([count_steps(length, model_dt, exact) for length in lengths.tolist()], dtype=int)
     parts = np.repeat(lengths / counts, counts)
-    ratios = np.broadcast_to((parts / model_dt)[None, :, None], (len(z), len(parts), 1))
     user_rows = np.append(0, np.cumsum(counts))
     long_z = np.full((len(z), len(parts) + 1, z.shape[2]), np.nan)
     long_z[:, user_rows] = z
     q, r = process_noise_covs, measurement_noise_covs
     if noise is not None:
-        by_length = {
-            length: as_floats(noise(length)) * (model_dt / length) for length in np.unique(parts).tolist()
-        }
-        q = np.array([by_length[length] for length in parts.tolist()])
+        of_length = {length: as_floats(noise(length)) for length in np.unique(parts).tolist()}
+        q = np.array([of_length[length] for length in parts.tolist()])
     elif q is not None:  # of a whole step, of which each part has its share
-        q = np.repeat(as_floats(q) * (model_dt / lengths)[:, None, None], counts, axis=0)
+        q = np.repeat(as_floats(q) / counts[:, None, None], counts, axis=0)
     if r is not None:
         r = as_floats(r)[np.minimum(np.searchsorted(user_rows, np.arange(len(parts) + 1)), len(r) - 1)]
-    long_u = np.concatenate([np.repeat(inputs, counts, axis=1), ratios], axis=2)
+    long_u, of_user = np.repeat(inputs, counts, axis=1), (user_rows[rows], times[rows], single)
+    if filter_.by_length:
+        known = {text: filter_.of_length(float(text)) for text in {f"{part:.12g}" for part in parts.tolist()}}
+        step_filters = [known[f"{part:.12g}"] for part in parts.tolist()]
+        return Prepared(filter_, keys, long_u, long_z, q, r, *of_user, step_filters)
+    if q is not None:  # which the page multiplies by the ratio
+        q *= (model_dt / parts)[:, None, None]
+    ratios = np.broadcast_to((parts / model_dt)[None, :, None], (len(z), len(parts), 1))
     any_step = replace(filter_, model=in_any_steps(filter_.model))
-    return Prepared(any_step, keys, long_u, long_z, q, r, user_rows[rows], times[rows], single)
+    return Prepared(any_step, keys, np.concatenate([long_u, ratios], axis=2), long_z, q, r, *of_user)
 
 
 def _check_filter(filter_: Any) -> None:
@@ -391,13 +411,12 @@ def _steps_of(times: np.ndarray, usual: float | None, update_first: bool) -> np.
     return steps if update_first else np.append(float(np.median(steps)), steps)
 
 
-def _sample_time(model: StateSpaceModel) -> float | None:
-    """The sample time of a model in which it is a constant [s], else None."""
+def _sample_time(filter_: Filter) -> float | None:
+    """The sample time of a filter in whose model it is a constant [s], else None."""
     try:
-        index, parts = sample_time_place(model, "steps of different lengths")
+        return filter_.sample_time
     except ValueError:
         return None
-    return float(model.constants[index]) * parts
 
 
 def _lengths(dt: Any, steps: int, default: float) -> np.ndarray:

@@ -61,8 +61,9 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                             for i in range(inputs.shape[2]):
                                 us[g, i * width + j] = inputs[b + min(g * width + j, count - 1), k - 1, i]
                     if qs.shape[0] > 0:
+                        first_number = 0 if qs.shape[1] == numbers.shape[0] else q_offset
                         for i in range(qs.shape[1]):
-                            numbers[q_offset + i] = qs[k - 1, i]
+                            numbers[first_number + i] = qs[k - 1, i]
                     for g in range(used):
                         begin(rows[g], us[g], numbers)
                     for _ in range(int(numbers[substeps])):
@@ -181,8 +182,9 @@ def _build_batch(kernels: Kernels) -> Callable:
                     for i in range(u.shape[0]):
                         u[i] = inputs[b, k - 1, i]
                     if qs.shape[0] > 0:
+                        first_number = 0 if qs.shape[1] == numbers.shape[0] else q_offset
                         for i in range(qs.shape[1]):
-                            numbers[q_offset + i] = qs[k - 1, i]
+                            numbers[first_number + i] = qs[k - 1, i]
                     predict(memory, u, numbers, size)
                 for i in range(m):
                     z[i] = measurements[b, k, i]
@@ -223,8 +225,9 @@ def operation_on(kernels: Kernels, given: tuple) -> Callable[[int], int]:
 def batch(kernels: Kernels) -> Callable:
     """`batch(*memory, size, keys, inputs, measurements, numbers, noise, out, first, last)` on trajectories.
 
-    noise = (qs, rs) has a row (Q, its root) for each step and a row (R, its root) for each measurement, in place
-    of the model's, or no rows. They are written into `numbers`, so threads must not share these.
+    noise = (qs, rs) has a row (Q, its root) for each step, or one of all numbers, and a row (R, its root) for each
+    measurement, in place of the model's, or no rows. They are written into `numbers`, so threads must not share
+    these.
     """
     return _function(None if is_interpreting() else _code_one_by_one(kernels), _build_batch, kernels)
 
@@ -273,7 +276,7 @@ def _code_side_by_side(kernels: Kernels) -> Code | None:
 def _shapes_of_data(kernels: Kernels) -> tuple:
     """Lengths of measurements, numbers, noise and estimates."""
     n, m, t = kernels.n, kernels.m, kernels.t
-    noise = [(None, 2 * t * t), (None, 2 * m * m)]
+    noise = [(None, None), (None, 2 * m * m)]
     out = [(None, None, *part) for part in ((n,), (t, t), (m,), (m, m), ())] + [(None,)]
     return (None, None, m), (None,), noise, out
 

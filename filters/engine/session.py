@@ -203,6 +203,11 @@ class Session:
             )
         return self._noise_places.constants + index, parts
 
+    def set_numbers(self, numbers: np.ndarray) -> None:
+        """Use the numbers of `Filter.of_length` from now on."""
+        self._remember_noise()
+        self._numbers[:] = numbers
+
     def set_parameter(self, name: str, value: float) -> None:
         """Use another value of one of the filter's parameters from now on; ValueError for one that it lacks."""
         offset, names = filter_offset(self._filter.kernel_model.any_shape), []

@@ -77,7 +77,7 @@ SCHEDULED = Page(propagate_scheduled, extended.add_process_noise, update_schedul
 class AffineFilter(PageFilter):
     """Base of filters that run on an affine model, or on the affine approximation of a model about one point."""
 
-    any_step: ClassVar[bool] = False  # A and B hold for one sample time
+    any_step: ClassVar[bool] = False  # A and B are those of one sample time
 
     def __post_init__(self):
         point = self.model.operating_state, self.model.operating_input
@@ -122,6 +122,7 @@ class KalmanFilter(AffineFilter):
     """
 
     name: ClassVar[str] = "kf"
+    by_length: ClassVar[bool] = True
     page: ClassVar[Page] = ExtendedKalmanFilter.page
     forms: ClassVar[Mapping[str, Page]] = {"information": INFORMATION, **ExtendedKalmanFilter.forms}
     form: str = "covariance"

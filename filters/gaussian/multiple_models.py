@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -20,125 +20,19 @@ from filters.augmented import embedded_model, places_within
 from filters.engine.belief import Belief, Kernels, filter_offset, memory_offsets, restart_if_lost
 from filters.filter import Filter
 from filters.gaussian.mixtures import Parts, blender, log_weigher, logarithm, nothing, parts_of
+from filters.gaussian.unequal_modes import Absent, absent_states, completer
 from filters.pages.kernels import anything_measured, nothing_to_summarise, stored, works_of
 from thruster_env.core.checks import as_floats, between, one_of, positive, short_repr, vector
 from thruster_env.graphs.programs import Place
+from thruster_env.logs.log import in_steps_of, sample_time_of
+from thruster_env.model.continuous import same_dt
 from thruster_env.model.shape import Shape, number_offsets, starts_of
 from thruster_env.model.state_space import StateSpaceModel
-
-# Unbiased mixing. A mode whose model lacks states s gets, before each mixture of weights w_i,
-#
-#     mean (x, m_s),  covariance (P, 0; 0, P_s)
-#
-# with m_s, P_s of the mixture of the modes that have s, w_i/(sum of their w): so the mixture's mean of s is m_s.
-# Covariances between states that the same modes lack stay; if modes that have s all weigh zero, so does s.
-#
-# Source: Yuan, Bar-Shalom, Willett, Mozeson, Pollak, Hardiman (2012), "A multiple IMM estimation approach with
-# unbiased mixing for thrusting projectiles"; Granstrom, Willett, Bar-Shalom (2015), "Systematic approach to IMM
-# mixing for unequal dimension states".
-
-
-class Absent(NamedTuple):
-    """States that some modes lack.
-
-    Attributes:
-        states: their indices.
-        modes: the modes that lack them.
-        from_prior: whether they get the prior moments of these modes' models, not moments of the other modes.
-    """
-
-    states: tuple[int, ...]
-    modes: tuple[int, ...]
-    from_prior: bool
-
-
-def absent_states(
-    states_of_modes: Sequence[tuple[int, ...]], n: int, moments_known: Sequence[int]
-) -> tuple[Absent, ...]:
-    """The states, of n, that modes with `states_of_modes` lack, in groups that the same modes lack.
-
-    A state of `moments_known` is a group of its own.
-    """
-    lacking: dict[tuple, list[int]] = {}
-    for state in range(n):
-        modes = tuple(k for k, states in enumerate(states_of_modes) if state not in states)
-        if modes:
-            lacking.setdefault((modes, state if state in moments_known else -1), []).append(state)
-    return tuple(Absent(tuple(states), modes, state >= 0) for (modes, state), states in lacking.items())
-
-
-def completer(
-    absent: tuple[Absent, ...],
-    parts: Parts,
-    n: int,
-    blend: Callable,
-    priors: Sequence[tuple[int, int]],
-    scratch: int,
-) -> Callable:
-    """Return `complete(row, weights, numbers)`: fill in the states that parts lack, by unbiased mixing.
-
-    Mean and covariance come first in each part. `priors` are the offsets of the prior mean and covariance of each
-    mode's model in the filter's numbers; from `scratch` on the row has room for weights, a mean and a covariance.
-    """
-    complete = nothing
-    for group in absent:
-        if group.from_prior:
-            complete = _from_prior(complete, group, parts, n, priors)
-        else:
-            complete = _of_others(complete, group, parts, n, blend, scratch)
-    return complete
-
-
-def _from_prior(
-    before: Callable, absent: Absent, parts: Parts, n: int, priors: Sequence[tuple[int, int]]
-) -> Callable:
-    """Fill in a state with the prior's moments of the modes' models."""
-    (state,), (first, stride, _) = absent.states, parts
-    offsets = tuple(
-        (first + k * stride, priors[k][0] + state, priors[k][1] + state * (n + 1)) for k in absent.modes
-    )
-
-    def complete(row, weights, numbers):
-        before(row, weights, numbers)
-        for part, mean, variance in offsets:
-            row[part + state] = numbers[mean]
-            for t in range(n):
-                row[part + n + state * n + t] = row[part + n + t * n + state] = 0.0
-            row[part + n + state * (n + 1)] = numbers[variance]
-
-    return complete
-
-
-def _of_others(before: Callable, absent: Absent, parts: Parts, n: int, blend: Callable, scratch: int) -> Callable:
-    """Fill in states with their moments in the mixture of the other modes."""
-    (states, modes, _), (first, stride, count), moments = absent, parts, scratch + parts.number
-
-    def complete(row, weights, numbers):
-        before(row, weights, numbers)
-        total = 0.0
-        for k in range(count):
-            row[scratch + k] = 0.0 if k in modes else row[weights + k]
-            total += row[scratch + k]
-        if total > 0.0:
-            for k in range(count):
-                row[scratch + k] /= total
-            blend(row, scratch, moments)
-            for k in modes:
-                part = first + k * stride
-                for s in states:
-                    row[part + s] = row[moments + s]
-                    for t in range(n):
-                        row[part + n + s * n + t] = row[part + n + t * n + s] = 0.0
-                for s in states:
-                    for t in states:
-                        row[part + n + s * n + t] = row[moments + n + s * n + t]
-
-    return complete
-
 
 LOST = 700.0  # log-likelihood of a mode whose filter restarts: this much below the least of the other modes
 MOST_MODES = 32
 SUM_TOLERANCE = 1e-9
+SINGULAR = 1e-12  # determinant of a transition matrix without a logarithm
 USUAL_FACTORS = (0.1, 1.0, 10.0)  # on Q
 
 
@@ -323,11 +217,12 @@ class MultipleModelFilter(Filter):
         mode_filter: name of a Gaussian filter for all modes, such as "kf", "ekf" or "ukf", or one for each.
         probabilities: initial probabilities p (K,) of the modes; `usual_probabilities` if None.
         absent: mean and variance of a state, by symbol, in modes that lack it; by default modes that lack a state
-            get the moments of the modes that have it (`filters.gaussian.multiple_models`).
+            get the moments of the modes that have it (`filters.gaussian.unequal_modes`).
     """
 
     one_model: ClassVar[bool] = False
     any_step: ClassVar[bool] = False
+    by_length: ClassVar[bool] = True
     gaussian_likelihood: ClassVar[bool] = False
     varying_noise: ClassVar[bool] = False  # each mode has Q and R of its own
     mixing: ClassVar[Callable | None] = None  # see `mode_kernels`
@@ -428,6 +323,35 @@ class MultipleModelFilter(Filter):
             if i not in moments_by_index and not any(i in indices for indices in self._places):
                 raise ValueError(f"each state must be one of a mode's, or of absent, but {name!r} is of none")
         return moments_by_index
+
+    @cached_property
+    def sample_time(self) -> float:
+        """That of all modes [s]; ValueError if they differ, or a mode's filter has the gain of one."""
+        what = f"steps of any length of {self.name!r}"
+        of_modes = [sample_time_of(model, what) for model in (self.model, *self._mode_models)]
+        if not all(same_dt(dt, of_modes[0]) for dt in of_modes):
+            raise ValueError(f"modes must have one sample time for steps of any length, but got {of_modes}")
+        for mode in self.mode_filters:
+            if not (mode.any_step or mode.by_length):
+                raise ValueError(f"a mode's filter must take steps of any length, but got {mode.name!r}")
+        return of_modes[0]
+
+    def of_length(self, length: float) -> Self:
+        """The filter with the modes of another sample time [s], and their transitions within it."""
+        ratio = length / self.sample_time
+        if same_dt(ratio, 1.0):
+            return self
+        modes = [in_steps_of(model, length) for model in self._mode_models]
+        changes: dict[str, Any] = {
+            "model": in_steps_of(self.model, length),
+            "modes": modes,
+            "probabilities": self.p,
+        }
+        return dataclasses.replace(self, **changes, **self._transitions(ratio))
+
+    def _transitions(self, ratio: float) -> dict[str, Any]:
+        """The field that has Pi of a part of a step, if there is one."""
+        return {}
 
     @cached_property
     def absent_states(self) -> tuple[Absent, ...]:
@@ -557,6 +481,22 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
         count, transition = len(self.mode_filters), self.transition
         transition = self.stay * np.eye(count) + (1.0 - self.stay) * self.p if transition is None else transition
         return probabilities_of("transition", transition, (count, count))
+
+    def _transitions(self, ratio: float) -> dict[str, Any]:
+        """Pi of a part of a step, exp(ratio log Pi): of `stay` it is stay^ratio I + (1 - stay^ratio) 1 p'."""
+        if self.transition is None:
+            stay = self.stay**ratio
+            return {"transition": stay * np.eye(len(self.p)) + (1.0 - stay) * self.p}
+        from scipy.linalg import expm, logm  # which take long to import
+
+        matrix = self.transition_matrix
+        rates = logm(matrix) if np.linalg.det(matrix) > SINGULAR else np.full(matrix.shape, np.nan)
+        between = np.where(np.eye(len(matrix)), 0.0, rates.real)
+        if np.abs(np.imag(rates)).max() > SUM_TOLERANCE or not between.min() >= -SUM_TOLERANCE:
+            rule = "transition must be that of a chain in continuous time for steps of different lengths"
+            raise ValueError(f"{rule}, with rates log(Pi) of no negative sign, but got {matrix.tolist()}")
+        powers = np.maximum(expm(ratio * rates.real), 0.0)
+        return {"transition": powers / powers.sum(axis=1, keepdims=True)}
 
 
 # Multiple model adaptive estimation: which one of several models is right.

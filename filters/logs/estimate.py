@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.engine.batch import Estimates, estimates_of, run
+from filters.engine.batch import Estimates, estimates_of, prepared, run
 from filters.engine.session import Session
 from filters.estimators.foreign import Estimator, ForeignFilter
 from filters.filter import Filter
 from filters.live import Live
-from filters.smoothers.smooth import smoothed
+from filters.smoothers.smooth import smoothed_rows
 from filters.starts import FirstRestart, Restarts
 from filters.wrappers.arguments import filter_for
 from thruster_env.core.checks import at_least
@@ -180,14 +180,15 @@ def estimate_with(
     measurements = seen_by(filter_.model, log.measurements)
     data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], measurements[None]
     if log.stamps is not None:
-        if smoother:
-            raise ValueError(f"a smoother must run on a grid, but log {log.name} has its own stamps")
         estimates, restarts = by_the_clock(filter_, data[0][0], log, noise)
     elif isinstance(filter_, ForeignFilter):
         estimates, restarts = run(filter_, *data), None
     else:
         estimates, restarts = _stepped(filter_, *data)
-    means, covs = smoothed(filter_, *data, lag)[0] if smoother else (estimates.means, estimates.covs)
+    means, covs = estimates.means, estimates.covs
+    if smoother:
+        dt = None if log.stamps is None else np.diff(log.times)
+        means, covs = smoothed_rows(prepared(filter_, *data, dt=dt, noise=noise), lag)[0]
     likelihoods = estimates.log_likelihoods[0]
     return LogEstimate(
         log,

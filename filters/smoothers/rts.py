@@ -96,6 +96,7 @@ def smooth_backwards(
     inputs: np.ndarray,
     lag: int,
     process_noise: np.ndarray,
+    rows: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Means (B, K + 1, n) and covariances given `lag` later measurements, from a filter's estimates.
 
@@ -109,6 +110,7 @@ def smooth_backwards(
         inputs: (B, K, p).
         lag: number of later measurements, 0 ... K.
         process_noise: rows (Q, its root) of each step, of `filters.engine.batch.noise_rows`; none for the model's.
+        rows: those of the measurements that `lag` counts, where others have none; None for all.
     """
     model, angles = filter_.kernel_model, filter_.kernel_model.any_shape.state_angles
     # A restarted belief is the prior; a belief may also be the prior without a restart.
@@ -117,29 +119,44 @@ def smooth_backwards(
     is_prior = means_alike & (estimates.covs == model.prior_cov).all(axis=(-2, -1))
     filtered = estimates.means, estimates.covs, is_prior & (estimates.divergences > 0)[:, None]
     numbers = filter_.numbers[None]
-    if len(process_noise):
+    if process_noise.shape[1] == numbers.shape[1]:
+        numbers = process_noise
+    elif len(process_noise):
         numbers, q = np.repeat(numbers, len(process_noise), axis=0), model.any_shape.offsets.q
         numbers[:, q : q + process_noise.shape[1]] = process_noise
-    return passes(filter_, relation)(filtered, inputs, lag, numbers)
+    return passes(filter_, relation)(filtered, inputs, lag, numbers, rows)
+
+
+def earliest_rows(times: int, lag: int, rows: np.ndarray | None = None) -> np.ndarray:
+    """The row that a measurement in each of `times` rows reaches back to: that of `lag` measurements before."""
+    rows, earliest = np.arange(times) if rows is None else rows, np.arange(float(times))
+    earliest[rows] = rows[np.maximum(np.arange(len(rows)) - lag, 0)]
+    return earliest
 
 
 def passes(filter_: PageFilter, relation: Relation) -> Callable[..., tuple]:
     """Return the function that makes the smoother's passes.
 
     It takes a filter's estimates, the inputs, the lag, and the numbers that the filter used: (1, count) for all
-    steps or (K, count) for each; those of the filter if None.
+    steps or (K, count) for each; those of the filter if None; and the rows that the lag counts, all if None.
     """
     functions, of_filter, model = filter_.kernel_model.functions, filter_.numbers[None], filter_.kernel_model
     shape = model.any_shape
     run_part = _smoother(relation, filter_.written_page, functions, shape, is_interpreting())
 
     def smoothed(
-        filtered: Given, inputs: np.ndarray, lag: int, numbers: np.ndarray | None = None
+        filtered: Given,
+        inputs: np.ndarray,
+        lag: int,
+        numbers: np.ndarray | None = None,
+        rows: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         numbers = of_filter if numbers is None else numbers
         arrays = tuple(np.ascontiguousarray(part, dtype=np.float64) for part in (*filtered, inputs))
         means, covs = np.empty_like(arrays[0]), np.empty_like(arrays[1])
-        work = partial(run_part, arrays[:3], arrays[3], numbers, lag, means, covs)
+        earliest = earliest_rows(inputs.shape[1] + 1, lag, rows)
+        begin = lag if rows is None else int(rows[lag])
+        work = partial(run_part, arrays[:3], arrays[3], numbers, begin, earliest, means, covs)
         work(0, 1) if len(means) == 1 else spread(work, len(means))
         return means, covs
 
@@ -183,7 +200,7 @@ def _smoother(relation: Relation, page: Page, functions: Functions, shape: Shape
         for i in range(count):
             target[at + i] = source[first + i]
 
-    def smooth(estimates, inputs, numbers, lag, means, out_covs, first, last):
+    def smooth(estimates, inputs, numbers, begin, earliest, means, out_covs, first, last):
         filtered, covs, restarted = estimates
         steps = inputs.shape[1]
         u, row, links = np.zeros(inputs.shape[2]), np.zeros(length), np.zeros(steps * width)
@@ -209,16 +226,17 @@ def _smoother(relation: Relation, page: Page, functions: Functions, shape: Shape
                     copy(row, link_offset, row, mean_offset, n)
                     copy(row, link_offset + belief, row, mean_offset + n, t * t)
                 copy(links, k * width, row, link_offset, width)
-            for end in range(lag, steps + 1):
+            for end in range(begin, steps + 1):
                 put(row, later_offset, filtered, covs, b, end)
-                for k in range(end, end - lag - 1, -1):
+                back_to = int(earliest[end])
+                for k in range(end, back_to - 1, -1):
                     if k < end:
                         for i in range(n):
                             row[mean_offset + i] = filtered[b, k, i]
                         copy(row, link_offset, links, k * width, width)
                         correct(row, u, now)
                         copy(row, later_offset, row, mean_offset, belief)
-                    if end == steps or k == end - lag:
+                    if end == steps or k == back_to:
                         for i in range(n):
                             means[b, k, i] = row[later_offset + i]
                         for i in range(t):
@@ -226,7 +244,7 @@ def _smoother(relation: Relation, page: Page, functions: Functions, shape: Shape
                                 out_covs[b, k, i, j] = row[later_offset + n + i * t + j]
 
     estimates = [(None, None, n), (None, None, t, t), (None, None)]
-    shapes = estimates, (None, None, None), (None, None), None, *estimates[:2], None, None
+    shapes = estimates, (None, None, None), (None, None), None, (None,), *estimates[:2], None, None
     from thruster_env.graphs.loops import Loops
 
     return Loops(smooth, shapes)

@@ -8,13 +8,13 @@ state some steps ago from all measurements so far.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.engine.batch import Beliefs, noise_rows, prepared, run, trajectories
+from filters.engine.batch import Beliefs, Prepared, noise_rows, prepared, run, trajectories
 from filters.engine.belief import Kernels, constrained, memory_offsets, restart_if_lost
 from filters.engine.compile import new_memory
 from filters.engine.session import Session
@@ -22,10 +22,10 @@ from filters.ensembles.ensemble import EnsembleFilter, named
 from filters.filter import Filter, PageFilter
 from filters.gaussian.multiple_models import MultipleModelFilter
 from filters.pages.kernels import analysis_of
-from filters.smoothers.rts import passes, relation_of, smooth_backwards
+from filters.smoothers.rts import earliest_rows, passes, relation_of, smooth_backwards
 from filters.starts import warn_of_restarts
 from thruster_env.core.angles import difference, wrapped_where
-from thruster_env.core.checks import at_least, short_repr
+from thruster_env.core.checks import at_least
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.sources import joiner, vector_part, written_out
 from thruster_env.core.threads import spread
@@ -45,7 +45,7 @@ from thruster_env.model.turns import refuse_rotations
 # The differences between modes i that lead to j count in the smoothed P_j, and again between the x_ij, so P is
 # rather too large. The smoothed x_j has no states that mode j lacks: their prediction from x_i, given the other
 # states, replaces them. After each step a mode gets them from modes that have them
-# (`filters.gaussian.multiple_models`).
+# (`filters.gaussian.unequal_modes`).
 #
 # Source: Kim (1994), "Dynamic linear models with Markov-switching", and for the density Koch (2000), "Fixed-
 # interval retrodiction approach to Bayesian IMM-MHT for maneuvering multiple targets".
@@ -125,7 +125,9 @@ def merged(weights, means, covs, angles) -> tuple[np.ndarray, np.ndarray]:
     return wrapped_where(likely[:, 0] + shift, angles), 0.5 * (cov + np.swapaxes(cov, 1, 2))
 
 
-def filtered(filter_: MultipleModelFilter, keys, inputs, z) -> tuple[np.ndarray, ...]:
+def filtered(
+    filter_: MultipleModelFilter, keys, inputs, z, step_filters: Sequence[MultipleModelFilter] | None = None
+) -> tuple[np.ndarray, ...]:
     """Means (B, K + 1, M, n), covariances, log probabilities of the modes, full restarts, and numbers of restarts.
 
     A full restart, (B, K + 1) bool, is a step in which all modes restart; the number (B,) is that of the filter,
@@ -138,6 +140,8 @@ def filtered(filter_: MultipleModelFilter, keys, inputs, z) -> tuple[np.ndarray,
     for b in range(count):
         for k in range(times):
             if k:
+                if step_filters is not None:
+                    session.set_numbers(step_filters[k - 1].numbers)
                 session.step(inputs[b, k - 1], z[b, k])
             else:
                 session.start(keys[b], z[b, 0])
@@ -189,16 +193,15 @@ def smoothed_modes(
     keys: np.ndarray | None,
     inputs: np.ndarray | None,
     measurements: np.ndarray | None,
+    step_filters: Sequence[MultipleModelFilter] | None = None,
 ) -> tuple[SmoothedModes, np.ndarray]:
     """The result of `smooth_modes`, and the filter's restarts (B,) in the forward pass, without a warning."""
     keys, inputs, measurements = trajectories(filter_, keys, inputs, measurements)
     relations = [relation_of(filter_of_mode, "a mode of a smoother") for filter_of_mode in filter_.mode_filters]
-    kinds = [filter_of_mode for filter_of_mode in filter_.mode_filters if isinstance(filter_of_mode, PageFilter)]
-    steps = [passes(filter_of_mode, relation) for filter_of_mode, relation in zip(kinds, relations, strict=True)]
-    means, covs, logs, restarted, divergences = filtered(filter_, keys, inputs, measurements)
+    kinds: Any = filter_.mode_filters  # which have pages, as they have relations
+    steps = [passes(kind, relation) for kind, relation in zip(kinds, relations, strict=True)]
+    means, covs, logs, restarted, divergences = filtered(filter_, keys, inputs, measurements, step_filters)
     mu, angles = np.exp(logs), filter_.model.shape.state_angles
-    with np.errstate(divide="ignore"):
-        log_transition = np.log(filter_.transition_matrix)
     count, times, modes, n = means.shape
     absent = [
         {i for group in filter_.absent_states if j in group.modes for i in group.states} for j in range(modes)
@@ -210,6 +213,10 @@ def smoothed_modes(
     for k in reversed(range(times - 1)):
         pair_x, pair_p = np.empty((count, modes, modes, n)), np.empty((count, modes, modes, n, n))
         levels = np.empty((count, modes, modes))
+        of_step = filter_ if step_filters is None else step_filters[k]
+        kinds = of_step.mode_filters
+        with np.errstate(divide="ignore"):
+            log_transition = np.log(of_step.transition_matrix)
         anew = np.stack([np.zeros(count, bool), restarted[:, k + 1]], axis=1)
         for i, j in np.ndindex(modes, modes):
             begun = means[:, k, i], covs[:, k, i]
@@ -217,7 +224,7 @@ def smoothed_modes(
                 kinds[j], states_of_modes[j], *begun, inputs[:, k], x[:, j], p[:, j]
             )
             ends = np.stack([begun[0], later], axis=1), np.stack([begun[1], later_cov], axis=1), anew
-            corrected, cov = steps[j](ends, inputs[:, k : k + 1], 1)
+            corrected, cov = steps[j](ends, inputs[:, k : k + 1], 1, kinds[j].numbers[None])
             pair_x[:, i, j], pair_p[:, i, j] = corrected[:, 0], cov[:, 0]
         w = weights_of(log_transition + logs[:, k, :, None], levels)
         joint = w * estimates.probabilities[:, k + 1, None, :]  # of modes i at k and j at k + 1
@@ -237,13 +244,13 @@ def smooth_ensembles(
     keys: np.ndarray,
     inputs: np.ndarray,
     measurements: np.ndarray,
-    lag: int,
+    earliest: np.ndarray,
     noise: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means (B, K + 1, n) and covariances of an ensemble given `lag` later measurements, and restarts (B,).
+    """Means (B, K + 1, n) and covariances of an ensemble given some later measurements, and restarts (B,).
 
     The analysis of measurement k is repeated for each pair (x_k, x_l) of the members now and at an earlier step l
-    >= k - lag, with a state of twice the size whose first half is measured. So the members of step l get the
+    >= earliest[k], with a state of twice the size whose first half is measured. So the members of step l get the
     analysis that they would get as part of one long state: with perturbed measurements
     x_lj += cov(x_l, y) S^-1 (z - v_j - y_j). Relaxation acts only on the members now, and steps before a restart
     from the prior are not changed.
@@ -271,7 +278,7 @@ def smooth_ensembles(
         history = np.zeros((times * n, now[1].shape[1]))
         numbers = filter_.numbers, paired.numbers
         data = keys, inputs, measurements, *noise
-        smooth(now, pair, history, size, data, numbers, lag, out, first, last)
+        smooth(now, pair, history, size, data, numbers, earliest, out, first, last)
 
     spread(part, count)
     return out
@@ -321,7 +328,7 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
             for j in range(target.shape[1]):
                 target[at + i, j] = source[first + i, j]
 
-    def smooth(now, pair, history, size, data, numbers, lag, out, first, last):
+    def smooth(now, pair, history, size, data, numbers, earliest, out, first, last):
         keys, inputs, measurements, qs, rs = data
         means, covs, restarts = out
         row, table, _ = now
@@ -359,7 +366,7 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
                 pair_row[pair_step] = row[step]
                 for i in range(feed):
                     pair_row[pair_acting + i] = row[acting + i]
-                for past in range(max(oldest, k - lag), k):
+                for past in range(max(oldest, int(earliest[k])), k):
                     copy(pair_table, 0, forecast, 0)
                     copy(pair_table, n, history, past * n)
                     analyse_pair(pair, z, pair_numbers, size)
@@ -377,7 +384,7 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
     out = [(None, None, n), (None, None, n, n), (None,)]
     from thruster_env.graphs.loops import Loops
 
-    return Loops(smooth, (memory, memory, (None, None), None, data, [(None,), (None,)], None, out, None, None))
+    return Loops(smooth, (memory, memory, (None, None), None, data, [(None,), (None,)], (None,), out, None, None))
 
 
 class Smoothed(NamedTuple):
@@ -450,15 +457,17 @@ def smooth(
     """
     covs = process_noise_covs, measurement_noise_covs
     data = prepared(filter_, keys, inputs, measurements, *covs, dt=dt, noise=noise, update_first=update_first)
-    if lag is not None and len(data.rows) < data.measurements.shape[1] - (not update_first):
-        raise ValueError(
-            f"lag must be left out where steps are longer than the model's, but got {short_repr(lag)}"
-        )
-    arguments = data.keys, data.inputs, data.measurements
-    estimates, divergences = smoothed(data.filter, *arguments, lag, **data.noise)
-    warn_of_restarts(data.filter, divergences, *arguments, **data.noise)
-    estimates = Smoothed(*(part[:, data.rows] for part in estimates))
+    estimates, divergences = smoothed_rows(data, lag)
+    warn_of_restarts(data.filter, divergences, data.keys, data.inputs, data.measurements, **data.noise)
     return Smoothed(*(part[0] for part in estimates)) if data.is_single else estimates
+
+
+def smoothed_rows(data: Prepared, lag: int | None) -> tuple[Smoothed, np.ndarray]:
+    """`smoothed` at the rows of the user's measurements, which the lag counts."""
+    rows = None if lag is None or len(data.rows) == data.measurements.shape[1] else data.rows
+    arguments = data.keys, data.inputs, data.measurements
+    estimates, divergences = smoothed(data.filter, *arguments, lag, rows=rows, **data.noise)
+    return Smoothed(*(part[:, data.rows] for part in estimates)), divergences
 
 
 def smoothed(
@@ -468,21 +477,29 @@ def smoothed(
     measurements: np.ndarray | None,
     lag: int | None = None,
     *,
+    rows: np.ndarray | None = None,
     process_noise_covs: np.ndarray | None = None,
     measurement_noise_covs: np.ndarray | None = None,
+    step_filters: Sequence[Filter] | None = None,
 ) -> tuple[Smoothed, np.ndarray]:
-    """The result of `smooth`, and the filter's restarts (B,) in the forward pass, without a warning."""
+    """The result of `smooth`, and the filter's restarts (B,) in the forward pass, without a warning.
+
+    The lag counts `rows`, all if None; `step_filters` are those of `filters.engine.batch.run`.
+    """
     keys, inputs, measurements = trajectories(filter_, keys, inputs, measurements)
-    steps = inputs.shape[1]
-    lag = steps if lag is None else min(at_least("lag", lag, 0), steps)
-    noise = noise_rows(filter_, steps + 1, process_noise_covs, measurement_noise_covs)
+    most = (inputs.shape[1] + 1 if rows is None else len(rows)) - 1
+    lag = most if lag is None else min(at_least("lag", lag, 0), most)
+    noise = noise_rows(filter_, inputs.shape[1] + 1, process_noise_covs, measurement_noise_covs, step_filters)
     if isinstance(filter_, EnsembleFilter):
-        *smoothed_moments, divergences = smooth_ensembles(filter_, keys, inputs, measurements, lag, noise)
+        *smoothed_moments, divergences = smooth_ensembles(
+            filter_, keys, inputs, measurements, earliest_rows(inputs.shape[1] + 1, lag, rows), noise
+        )
         return Smoothed(*smoothed_moments), divergences
     if isinstance(filter_, MultipleModelFilter):
-        if lag < steps:
+        if lag < most:
             raise ValueError(f"a filter of several models must be smoothed without a lag, but got {lag}")
-        of_modes, divergences = smoothed_modes(filter_, keys, inputs, measurements)
+        of_steps: Any = step_filters
+        of_modes, divergences = smoothed_modes(filter_, keys, inputs, measurements, of_steps)
         return Smoothed(of_modes.means, of_modes.covs), divergences
     bounds, by = filter_.model.bounds, filter_.model.bounded_by
     if bounds:
@@ -490,8 +507,8 @@ def smoothed(
     relation = relation_of(filter_, "a smoother", ", imm, mmae or an ensemble Kalman filter")
     assert isinstance(filter_, PageFilter)
     covs = {"process_noise_covs": process_noise_covs, "measurement_noise_covs": measurement_noise_covs}
-    estimates = run(filter_, keys, inputs, measurements, **covs)
-    free = smooth_backwards(filter_, relation, estimates, inputs, lag, noise[0])
+    estimates = run(filter_, keys, inputs, measurements, **covs, step_filters=step_filters)
+    free = smooth_backwards(filter_, relation, estimates, inputs, lag, noise[0], rows)
     return Smoothed(*(constrained(*free, bounds, by) if bounds else free)), estimates.divergences
 
 

@@ -209,8 +209,8 @@ def test_samples_from_before_the_start_nan_and_models_without_a_dt_are_refused()
         live = make_filter("ekf", thruster_model()).live()
         live.start(1.0)
         live.update(2.0, "thrust", 0.1)
-    with pytest.raises(ValueError, match="'kf' has the A and B of one dt: 'ekf' is the Kalman filter at any dt"):
-        make_filter("kf", thruster_model()).live()
+    with pytest.raises(ValueError, match="'kf-steady' has the A and B of one dt: 'ekf' is the Kalman filter at"):
+        make_filter("kf-steady", thruster_model()).live()
 
 
 def test_a_channel_may_have_a_function_of_its_own():

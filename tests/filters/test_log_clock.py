@@ -22,12 +22,13 @@ def table(stamps, seed=0, missing=()):
     return {"time_s": stamps, "V_s": 8.0 * np.sign(np.sin(3.0 * stamps)) + 0.1, "thrust": thrust}
 
 
-@pytest.mark.parametrize("name", ["ekf", "ukf", "enkf", "sage-husa", "pf"])
+@pytest.mark.parametrize("name", ["ekf", "kf", "enkf", "sage-husa", "pf"])
 def test_where_stamps_lie_on_the_grid_the_numbers_are_those_of_the_grid(name):
     stamps = 100.0 + 0.01 * np.delete(np.arange(200), [50, 51, 120])  # rows that are missing
     data = table(stamps, missing=[20, 21, 22])
-    on_grid = estimate(data, name, thruster_model)
-    own = estimate(data, name, thruster_model, grid=False)
+    smoother = {"ekf": {"lag": 300}, "kf": {"smoother": True}}.get(name, {})
+    on_grid = estimate(data, name, thruster_model, **smoother)
+    own = estimate(data, name, thruster_model, grid=False, **smoother)
     rows = np.round((stamps - 100.0) / 0.01).astype(int)
     assert own.log.steps + 1 == len(stamps) < on_grid.log.steps + 1 == 200
     np.testing.assert_allclose(own.log.times, stamps - 100.0, atol=1e-12)
@@ -80,8 +81,10 @@ def test_a_clock_offset_moves_stamps_and_inputs_are_held_from_their_own():
 @pytest.mark.parametrize(
     "call, rule",
     [
-        (lambda data: estimate(data, "ekf", thruster_model, grid=False, smoother=True), "a smoother must run on"),
-        (lambda data: estimate(data, "kf", thruster_model, grid=False), "'kf' has the A and B of one dt"),
+        (
+            lambda data: estimate(data, "kf-steady", thruster_model, grid=False),
+            "'kf-steady' has the A and B of one dt",
+        ),
         (
             lambda data: estimate(data, "ekf", logged_model(lag={"thrust": 0.02}), grid=False),
             "a model whose other constants do not follow from dt",

@@ -243,7 +243,6 @@ def test_what_is_refused(changes, rule):
 def test_the_sample_times_of_several_models_do_not_change(name):
     filter_ = make_filter(name, thruster_model())
     for use in (
-        filter_.live,
         lambda: filter_.session().set_dt(0.02),
         lambda: filter_.session().scale_process_noise(2.0),
     ):

@@ -3,16 +3,21 @@
 import numpy as np
 import pandas
 import pytest
+from scipy.linalg import expm
 
 import filters
 from filters.models import kalman_filter
 from filters.plants import pendulum
+from tests.filters.test_live import A, oscillator
 
 rng = np.random.default_rng(3)
 Z = np.cumsum(rng.normal(size=30))
 LEVEL = kalman_filter("constant-velocity", dt=0.1, noise=1.0, acceleration=1.0)
 PLANT, DT = pendulum(), 0.05
 LENGTHS, U = rng.uniform(0.02, 0.13, 29), rng.normal(size=29)
+OSCILLATOR = oscillator(operating_state=[0.0, 0.0], operating_input=[0.0])
+LINEAR, MEASURED = OSCILLATOR.at(DT, substeps=4), rng.normal(size=(30, 2))
+MEASURED[4], MEASURED[7, 0] = np.nan, np.nan
 
 
 def test_a_run_of_a_list_a_table_or_a_batch_is_a_table_and_a_picture(as_python):
@@ -63,6 +68,92 @@ def test_steps_of_any_length_are_those_of_a_live_filter(noise):
         np.testing.assert_allclose(smoothed.means, by_hand(filter_, estimates), rtol=1e-6, atol=1e-9)
 
 
+def normal_posterior(q_of_length):
+    """Mean and covariance of all states of the oscillator, (K + 1, 2), from their joint normal distribution."""
+    f, b, times = [], [], np.append(0.0, np.cumsum(LENGTHS))
+    slope = np.zeros((3, 3))
+    slope[:2, :2], slope[1, 2] = A, 1.0
+    for length in LENGTHS.tolist():
+        moved = expm(slope * length)
+        f, b = [*f, moved[:2, :2]], [*b, moved[:2, 2]]
+    mean, cov = [np.array([0.5, 0.0])], np.zeros((2 * len(times), 2 * len(times)))
+    cov[:2, :2] = np.diag([0.3, 0.2])
+    for k, length in enumerate(LENGTHS.tolist()):
+        at, last = slice(2 * k + 2, 2 * k + 4), slice(2 * k, 2 * k + 2)
+        mean.append(f[k] @ mean[-1] + b[k] * U[k])
+        cov[at, : 2 * k + 2] = f[k] @ cov[last, : 2 * k + 2]
+        cov[: 2 * k + 2, at] = cov[at, : 2 * k + 2].T
+        cov[at, at] = f[k] @ cov[last, last] @ f[k].T + q_of_length(length)
+    mean, measured = np.concatenate(mean), np.flatnonzero(~np.isnan(MEASURED.ravel()))
+    s = cov[np.ix_(measured, measured)] + np.diag(np.tile([0.02, 0.1], len(times))[measured])
+    gain = np.linalg.solve(s, cov[measured]).T
+    return (mean + gain @ (MEASURED.ravel() - mean)[measured]).reshape(-1, 2), cov - gain @ cov[measured]
+
+
+def test_a_kalman_filter_in_steps_of_any_length_is_exact_and_smooths_late_samples_as_those_in_time():
+    kf = filters.make_filter("kf", LINEAR)
+    data: dict = {"inputs": U, "measurements": MEASURED, "dt": LENGTHS, "noise": OSCILLATOR.noise}
+    mean, cov = normal_posterior(OSCILLATOR.noise)
+    smoothed, estimates = filters.smooth(kf, **data), filters.run(kf, **data)
+    np.testing.assert_allclose(smoothed.means, mean, rtol=1e-6, atol=1e-7)
+    for k in range(len(mean)):
+        block = slice(2 * k, 2 * k + 2)
+        np.testing.assert_allclose(smoothed.covs[k], cov[block, block], rtol=1e-5, atol=1e-9)
+    np.testing.assert_array_equal(filters.smooth(kf, **data, lag=0).means, estimates.means)
+    lagged, times = filters.smooth(kf, **data, lag=3), np.append(0.0, np.cumsum(LENGTHS))
+    in_time, late = (kf.live(noise=OSCILLATOR.noise, late=5.0) for _ in range(2))
+    for live in (in_time, late):
+        live.start(0.0, MEASURED[0])
+    for k, (u, z) in enumerate(zip(U, MEASURED[1:], strict=True)):
+        in_time.predict_to(times[k + 1], [u])
+        in_time.update(times[k + 1], None, z)
+        late.predict_to(times[k + 1], [u])
+        if k % 2:
+            late.update(times[k + 1], None, z)
+            late.update(times[k], None, MEASURED[k])
+        elif k == len(U) - 1:
+            late.update(times[k + 1], None, z)
+        if k >= 2:
+            np.testing.assert_allclose(
+                in_time.smoothed(times[k - 2])[0], lagged.means[k - 2], rtol=1e-7, atol=1e-9
+            )
+    np.testing.assert_allclose(in_time.mean, estimates.means[-1], rtol=1e-8)
+    np.testing.assert_allclose(late.smoothed(times[9])[1], smoothed.covs[9], rtol=1e-7, atol=1e-12)
+    between = 0.5 * (times[9] + times[10])
+    parts, rows = np.insert(LENGTHS, 9, 0.5 * LENGTHS[9]), np.insert(MEASURED, 10, np.nan, axis=0)
+    parts[10] *= 0.5
+    data |= {"dt": parts, "inputs": np.insert(U, 9, U[9]), "measurements": rows}
+    np.testing.assert_allclose(late.smoothed(between)[0], filters.smooth(kf, **data).means[10], rtol=1e-7)
+    with pytest.raises(ValueError, match="time must be within late = 5 s before the belief, 0 to .* but got -1"):
+        late.smoothed(-1.0)
+
+
+@pytest.mark.parametrize("name", ["imm", "mmae"])
+def test_modes_in_steps_of_any_length_are_those_of_a_live_filter_and_alike_they_are_one(name, as_python):
+    data: dict = {"inputs": U[:9], "measurements": MEASURED[:10], "dt": LENGTHS[:9]}
+    imm = filters.make_filter(name, LINEAR, modes=[{}, {"process_noise_cov": 9.0 * LINEAR.process_noise_cov}])
+    estimates, live, times = filters.run(imm, **data), imm.live(), np.cumsum(LENGTHS)
+    live.start(0.0, MEASURED[0])
+    for time, u, z in zip(times[:9].tolist(), U, MEASURED[1:], strict=False):
+        live.predict_to(time, [u])
+        live.update(time, None, z)
+    np.testing.assert_allclose(live.mean, estimates.means[-1], rtol=1e-9)
+    np.testing.assert_allclose(live.cov, estimates.covs[-1], rtol=1e-9)
+    alike, kf = (
+        filters.make_filter(name, LINEAR, modes=[{}, {}], mode_filter="kf"),
+        filters.make_filter("kf", LINEAR),
+    )
+    for function in (filters.run, filters.smooth):
+        both = function(alike, **data), function(kf, **data)
+        np.testing.assert_allclose(both[0].means, both[1].means, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(both[0].covs, both[1].covs, rtol=1e-7, atol=1e-12)
+    if name == "imm":
+        for arguments in ({}, {"transition": [[0.9, 0.1], [0.3, 0.7]]}):
+            filter_ = filters.make_filter("imm", LINEAR, **arguments)
+            half = filter_.of_length(0.5 * DT).transition_matrix
+            np.testing.assert_allclose(half @ half, filter_.transition_matrix, rtol=1e-9)
+
+
 def by_hand(filter_, estimates):
     """Rauch, Tung, Striebel over parts of steps, each with its own F and Q in proportion to its length."""
     plain, counts = filter_.model, np.ceil(LENGTHS / DT - 1e-9).astype(int)
@@ -92,7 +183,15 @@ def test_what_steps_of_different_lengths_need_is_said():
     with pytest.raises(ValueError, match="or of 29 steps, positive and finite, but got"):
         filters.run(LEVEL, Z, dt=[0.1, 0.2])
     ekf = filters.make_filter("ekf", PLANT.at(DT))
-    with pytest.raises(ValueError, match="lag must be left out where steps are longer"):
-        filters.smooth(ekf, inputs=U, measurements=Z, dt=LENGTHS, lag=2)
+    imm = filters.make_filter("imm", PLANT.at(DT))
+    with pytest.raises(ValueError, match="of the filter 'imm' cannot vary .* but got another Q"):
+        filters.run(imm, inputs=U, measurements=Z, dt=LENGTHS, noise=PLANT.noise)
+    with pytest.raises(ValueError, match="of the filter 'imm' cannot vary .* but got another Q"):
+        imm.live(noise=PLANT.noise)
+    cycle = filters.make_filter("imm", PLANT.at(DT), transition=[[0.1, 0.9], [0.9, 0.1]])
+    with pytest.raises(ValueError, match="transition must be that of a chain in continuous time"):
+        filters.run(cycle, inputs=U, measurements=Z, dt=LENGTHS)
+    with pytest.raises(ValueError, match="in continuous time|of one sample time|sample time is a constant"):
+        filters.run(filters.make_filter("kf-steady", LINEAR), inputs=U, measurements=MEASURED, dt=LENGTHS)
     with pytest.raises(ValueError, match="noise must come with dt"):
         filters.run(ekf, inputs=U, measurements=Z, noise=PLANT.noise)

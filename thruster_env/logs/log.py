@@ -365,8 +365,8 @@ def in_any_steps(model: StateSpaceModel, dt: float | None = None) -> AnyStepMode
     Raises:
         ValueError: for a model of one sample time, or of another one than the logs.
     """
-    index, parts = sample_time_place(model, "a filter on a log's own stamps")
-    model_dt = float(model.constants[index]) * parts
+    index, _ = sample_time_place(model, "a filter on a log's own stamps")
+    model_dt = sample_time_of(model, "")
     if dt is not None and not same_dt(model_dt, dt):
         raise ValueError(f"the dt of logs on their own stamps must be the model's {model_dt:g} s, but is {dt:g} s")
     fields: dict[str, Any] = {name: getattr(model, name) for name in StateSpaceModel.__dataclass_fields__}
@@ -390,6 +390,27 @@ def in_any_steps(model: StateSpaceModel, dt: float | None = None) -> AnyStepMode
     any_step = AnyStepModel(**fields)
     object.__setattr__(any_step, "plain", model)
     return any_step
+
+
+def sample_time_of(model: StateSpaceModel, what: str) -> float:
+    """The sample time of a model in which it is a constant [s]; ValueError, with `what` needs it, for others."""
+    index, parts = sample_time_place(model, what)
+    return float(model.constants[index]) * parts
+
+
+def in_steps_of(model: StateSpaceModel, length: float) -> StateSpaceModel:
+    """The model for steps of another length [s], with Q in proportion to it.
+
+    Raises:
+        ValueError: for a model whose sample time is no constant.
+    """
+    index, parts = sample_time_place(model, "a step of another length")
+    ratio = length / (float(model.constants[index]) * parts)
+    if same_dt(ratio, 1.0):
+        return model
+    of_model: Any = model.constants
+    constants = of_model._replace(**{of_model._fields[index]: length / parts})
+    return model.replace(constants=constants, process_noise_cov=ratio * model.process_noise_cov)
 
 
 def of_one_step(model: StateSpaceModel) -> StateSpaceModel:
