@@ -13,6 +13,7 @@ from filters import (
     run,
     thruster_model,
 )
+from filters.adaptive import bounded_step
 from filters.engine.session import Session
 from tests.models import plane_model, simulated
 from tests.oracles import each_close, kalman_update
@@ -62,6 +63,20 @@ def test_sage_husa_is_the_textbook_recursion_with_bounded_steps(measured):
             np.testing.assert_allclose(belief.cov, p, rtol=1e-9, atol=1e-12)
             np.testing.assert_allclose(filter_.estimated_noise(belief), r, rtol=1e-9, atol=1e-12)
             np.testing.assert_allclose(filter_.estimated_process_noise(belief), q, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_bounded_step_leaves_at_least_half(seed):
+    rng = np.random.default_rng(seed)
+    old, more, less = (part @ part.T for part in rng.normal(size=(3, 3, 3)) * [[[1.0]], [[0.0]], [[30.0]]])
+    new = bounded_step(old, more, less, 0.9)
+    assert np.linalg.eigvalsh(new - 0.5 * old)[0] > -1e-12
+    assert not np.allclose(new, old)
+
+
+def test_a_step_of_a_singular_matrix_is_none():
+    old, less = np.diag([1.0, 0.0]), np.eye(2)
+    np.testing.assert_array_equal(bounded_step(old, less, less, 0.1), old)
 
 
 def test_variational_bayes_is_the_naive_recursion():

@@ -7,7 +7,8 @@ from scipy.stats import multivariate_normal
 
 from filters import make_filter, run
 from tests.filters.test_localised import ring
-from tests.models import KEY, plane_model, simulated, state_space
+from tests.models import KEY, plane_model, random_affine, simulated, state_space
+from thruster_env.core.compiled import interpreted
 
 DEVIATION = 0.3
 
@@ -136,6 +137,57 @@ def test_it_makes_up_for_a_q_that_is_too_small_and_leaves_a_right_one():
     assert squares(0.001, 0.0) > 4.0
     assert squares(0.001, 0.3) < 2.0
     assert abs(squares(0.1, 0.1) - 1.0) < 0.2
+
+
+@pytest.mark.usefixtures("as_python")
+def test_of_one_state_it_is_the_factor_of_all_however_many_channels_see_it():
+    model = random_affine(1, 3, 1, seed=2)
+    inputs, z = simulated(model.replace(process_noise_cov=9.0 * model.process_noise_cov), 20)
+    own = {"ensemble_size": 8, "adaptive_inflation": DEVIATION}
+    settings = {"inflation_by_state": 1}, {}, {"adaptive_inflation": 0.0}
+    each, one, none = (run(make_filter("etkf", model, **own | given), None, inputs, z).covs for given in settings)
+    np.testing.assert_allclose(each, one, rtol=1e-10)
+    assert abs(none / one - 1.0).max() > 0.1
+
+
+@pytest.mark.usefixtures("as_python")
+def test_the_factor_grows_of_the_state_whose_q_is_too_small():
+    """Two bodies that do not touch: the noise of the second is a hundred times what the filter believes."""
+
+    def both(x, u, c):
+        return (*walk(x[:2], u, c), *walk(x[2:], u, c))
+
+    def places(x, c):
+        return (x[0], x[2])
+
+    def pair(noise):
+        prior = {"mean": np.zeros(4), "cov": [0.04, 0.1, 0.04, 0.1]}
+        return state_space(both, places, q=[1e-4, 0.001, 1e-4, noise], r=[0.04, 0.04], **prior, inputs=0)
+
+    _, z = simulated(pair(0.1), 150, count=4)
+
+    def squares(**own):
+        filter_ = make_filter("etkf", pair(0.001), ensemble_size=30, adaptive_inflation=0.3, **own)
+        found = run(filter_, None, None, z)
+        s = np.einsum("bkii->bki", found.innovation_covs)
+        return (found.innovations**2 / s)[:, 30:].mean(axis=(0, 1)), s[:, 30:, 0].mean()
+
+    (_, second), spread = squares(inflation_by_state=1)
+    (_, of_all), wide = squares()
+    assert second < 2.0 and of_all < 2.5
+    assert spread < 0.9 * wide  # the first body's forecast stays narrow
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("by_state", (0, 1))
+def test_compiled_code_and_python_are_one(by_state):
+    parameters = {"adaptive_inflation": 0.2, "rotations": 1 - by_state, "inflation_by_state": by_state}
+    filter_ = make_filter("etkf", plane_model(), ensemble_size=9, **parameters)
+    inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)
+    with interpreted():
+        expected = run(filter_, None, inputs, z)
+    for one, other in zip(run(filter_, None, inputs, z), expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
 def test_wrong_numbers_are_refused():

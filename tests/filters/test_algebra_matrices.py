@@ -6,7 +6,7 @@ from scipy.stats import multivariate_normal, multivariate_t
 
 from filters.algebra import operations, points
 from filters.algebra.calls import calls_of
-from filters.algebra.matrices import evaluate, in_order, input_matrix
+from filters.algebra.matrices import Matrix, evaluate, in_order, input_matrix
 from filters.algebra.operations import (
     at_least,
     choose,
@@ -161,6 +161,14 @@ def test_calls_of_functions_are_the_formula(name, sizes):
     work = calls_of([(Place("rows", 0), wanted)], known, {})
     work(rows, np.zeros(1), np.concatenate(numbers), np.zeros(1))
     np.testing.assert_allclose(rows.reshape(expected.shape), expected, rtol=1e-10, atol=1e-11)
+
+
+def test_what_stands_in_a_formula_twice_is_there_once():
+    g = as_matrices(values_of_sizes(N, M))
+    assert g["H"] @ g["P"] is g["H"] @ g["P"] and g["P"].T is g["P"] and g["H"].T.T is g["H"]
+    assert sym(g["H"] @ g["P"] @ g["H"].T).arguments[2] is g["P"] @ g["H"].T
+    assert isinstance(posterior(g), Matrix) and posterior(g).operation is operations.of_best_gain
+    assert FORMULAS["any gain"](g).operation is not operations.of_best_gain
 
 
 def test_densities_are_those_of_scipy():

@@ -8,6 +8,8 @@ import torch
 
 import filters
 from filters import make_filter, run
+from filters.differentiated.runs import ModelSlopes
+from filters.sensitivity import likelihood, sensitivity
 from tests.models import simulated, state_space
 
 DT = 0.1
@@ -71,6 +73,22 @@ def one_state(transition, constants, start=0.0):
 
 
 @pytest.mark.usefixtures("as_python")
+def test_an_exponent_is_identified_from_rest():
+    model = one_state(powered, (0.5, 1.8))
+    inputs, z = simulated(model, 60, count=2, level=2.0)
+    none = np.zeros((2, 1, 1))
+    found = sensitivity(model, inputs, z, ModelSlopes(np.eye(2), none, none, np.zeros((2, 1)), none))
+    assert (np.linalg.eigvalsh(found.information) > 0.0).all()
+    step = 1e-5
+    for k in range(2):
+        sides = []
+        for sign in (1.0, -1.0):
+            c = np.array(model.constants) + sign * step * np.eye(2)[k]
+            sides.append(likelihood(model.replace(constants=tuple(c)), inputs, z, none[:1], none[:1]).values.sum())
+        assert found.gradients.sum(axis=0)[k] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-4)
+
+
+@pytest.mark.usefixtures("as_python")
 def test_a_tank_that_empties_does_not_restart():
     model = one_state(tank, (0.5,), start=0.1)
     z = np.zeros((1, 41, 1))
@@ -95,3 +113,24 @@ def test_tensors_have_finite_derivatives_at_rest(make):
     )
     (means**2).sum().backward()
     assert torch.isfinite(q.grad).all() and torch.isfinite(c.grad).all() and c.grad.any()
+
+
+def drag_of_tensors(x, u, c):
+    """The same for torch, whose root at rest has an infinite slope."""
+    speed = torch.sqrt(x[2] * x[2] + x[3] * x[3])
+    low = (x[2] ** 2) ** 0.5 + torch.hypot(x[2], x[3]) + torch.atan2(x[2], x[3]) * torch.acos(1.0 + 0.0 * x[3])
+    ahead, abeam = (DT * (u[k] - (c[0] + 0.0 * low) * speed * x[2 + k]) for k in range(2))
+    return x[0] + DT * x[2], x[1] + DT * x[3], x[2] + ahead, x[3] + abeam
+
+
+def test_functions_of_tensors_have_finite_slopes_at_rest():
+    inputs, z = simulated(at_rest(), 5, count=2, level=2.0)
+    filter_ = make_filter("ekf", at_rest())
+    graph, given = filters.torch(filter_), filters.torch(filter_, transition=drag_of_tensors)
+    found = []
+    for one in (graph, given):
+        c = torch.tensor([0.3], dtype=torch.float64, requires_grad=True)
+        estimates = one.replace(constants=c).run(inputs, z)
+        assert not estimates.divergences.any()
+        found.append((estimates.means.detach(), torch.autograd.grad(estimates.log_likelihoods.sum(), c)[0]))
+    torch.testing.assert_close(*found, rtol=1e-10, atol=1e-12)

@@ -3,19 +3,24 @@
 import math
 import pickle
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from filters import (
+    EnsembleKalmanFilter,
+    EstimateState,
     ExtendedKalmanFilter,
+    ParticleFilter,
     Unknown,
     augmented_model,
     run,
     thruster_model,
 )
-from tests.models import held_voltages
+from tests.models import held_voltages, scalar_model
+from thruster_env.core.compiled import interpreted
 from thruster_env.core.derivatives import jacobian
-from thruster_env.core.streams import episode_keys
+from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.model import simulate
 
 
@@ -71,6 +76,47 @@ def test_its_jacobians_are_those_of_its_functions():
         np.testing.assert_allclose(analytic(x, *values), expected, rtol=1e-6, atol=1e-9)
 
 
+def test_a_model_without_jacobians_gets_none():
+    model = thruster_model().replace(transition_jacobian=None, observe_jacobian=None)
+    augmented = augmented_model(model, {"motor_damping": Unknown(5.0)})
+    assert augmented.transition_jacobian is None and augmented.observe_jacobian is None
+
+
+def test_constants_of_a_tuple_go_by_number():
+    model = scalar_model()
+    augmented = augmented_model(model, {0: Unknown(0.1)})
+    assert augmented.transition((2.0, 0.7), (0.5,), augmented.constants) == (0.7 * 2.0 + 0.5, 0.7)
+    assert augmented.observe((2.0, 0.7), augmented.constants) == (4.0,)
+    with interpreted():
+        belief = ExtendedKalmanFilter(model=augmented).init()
+    assert belief.mean.tolist() == [3.0, 0.9]
+
+
+@pytest.mark.slow
+def test_it_recovers_an_unknown_ambient_flow_and_beats_the_filter_that_ignores_it():
+    runs, actual = 40, 0.6
+    inputs = held_voltages(runs, 30)
+    drawn = simulate.simulate(thruster_model(ambient_velocity=actual), episode_keys(range(runs)), inputs)
+    assumed = thruster_model()  # still water
+
+    def estimates(kind, model, **numbers):
+        found = run(kind(model=model, **numbers), filter_keys(range(runs)), inputs, drawn.measurements)
+        assert (found.divergences == 0).all()
+        return found, ((found.means[..., :2] - drawn.states)[:, 50:] ** 2).mean(axis=1)
+
+    _, plain = estimates(ExtendedKalmanFilter, assumed)
+    joint = augmented_model(assumed, {"ambient_velocity": Unknown(std=0.5)})
+    found, squares = estimates(ExtendedKalmanFilter, joint)
+    gain = plain - squares  # paired by run; 95 % in each state
+    assert (gain.mean(axis=0) > 1.96 * gain.std(axis=0, ddof=1) / math.sqrt(runs)).all()
+    assert squares[:, 1].mean() < 0.5 * plain[:, 1].mean()
+    flow, spread = found.means[:, -1, 2], np.sqrt(found.covs[:, -1, 2, 2])
+    assert abs(flow.mean() - actual) < 0.02 and (spread < 0.1).all()
+    for kind, size in ((EnsembleKalmanFilter, 100), (ParticleFilter, 1000)):
+        found, _ = estimates(kind, joint, ensemble_size=size)
+        assert abs(found.means[:, -1, 2].mean() - actual) < 0.05
+
+
 def test_it_recovers_the_load_gain_of_the_physical_tunnel():
     runs, plant = 40, thruster_model(preset="tunnel_physical")
     actual = plant.constants.load_gain
@@ -87,6 +133,16 @@ def test_it_recovers_the_load_gain_of_the_physical_tunnel():
     squares = [((e.means[..., :2] - drawn.states)[:, 50:] ** 2).mean(axis=1) for e in (plain, found)]
     gain = squares[0] - squares[1]
     assert (gain.mean(axis=0) > 1.96 * gain.std(axis=0, ddof=1) / math.sqrt(runs)).all()
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_wrapper_runs_on_it_and_draws_its_estimate():
+    model = augmented_model(thruster_model(), {"ambient_velocity": Unknown(std=0.5)})
+    env = EstimateState(gym.make("BowThruster-v0", render_mode="rgb_array"), filter="ekf", model=model)
+    env.reset(seed=1)
+    _, _, _, _, info = env.step(np.array([6.0], dtype=np.float32))
+    assert info["estimate"].shape == (3,) and env.render().ndim == 3
+    env.close()
 
 
 @pytest.mark.parametrize(

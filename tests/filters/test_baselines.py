@@ -119,6 +119,24 @@ def test_the_low_pass_filters_the_measurement_before_it_is_inverted():
     np.testing.assert_allclose(estimates.means[0, :, 1], expected, atol=1e-7)
 
 
+def test_a_short_time_constant_makes_it_the_inversion():
+    model = thruster_model()
+    inputs = np.full((1, 20, 1), 6.0)
+    z = simulate.simulate(model, episode_keys([2]), inputs).measurements
+    one = run(LowPass(model=model, time_constant=1e-3), KEYS, inputs, z)
+    other = run(Inversion(model=model), KEYS, inputs, z)
+    np.testing.assert_allclose(one.means, other.means, rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [Inversion, LowPass])
+def test_before_anything_is_measured_it_is_the_open_loop(kind):
+    model = bumpy_model()
+    inputs = np.ones((1, 5, 1))
+    estimates = run(kind(model=model), KEYS, inputs, np.full((1, 6, 1), np.nan))
+    np.testing.assert_allclose(estimates.means[0], open_loop(model, inputs), rtol=1e-12)
+    assert (estimates.innovations == 0.0).all()
+
+
 def pair(x, c):
     return (x[0] * x[0], x[0] + x[1])
 

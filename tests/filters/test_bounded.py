@@ -1,11 +1,13 @@
 """Estimates within bounds: truncated normals of SciPy, least squares within a box, coverage, all ways to run."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 from scipy.stats import truncnorm
 
-from filters import ExtendedKalmanFilter, make_filter, run, smooth
+from filters import ExtendedKalmanFilter, augmented_model, linearize, make_filter, run, smooth
+from filters.augmented import Unknown
 from filters.consistency.nees import mean_interval
 from filters.smoothers.smooth import WithSmoother
 from tests.models import KEY, scalar_model, simulated, wide_model
@@ -173,6 +175,34 @@ def test_of_a_constant_that_is_not_negative_the_belief_is_exact():
     rmse = {by: np.sqrt(np.mean(one[:, -1] ** 2)) for by, one in errors.items()}
     assert rmse["truncation"] < rmse["projection"] < rmse[None]
     assert np.mean(errors[None][:, -1]) < -0.1  # without bounds it is pulled below the truth
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_copy_of_a_vector_env_is_the_single_env():
+    from filters import EstimateState, EstimateStates
+    from thruster_env.thruster.model import thruster_model
+
+    model = thruster_model().replace(bounds={"omega_m": (0.0, 30.0), "U_a": (0.0, None)})
+    single = EstimateState(gym.make("BowThruster-v0"), "ekf", model=model)
+    vector = EstimateStates(
+        gym.make_vec("BowThruster-v0", num_envs=2, vectorization_mode="sync"), "ekf", model=model
+    )
+    _, one = single.reset(seed=4)
+    _, many = vector.reset(seed=4)
+    for action in (12.0, 12.0, -12.0, -12.0, -12.0):
+        *_, one = single.step(np.array([action]))
+        *_, many = vector.step(np.full((2, 1), action))
+        np.testing.assert_allclose(many["estimate"][0], one["estimate"], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(many["estimate_cov"][0], one["estimate_cov"], rtol=1e-9, atol=1e-12)
+        assert 0.0 <= one["estimate"][0] <= 30.0 and one["estimate"][1] >= 0.0
+
+
+def test_other_models_made_of_one_keep_its_bounds():
+    model = wide_model().replace(bounds=BY_NAME, bounded_by="projection")
+    joint = augmented_model(model, {0: Unknown(0.1)})
+    assert joint.bounds == model.bounds == ((0, 0.0, INF), (2, -0.2, 0.4)) and joint.bounded_by == "projection"
+    assert linearize(model, np.zeros(3), np.zeros(2)).bounds == model.bounds
+    assert model.digest == wide_model().digest  # bounds are no part of the plant
 
 
 def test_wrong_bounds_and_what_cannot_keep_them_are_refused():

@@ -1,13 +1,17 @@
 """Bounds, the filter's forms and smoothers where variances lie many powers of ten apart, and bounds on angles."""
 
+import math
 from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
 
-from filters import make_filter, run
+from filters import affine_model, make_filter, run
 from filters.bounds import path_bound, posterior_bound, wrapped_variances
 from tests.models import affine, state_space
+from thruster_env.core.checks import covariance_root
+from tuning.problems import model_problem
+from tuning.problems.model_problem import ModelProblem
 
 pytestmark = pytest.mark.usefixtures("as_python")
 STEPS = 25
@@ -94,6 +98,12 @@ def test_each_form_of_the_kalman_filter_has_the_covariance_of_riccati(form):
         assert found.divergences[0] == 0 and apart(found.covs[0], exact) < 1e-6, q
 
 
+def test_the_issues_example_has_the_kalman_filters_own_error():
+    model, exact = linear("constant velocity", np.diag([1e-12, 1e-2]))
+    found = np.sqrt(np.diag(posterior_bound(model, np.zeros((1, STEPS, 0)))[0, -1]))
+    np.testing.assert_allclose(found, np.sqrt(np.diag(exact[-1])), rtol=1e-10)
+
+
 def test_rounding_of_slopes_by_differences_is_no_information():
     def move(x, u, c):
         return x[0] + x[1], x[1]
@@ -112,6 +122,13 @@ def test_a_state_too_uncertain_for_float64_has_no_bound_rather_than_a_wrong_one(
     model = affine([[1e30]], np.zeros((1, 0)), [[0.0]], q=[1.0], r=[1.0], mean=[0.0], cov=[1.0])
     found = posterior_bound(model, np.zeros((1, 8, 0)), truths=2)[0, :, 0, 0]
     assert found[1] == pytest.approx(1e60) and not np.isfinite(found[-1])
+
+
+def test_roots_of_correlated_covariances_do_not_depend_on_units():
+    for q in noises(3, 0.9):
+        root = covariance_root(q)
+        units = np.sqrt(np.diag(q))
+        np.testing.assert_allclose(root @ root.T / units / units[:, None], q / units / units[:, None], atol=1e-13)
 
 
 def oscillator(variance):
@@ -140,3 +157,43 @@ def test_the_bound_of_a_wrapped_error_is_the_ground_state_on_the_circle():
     np.testing.assert_allclose(found[-1, 0], np.pi**2 / 3, rtol=1e-5)
     with np.errstate(all="raise"):
         assert np.isnan(wrapped_variances(np.array([np.nan]), [True]))[0]
+
+
+def heading(noise):
+    """A heading that only a gyroscope is known of: no measurement tells it."""
+    return affine_model(
+        a=[[1.0, 0.1], [0.0, 0.9]],
+        b=np.zeros((2, 0)),
+        c=[[0.0, 1.0]],
+        process_noise_cov=[noise, 1e-4],
+        measurement_noise_cov=[1e-4],
+        prior_mean=[3.0, 0.0],
+        prior_cov=[noise, 1e-4],
+        states=[("heading", "psi", "rad", True), ("rate", "r", "rad/s")],
+    )
+
+
+@pytest.mark.parametrize("noise", [1e-4, 0.1])
+def test_no_filter_is_better_than_the_bound_on_a_heading_that_drifts(noise):
+    problem = ModelProblem(heading(noise), steps=60, first_scored_step=50)
+    data = problem.data(range(1))
+    bound = problem.bound(data)[0]
+    plain = posterior_bound(problem.truth, data.inputs, truths=2)[0, data.late, 0, 0]
+    # The Kalman filter is the best there is, its errors are normal, and wrapped as every score wraps them.
+    errors = np.random.default_rng(0).normal(size=(2000, len(plain))) * np.sqrt(plain)
+    squares = (errors - 2.0 * np.pi * np.round(errors / (2.0 * np.pi))) ** 2
+    least = squares.mean() - 3.9 * squares.std() / math.sqrt(squares.size)
+    most = squares.mean() + 3.9 * squares.std() / math.sqrt(squares.size)
+    assert 0.9 * bound**2 < most and bound <= np.pi / math.sqrt(3.0)
+    if noise < 1e-3:
+        assert bound == pytest.approx(math.sqrt(plain.mean()), rel=1e-12) and least < bound**2 < most
+    else:
+        assert bound**2 < least < most < plain.mean() / 1.2  # why the plain one is no bound on wrapped errors
+
+
+def test_the_open_loops_error_of_an_angle_goes_the_short_way_round(monkeypatch):
+    monkeypatch.setattr(model_problem, "SCALE_SEEDS", range(20))
+    truth = heading(1e-6).replace(process_noise_cov=[1e-6, 0.0], prior_mean=[math.pi, 0.0])
+    problem = ModelProblem(truth, steps=60, first_scored_step=50)
+    assert np.isnan(problem.bound(problem.data(range(2)))).all()
+    assert problem.scale[0] < 0.1

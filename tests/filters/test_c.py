@@ -17,8 +17,9 @@ from filters.logs.estimate import estimate_with
 from filters.logs.findings import columns_of
 from tests.filters.test_filter_paths import diverging
 from tests.filters.test_pages import wide_pendulum
-from tests.models import lonely_model, scalar_model, simulated, wide_model
+from tests.models import lonely_model, random_affine, scalar_model, simulated, wide_model
 from tests.slow import slow_but
+from thruster_env.auv.model import auv_model
 from thruster_env.core.angles import difference
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
@@ -230,6 +231,17 @@ def test_a_users_filter_is_that_of_run(which, tmp_path):
     assert_same(found, [one[0] for one in run(filter_, None, inputs, z)[:5]], 1e-10)
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", ["ekf", "ukf"])
+def test_a_vehicle_and_many_states(name, tmp_path):
+    for model in (auv_model(states="velocities"), random_affine(9, 4, 1)):
+        inputs, z = simulated(model, 25, level=1.0, missing=0.2)
+        filter_ = made(name, model)
+        found, *_ = estimated(built(filter_, tmp_path), model, inputs[0], z[0])
+        assert_same(found, [part[0] for part in run(filter_, None, inputs, z)[:5]], 1e-12)
+
+
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python says so when a number overflows
 @pytest.mark.parametrize("name", NAMES)
@@ -368,6 +380,11 @@ def test_an_error_names_what_is_wrong(make, message):
     with pytest.raises(ValueError, match=message) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+def test_comments_hold_any_unit():
+    header = c_filter(made("ekf", small())).header
+    assert header.isascii() and header.count("*/") == header.count("/*")
 
 
 def test_a_filter_is_the_same_text_each_time():
@@ -509,3 +526,45 @@ def test_a_log_is_read_in_any_unit_as_estimate_reads_it(words, log, tmp_path):
     log = read_log(tmp_path / "log.csv", model, columns, dt=None if has_times else 1.0)
     np.testing.assert_allclose(log.inputs[:, 0], [1.0, 3.0])
     np.testing.assert_allclose(log.measurements[:, 0], [2.0, 3.0, 5.0])
+
+
+@pytest.mark.usefixtures("as_python")
+def test_rows_that_a_log_lacks_are_predicted_as_estimate_does(tmp_path):
+    model = thruster_model()
+    inputs, z = simulated(model, 60, level=1.0)
+    lines = log_of(model, inputs[0], z[0]).splitlines()
+    lines = [line for k, line in enumerate(lines) if k not in (4, 9, 10, *range(20, 41))]
+    filter_ = made("ekf", model)
+    write_project(filter_, tmp_path, "one", dt=0.01)
+    command = ["gcc", *WARNINGS, *SANITIZERS, "one.c", "main.c", "-lm", "-o", "one_log"]
+    assert subprocess.run(command, cwd=tmp_path).returncode == 0
+
+    def filtered(lines):
+        return subprocess.run([tmp_path / "one_log"], input="\n".join(lines), capture_output=True, text=True)
+
+    headers, *rows = (line.split(",") for line in filtered(lines).stdout.splitlines())
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    wanted = columns_of(estimate_with(filter_, ReplayEnv(tmp_path / "log.csv", model).log))
+    assert len(rows) == 61 == len(wanted["time_s"])
+    for header, column in zip(headers, zip(*rows, strict=True), strict=True):
+        numbers = [float(word) if word else math.nan for word in column]
+        np.testing.assert_allclose(numbers, wanted[header], rtol=1e-8, atol=1e-9)
+    for some in (lines[:1] + lines[1::2], [lines[0], *lines[1:4], lines[2]]):  # of another dt; back in time
+        ended = filtered(some)
+        assert ended.returncode == 2
+        assert re.match(r"line \d+: times must be steps of 0.01 s, .*" + re.escape(WAY), ended.stderr)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_spaces_part_cells_and_a_mark_of_order_may_stand_twice(tmp_path):
+    write_project(made("ekf", thruster_model()), tmp_path, "one")
+    assert subprocess.run(["gcc", "one.c", "main.c", "-lm", "-o", "one_log"], cwd=tmp_path).returncode == 0
+    plain = "t,voltage_V,measured_thrust_N\n0,1,2\n1,3,nan\n2,2,5\n3,2,4\n"
+    log = "\ufeff\ufeff#t voltage_V   measured_thrust_N \n 0 1 2\n\n1\t3 nan \n2 2 5\n3 2 4"
+    one, other = (
+        subprocess.run([tmp_path / "one_log"], input=text.encode(), capture_output=True, check=True).stdout
+        for text in (plain, log)
+    )
+    assert one == other
+    (tmp_path / "log.csv").write_text(log, encoding="utf-8")
+    assert read_log(tmp_path / "log.csv", thruster_model()).inputs[:, 0].tolist() == [1.0, 3.0, 2.0]

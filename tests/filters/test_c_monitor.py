@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from filters import run, thruster_model
-from filters.c.project import c_filter, write_project
+from filters.c.project import c_filter, sizes_of, write_project
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import alarms_of, columns_of
 from filters.monitoring import Monitor
 from filters.monitoring.monitor import TESTS
 from tests.filters.test_c import SANITIZERS, WARNINGS, log_of, made
+from tests.filters.test_filter_paths import diverging
 from tests.models import lonely_model, simulated, wide_model
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
@@ -163,6 +164,14 @@ def test_floats_raise_the_same_alarms_of_a_stuck_sensor(tmp_path):
 
 
 @pytest.mark.usefixtures("as_python")
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python says so when a number overflows
+def test_a_filter_that_is_lost_says_nothing_of_its_sensors(tmp_path):
+    filter_, inputs, z = diverging("ekf")
+    inputs, z = np.repeat(inputs[0], 4, axis=0), np.concatenate([z[0, :1], np.repeat(z[0, 1:], 4, axis=0)])
+    assert_same(told_by_c(filter_, inputs, z, tmp_path), told_by_python(filter_, inputs, z))
+
+
+@pytest.mark.usefixtures("as_python")
 def test_a_project_counts_alarms_as_estimate_does(tmp_path):
     model = thruster_model()
     inputs, z = faulty(model)
@@ -181,6 +190,23 @@ def test_a_project_counts_alarms_as_estimate_does(tmp_path):
     expected = columns_of(found, alarms)["alarm_thrust"]
     place = headers.index("alarm_thrust")
     assert [float(row[place]) for row in rows] == expected.tolist() and expected.sum() > 3
+
+
+@pytest.mark.usefixtures("as_python")
+def test_the_readme_has_the_thresholds_and_the_bytes(tmp_path):
+    filter_, monitor = made("ekf", wide_model()), Monitor()
+    write_project(filter_, tmp_path, "one", monitor=100_000)
+    readme = (tmp_path / "README.md").read_text()
+    limits = monitor.limits(2)
+    for number in (limits[1], limits[2], limits[3], limits[4], *limits[8:]):
+        assert f"{number:.4g}" in readme
+    code = c_filter(filter_, "one", monitor=monitor)
+    tested, plain = sizes_of(code), sizes_of(c_filter(filter_, "one"))
+    ring = 2 * 8 * monitor.window
+    assert (
+        f"| struct | {tested.struct}" in readme and plain.struct + ring < tested.struct < plain.struct + 2 * ring
+    )
+    assert "tests" not in c_filter(filter_, "one").header and "1 | `ONE_OUTLIER` |" in readme
 
 
 @pytest.mark.usefixtures("as_python")

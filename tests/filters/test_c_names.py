@@ -7,6 +7,7 @@ import pytest
 
 from filters import make_filter
 from filters.c.project import c_filter, write_project
+from filters.monitoring.monitor import monitor_of
 from tests.models import scalar_model, state_space
 
 TAKEN = """exp R propagate NAN new class double_t correct add_process_noise filter x u z t0 i P prior_mean line
@@ -19,6 +20,13 @@ FREE = "ekf EKF tank torque stroke member R_ a test draw philox EKF_2 expo L MOT
 def test_a_name_that_is_taken_is_refused_in_one_line(name):
     with pytest.raises(ValueError, match=rf"a name in C must be [^\n]* but got '{name}'"):
         c_filter(make_filter("ekf", scalar_model()), name)
+
+
+def test_names_of_the_tests_are_taken_only_where_there_are_some():
+    assert c_filter(make_filter("ekf", scalar_model()), "sound").name == "sound"
+    for name in ("sound", "test"):  # static functions sound, and test_update
+        with pytest.raises(ValueError, match=f"but got '{name}'"):
+            c_filter(make_filter("ekf", scalar_model()), name, monitor=monitor_of(1e5))
 
 
 ODD = ["exp", "a*/b", "a/*b", "what??/", 'q"uote', "R", "%d", "back\\slash", "naïve"]

@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from filters import EnsembleKalmanFilter, KalmanFilter, run
-from tests.models import KEY, line_model, plane_model, simulated
-from tests.oracles import convergence, normals, relative_errors
+from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, run, thruster_model
+from tests.models import KEY, held_voltages, line_model, plane_model, simulated
+from tests.oracles import assert_normal, convergence, normals, relative_errors
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, filter_keys
+from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys, filter_keys
+from thruster_env.model import simulate
 
 
 @pytest.mark.parametrize("centred", [0, 1])
@@ -60,6 +61,34 @@ def test_centred_perturbations_move_the_mean_as_the_gain_says():
         EnsembleKalmanFilter(model=model, centred_perturbations=2)
 
 
+def test_members_are_stirred_by_the_prior_the_process_noise_and_the_measurement_noise():
+    model, size = plane_model(), 2000
+    a, b, offset, c, shift = model.matrices()
+    filter_ = EnsembleKalmanFilter(model=model, ensemble_size=size)
+    z = np.array([1.0, 2.0])
+    with interpreted():
+        first = filter_.init(KEY)
+        second = filter_.predict(first, [0.5])
+        third = filter_.predict(second, [0.5])
+        updated, innovation = filter_.update(third, z)
+    drift = (offset + b[:, 0] * 0.5)[:, None]
+    w_1 = second.members - a @ first.members - drift
+    w_2 = third.members - a @ second.members - drift
+    # The analysis solved for the noise that each member took the measurement with.
+    gain = np.cov(third.members) @ c.T @ np.linalg.inv(innovation.cov)
+    expected = c @ third.members + shift[:, None]
+    v = z[:, None] - expected - np.linalg.inv(gain) @ (updated.members - third.members)
+    assert_normal(first.members, model.prior_cov, model.prior_mean)
+    assert_normal(w_1, model.process_noise_cov)
+    assert_normal(w_2, model.process_noise_cov)
+    assert_normal(v, model.measurement_noise_cov)
+    # Nothing that stirs the members is correlated with anything else.
+    together = np.corrcoef(np.vstack([first.members, w_1, w_2, v]))
+    for i in range(0, 8, 2):
+        together[i : i + 2, i : i + 2] = 0.0
+    assert np.abs(together).max() < 4 / math.sqrt(size)
+
+
 def test_it_converges_to_the_kalman_filter_like_one_over_root_n():
     model = line_model()
     inputs, measurements = simulated(model, 30, count=60, seed=0, level=1.0, compiled=True)
@@ -75,7 +104,29 @@ def test_it_converges_to_the_kalman_filter_like_one_over_root_n():
     assert (np.abs(bias) < 4 * errors[0, -1] / math.sqrt(60)).all()
 
 
+def test_on_the_thruster_a_hundred_members_are_as_good_as_the_extended_filter():
+    model = thruster_model(process_noise_cov=[1.0, 4e-4], measurement_noise_cov=0.25)
+    inputs = held_voltages(100, 20)
+    drawn = simulate.simulate(model, episode_keys(range(100)), inputs)
+
+    def rmse(filter_):
+        estimates = run(filter_, filter_keys(range(100)), inputs, drawn.measurements)
+        assert (estimates.divergences == 0).all()
+        return np.sqrt(np.mean((estimates.means - drawn.states)[:, 50:] ** 2, axis=(0, 1)))
+
+    ensemble = rmse(EnsembleKalmanFilter(model=model, ensemble_size=100))
+    np.testing.assert_allclose(ensemble, rmse(ExtendedKalmanFilter(model=model)), rtol=0.05)
+
+
 @pytest.mark.parametrize("size", [1, 0, -3, 2.5, math.nan, "many", None])
 def test_fewer_than_two_members_or_no_whole_number_is_refused(size):
     with pytest.raises(ValueError, match="ensemble_size must be a (whole|finite) number.* but got"):
         EnsembleKalmanFilter(model=line_model(), ensemble_size=size)
+
+
+def test_two_members_are_enough_to_run():
+    filter_ = EnsembleKalmanFilter(model=line_model(), ensemble_size=2)
+    with interpreted():
+        estimates = run(filter_, np.array([KEY]), np.zeros((1, 20, 1)), np.zeros((1, 21, 1)))
+    assert np.isfinite(estimates.means).all()
+    assert estimates.divergences.tolist() == [0]

@@ -1,5 +1,6 @@
 """The pages of the ensemble filters on NumPy's arrays, a column a member: they are the filters."""
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -16,8 +17,10 @@ from filters.pages.page import Page
 from tests.filters.of_arrays import OfArrays, parameters_of
 from tests.filters.test_pages import turn_if, wide_pendulum
 from tests.filters.test_sensitivity import pendulum as turning_pendulum
-from tests.models import simulated, wide_model
+from tests.models import random_affine, simulated, wide_model
+from tests.slow import slow_but
 from thruster_env.core.checks import covariance_root
+from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys, fill_normals
 from thruster_env.model.shape import LANES, padded
 
@@ -110,6 +113,28 @@ def test_a_page_of_arrays_with_adaptive_inflation_is_the_filter(name, by_state, 
     own = {"adaptive_inflation": 0.3, "inflation_by_state": by_state, "least_deviation": least_deviation}
     for model in (wide_model(), turning_pendulum().replace(transition=turn_if)):
         assert_page_is_the_filter(make_filter(name, model, ensemble_size=SIZE, **own))
+
+
+@pytest.mark.parametrize("name", slow_but(["etkf", "letkf"], ["etkf"]))
+def test_a_page_of_arrays_is_the_compiled_filter(name):
+    model = random_affine(7, 3, 2, seed=4)  # sums of more loops than one, and a geometric mean that is called
+    assert_page_is_the_filter(make_filter(name, model, ensemble_size=21, **CHOICES[name]))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", CHOICES)
+def test_a_page_of_arrays_is_the_filter_by_calls(name):
+    """Of a model that decides, and of one that is large."""
+    decides = turning_pendulum().replace(transition=turn_if)
+    assert_page_is_the_filter(make_filter(name, decides, ensemble_size=SIZE, **CHOICES[name]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["enkf", "letkf"])
+def test_a_page_of_arrays_is_the_filter_of_a_large_model(name):
+    """The one compiled, whose analysis is the longer program, the other one as Python."""
+    with nullcontext() if name == "letkf" else interpreted():
+        assert_page_is_the_filter(make_filter(name, random_affine(38, 8, 1), ensemble_size=45, **CHOICES[name]))
 
 
 def update_in_part(model, x, z, e):

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from filters import make_filter, run
+from filters import EstimateState, make_filter, run
 from filters.estimators.libraries import FilterPyEstimator, StoneSoupEstimator
 from tests.filters.test_gaussian_peers import stone_soup_models
 from tests.models import random_affine, simulated
+from tuning.evaluation.compare import compare, contender
 from tuning.problems.data import held_out_seeds
 from tuning.thruster.scenario import find_scenario
 
@@ -33,6 +34,23 @@ def test_filterpy_s_unscented_filter_gives_what_ours_gives(name):
     ours, theirs = (run(one, *short(name)) for one in filters)
     assert_equal(ours, theirs, 1e-6)
     assert filters[1].name == "filterpy ukf" and filters[1].has_covariance
+
+
+def test_it_stands_in_a_comparison_and_beside_an_env():
+    pytest.importorskip("filterpy")
+    import gymnasium as gym
+
+    problem = find_scenario("nominal").replace(steps=60)
+    (board,), _ = compare([contender("ukf"), contender(UNSCENTED)], [problem], held_out_seeds(0, 2))
+    assert [row.label for row in board.rows] == ["ukf", UNSCENTED]
+    assert board.rows[1].score_ratio.value == pytest.approx(1.0, abs=1e-9)
+    assert board.rows[1].nees == pytest.approx(board.rows[0].nees, rel=1e-6)
+    envs = [EstimateState(gym.make("BowThruster-v0"), filter=kind, observation="belief", alpha=0.5)
+            for kind in ("ukf", UNSCENTED)]  # fmt: skip
+    for seen in zip(
+        *([env.reset(seed=1)[0]] + [env.step([9.0])[0] for _ in range(9)] for env in envs), strict=True
+    ):
+        np.testing.assert_allclose(*seen, rtol=1e-6, atol=1e-6)
 
 
 def linear(columns):

@@ -33,6 +33,20 @@ class Walks(Estimator):
         return np.full(self.n, self.draw() + self.count)
 
 
+class AtOnce(Estimator):
+    """All runs at once, from the global generator, and what it remembers."""
+
+    has_covariance = False
+
+    def __init__(self, n, draw):
+        self.n, self.draw, self.count = n, draw, 0.0
+
+    def run(self, keys, inputs, measurements):
+        self.count += 1.0
+        draws = [[self.draw() + self.count for _ in range(measurements.shape[1])] for _ in keys]
+        return np.repeat(np.array(draws)[..., None], self.n, axis=2)
+
+
 def torchs():
     return float(pytest.importorskip("torch").randn(()))
 
@@ -74,6 +88,29 @@ def test_a_run_is_a_function_of_its_key_and_data(draw, data):
             session.step(inputs[b, k], measurements[b, k + 1])
             means.append(session.mean.copy())
         np.testing.assert_array_equal(means, whole[b])
+
+
+@pytest.mark.parametrize("draw", DRAWS)
+def test_all_runs_at_once_are_the_same_again(draw, data):
+    model, inputs, measurements = data
+    filter_ = make_filter(AtOnce(model.n, draw), model)
+    first, again = (run(filter_, KEYS, inputs, measurements).means for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    other = run(filter_, KEYS[::-1].copy(), inputs, measurements).means
+    assert not np.array_equal(first, other)
+
+
+def test_sessions_in_turns_keep_their_own_generators(data):
+    model, inputs, measurements = data
+    filter_ = make_filter(Walks(model.n, np.random.normal), model)
+    whole = run(filter_, KEYS, inputs, measurements).means
+    sessions = [filter_.session() for _ in KEYS]
+    for session, key, z in zip(sessions, KEYS, measurements, strict=True):
+        session.start(key, z[0])
+    for k in range(STEPS):
+        for b, session in enumerate(sessions):
+            session.step(inputs[b, k], measurements[b, k + 1])
+            np.testing.assert_array_equal(session.mean, whole[b, k + 1])
 
 
 def test_what_draws_from_a_generator_that_nobody_can_seed_is_refused(data):

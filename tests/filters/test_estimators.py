@@ -2,7 +2,9 @@
 # ruff: noqa: F811 - fixtures come by import and go by name
 
 import copy
+import json
 import math
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -174,6 +176,12 @@ def test_many_at_once_are_one_after_the_other_and_randomness_follows_from_the_ke
     assert (drawn[0] != drawn[1]).all()
 
 
+def test_a_covariance_without_an_innovation_has_a_nees_but_no_nis_and_no_likelihood():
+    estimator = Scripted((np.zeros(2), np.array([4e4, 4.0])), has_covariance=True)
+    found = evaluate(make_filter(estimator, NOMINAL.model()), NOMINAL.data(SEEDS), NOMINAL.scale)
+    assert found.nees.value > 0 and math.isnan(found.nis.value) and math.isnan(found.log_likelihood)
+
+
 @pytest.mark.parametrize(
     ("estimator", "rule"),
     [
@@ -299,6 +307,40 @@ def test_what_it_does_not_give_is_zero_or_nan_beside_an_env_and_copies_go_their_
     rows, _ = envs.reset(seed=3)
     np.testing.assert_array_equal(rows[1], observation)
     assert (envs.step(np.ones((2, 1), dtype=np.float32))[0][:, :2] != rows[:, :2]).all()
+
+
+def test_an_object_is_kept_in_the_spec_but_not_as_text():
+    env = EstimateState(gym.make("BowThruster-v0"), filter=Drawing())
+    again = gym.make(env.spec)
+    np.testing.assert_array_equal(env.reset(seed=2)[0], again.reset(seed=2)[0])
+    with pytest.raises(TypeError, match="give its name or 'module:object' instead"):
+        env.spec.to_json()
+    with pytest.raises(ValueError, match="must have reset.* and step.* to run beside an env"):
+        only = AtOnce()
+        only.reset = None
+        EstimateState(gym.make("BowThruster-v0"), filter=only)
+
+
+def test_by_the_command_line(thruster):
+    kinds = ("--filter", "ekf", "--filter", f"{HERE}:AtOnce", "--filter", f"{HERE}:scaled_gain")
+    done = thruster("compare", *kinds, "--seeds", 2, "--json", "board.json")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(Path("board.json").read_text())["scenarios"]["nominal"]["filters"]
+    assert list(rows) == ["ekf", f"{HERE}:AtOnce", f"{HERE}:scaled_gain"]
+    assert rows[f"{HERE}:AtOnce"]["nees"] is None and rows[f"{HERE}:AtOnce"]["verdict"] == "worse"
+    done = thruster("evaluate", "--filter", f"{HERE}:AtOnce", "--seeds", 2)
+    assert done.returncode == 0 and "rule of thumb" in done.stdout, done.stderr
+    for arguments, line in (
+        (("compare", "--filter", "math:pi"), "estimator 'math:pi' must be an estimator, or make one of a model"),
+        (("evaluate", "--filter", "nosuch_module:x"), "estimator must be 'module:object' that can be imported"),
+        (
+            ("tune", "--filter", f"{HERE}:AtOnce", "--out", "t.json"),
+            "a tuned file must be of a filter of filters.FILTERS",
+        ),
+        (("evaluate", "--filter", f"{HERE}:AtOnce", "--consistency", "a.png"), "of a filter with a covariance"),
+    ):
+        done = thruster(*arguments)
+        assert done.returncode == 2 and line in done.stderr and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from filters import make_filter, run
+from filters.consistency.nees import whiteness, whiteness_of
+from filters.consistency.report import is_white, whiteness_sentence
 from filters.estimators.foreign import Estimator
 from filters.estimators.libraries import FilterPyEstimator, StoneSoupEstimator
 from filters.logs.estimate import estimate
@@ -119,3 +121,23 @@ def test_without_innovations_their_metrics_are_blank_and_a_sentence_says_so():
     assert math.isnan(told.mean_nis) and math.isnan(told.log_likelihood) and told.rows == 46
     silent = "This estimator gives no innovation, so there is no NIS, no whiteness and no likelihood."
     assert verdict(found, told)[-1] == silent
+
+
+def test_of_innovations_without_a_covariance_there_is_a_size_but_no_test():
+    model, log = log_of_scalars()
+    told = findings(estimate(log, Told(np.array([0.5])), model))
+    assert told.predictions[0].rmse == 0.5 and math.isnan(told.mean_nis) and told.whiteness is None
+    at_once = run(make_filter(Told(), model), np.zeros((2, 2)), np.zeros((2, 9, 1)), np.ones((2, 10, 1)))
+    assert np.isnan(at_once.innovations).all() and np.isnan(at_once.innovation_covs).all()
+    assert np.isnan(at_once.log_likelihoods).all() and (at_once.covs == 1.0).all()
+
+
+def test_whiteness_of_nothing_is_no_whiteness():
+    none = whiteness(np.full((2, 40, 1), np.nan), np.full((2, 40, 1, 1), np.nan))
+    assert math.isnan(none.p_value) and math.isnan(none.share_inside) and is_white(none)
+    assert whiteness_sentence(none).startswith("No test of whiteness")
+    e = np.random.default_rng(1).normal(size=(3, 60, 1))
+    silent = np.concatenate([e, np.zeros_like(e)], axis=2)
+    present = np.broadcast_to([True, False], silent.shape)
+    one, other = whiteness_of(e), whiteness_of(silent, present)
+    assert other.p_value == pytest.approx(one.p_value) and other.share_inside == one.share_inside

@@ -72,6 +72,14 @@ def test_central_differences_agree_with_the_analytic_jacobian(x):
     np.testing.assert_allclose(h, look_jacobian(x, c), rtol=1e-7, atol=1e-7)
 
 
+def test_without_jacobians_the_estimates_are_the_same_to_the_differences_accuracy():
+    inputs, measurements = simulated(pendulum(), 150)
+    analytic = estimates_of(pendulum(), inputs, measurements)
+    numeric = estimates_of(pendulum(analytic=False), inputs, measurements)
+    np.testing.assert_allclose(numeric.means, analytic.means, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(numeric.covs, analytic.covs, rtol=1e-7, atol=1e-9)
+
+
 def swing_thrice(x, u, c):
     return swing(swing(swing(x, u, c), u, c), u, c)
 

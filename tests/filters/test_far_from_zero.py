@@ -15,6 +15,7 @@ from filters.c.project import c_filter
 from filters.differentiated.runs import ModelSlopes
 from filters.sensitivity import sensitivity
 from tests.models import simulated, state_space
+from thruster_env.core.compiled import interpreted
 from thruster_env.core.derivatives import jacobian, step_growth, step_of
 from thruster_env.model.affine import linearize
 
@@ -121,6 +122,37 @@ def test_a_model_that_branches_runs_as_a_program_on_tensors_and_in_c():
     assert "?" in c_filter(filter_).source
 
 
+@pytest.mark.slow
+def test_machine_code_has_the_numbers_of_python():
+    inputs, z = data()
+    for name, called in (("ekf", True), ("ukf", False)):
+        filter_ = make_filter(name, body(5e6, called=called))
+        found = run(filter_, KEYS, inputs, z).means
+        with interpreted():
+            np.testing.assert_allclose(found, run(filter_, KEYS, inputs, z).means, rtol=0, atol=1e-6)
+
+
+def flow(x, u, c):
+    """Forty states, of which each pulls at the next; in an array, too many for a program."""
+    out = np.empty_like(x)
+    for i in range(40):
+        pull = x[i - 1] - x[i]
+        out[i] = x[i] + 0.05 * pull * (1.0 + (pull * pull if int(pull > 0.0) else 0.0) / (c[1] * c[1]))
+    return out
+
+
+@pytest.mark.usefixtures("as_python")
+def test_many_states_far_from_zero():
+    found, (inputs, z) = [], (np.zeros((1, 6, 0)), np.sin(np.arange(7.0 * 40)).reshape(1, 7, 40))
+    for offset, unit in ((0.0, 1.0), (5e6, 1.0), (1e9, 1e3)):
+        noise = {"q": [0.01 * unit**2] * 40, "r": [0.1 * unit**2] * 40}
+        prior = {"mean": offset + unit * np.cos(np.arange(40.0)), "cov": [unit**2] * 40}
+        model = state_space(flow, lambda x, c: x, **noise, **prior, inputs=0, constants=(offset, unit))
+        found.append((run(make_filter("ekf", model), None, inputs, offset + unit * z).means - offset) / unit)
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=1e-5)
+
+
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("called", [False, True])
 @pytest.mark.parametrize("unit", [1e-9, 1e-6, 1.0, 1e6])
@@ -131,6 +163,15 @@ def test_a_position_that_is_known_at_first_has_the_scale_of_its_velocity(unit, c
     assert model.scales[0] == pytest.approx(DT * model.scales[1], rel=0.5)
     expected = estimates("ekf", body(process_noise_cov=[0.0, 1e-3], prior_cov=[0.0, 0.1]), inputs, z)
     np.testing.assert_allclose(estimates("ekf", model, inputs, z), expected, atol=1e-6)
+
+
+def test_scales_of_states_without_variance():
+    def step(x, u, c):
+        return x[0] + x[1], x[1], x[2] + 0.25, x[3], x[4]
+
+    prior = {"mean": [7.0, 0.0, 3.0, -40.0, 0.0], "cov": [0.0, 0.01, 0.0, 0.0, 0.0]}
+    model = state_space(step, lambda x, c: (x[0],), q=[0.0] * 5, r=[1.0], **prior, inputs=0)
+    np.testing.assert_allclose(model.scales, [0.1 * (0.75 + 0.25 * math.cos(1.0)), 0.1, 0.25, 40.0, 1.0])
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1.0, 1e9])

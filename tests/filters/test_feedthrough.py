@@ -25,18 +25,22 @@ from filters.c.project import write_project
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import findings, verdict
 from filters.sensitivity import likelihood
-from tests.filters.test_c import WARNINGS
+from tests.filters.test_c import WARNINGS, built, printed
 from tests.slow import slow_but
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.env.model_env import ModelEnv, ModelVectorEnv
+from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.log import in_any_steps
 from thruster_env.logs.read import read_log
-from thruster_env.logs.write import EXACT, write_columns
+from thruster_env.logs.write import EXACT, write_columns, write_log
 from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.simulate import inputs_until, simulate
 from tuning.identification.objective import Objective
 from tuning.problems.log_problem import LogProblem, as_rows
+from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Coordinates, Parameter
+from tuning.reporting.matlab import matlab_function
+from tuning.search.space import untuned_choice
 
 D = -2.0
 NOISE = {
@@ -182,6 +186,15 @@ def test_wrappers_live_and_tensors_agree_with_run():
 
 
 @pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", ["ekf", pytest.param("ukf", marks=pytest.mark.slow), "enkf"])
+def test_code_in_c_agrees_with_run(name, tmp_path):
+    inputs, z = data(1)
+    filter_ = make_filter(name, model(), **own(name))
+    found = printed(built(filter_, tmp_path), inputs[0], z[0])
+    np.testing.assert_allclose(found[:, :2], run(filter_, None, inputs, z).means[0], rtol=1e-9)
+
+
+@pytest.mark.usefixtures("as_python")
 def test_a_program_in_c_reads_a_log_as_estimate_does(tmp_path):
     """With a gap, before which the input of the row after it acts, and a missing sample."""
     present = ~np.isin(np.arange(60), [20, 21])
@@ -241,6 +254,24 @@ def cycled(rows=600, seed=0):
 
 
 @pytest.mark.usefixtures("as_python")
+def test_the_charge_of_a_cell_is_found_from_a_log_as_it_is():
+    """Within 0.04 % of capacity, where the current of the step before, as a state, has three times the error."""
+    table, charges = cycled()
+    log = read_log(table, cell())
+    assert log.until and (log.inputs[:, 0] == table["i_A"][1:]).all()
+    found = estimate_with(make_filter("ekf", cell()), log)
+    assert np.sqrt(((found.means[100:, 0] - charges[100:]) ** 2).mean()) < 4e-4
+    assert 0.8 < findings(found).mean_nis < 1.25 and np.isnan(found.innovations[0]).all()
+    by_clock = estimate_with(make_filter("ekf", cell()), read_log(table, cell(), grid=False))
+    np.testing.assert_allclose(by_clock.means, found.means, rtol=1e-9)
+    replayed = EstimateState(ReplayEnv(table, cell()), filter="ekf")
+    replayed.reset(seed=0)
+    for k in range(1, 20):
+        *_, info = replayed.step([0.0])
+        np.testing.assert_allclose(info["estimate"], found.means[k], rtol=1e-9)
+
+
+@pytest.mark.usefixtures("as_python")
 def test_innovations_that_follow_the_input_of_their_row_name_the_cause():
     table, _ = cycled()
     for model_, inputs_act, remedy in (
@@ -270,6 +301,22 @@ def test_blocks_of_logs_and_steps_of_any_length():
     of_steps = run(make_filter("ekf", in_any_steps(cell())), None, rows.inputs[None], z)
     of_one = run(make_filter("ekf", cell()), None, rows.inputs[None, :, :1], z)
     np.testing.assert_allclose(of_steps.means, of_one.means, rtol=1e-9)
+
+
+def test_logs_are_written_as_they_are_read(tmp_path):
+    log = read_log(cycled(48)[0], cell())
+    write_log(tmp_path / "log.csv", log)
+    again = read_log(tmp_path / "log.csv", cell())
+    np.testing.assert_array_equal(again.inputs, log.inputs)
+    np.testing.assert_array_equal(again.measurements, log.measurements)
+    with pytest.raises(ValueError, match="inputs_act must be one of from, until"):
+        read_log(tmp_path / "log.csv", cell(), inputs_act="after")
+
+
+def test_lines_of_matlab_take_the_input_before():
+    problem = ModelProblem(model(), inputs=[0.0] * 5, steps=5, first_scored_step=0)
+    text = matlab_function(untuned_choice("ekf", problem), model(), "mine", None)
+    assert "m.h(x, before)" in text and "measurement(x, u)" in text and "m.h(x)" not in text
 
 
 @pytest.mark.usefixtures("as_python")

@@ -121,6 +121,23 @@ def test_compiled_and_interpreted_agree(name, kind):
         assert_compiled_as_python(filter_, *data, **varying_noise(model, 25))
 
 
+@pytest.mark.parametrize("name", ["enkf", "ienkf"])
+def test_compiled_and_interpreted_agree_where_ensembles_are_stretched(name):
+    model = thruster_model()
+    filter_ = make_filter(name, model, ensemble_size=10, inflation=1.05, relaxation=0.4)
+    inputs, measurements = simulated(model, 12, count=3)
+    measurements[0, 3] = measurements[0, 6, 0] = np.nan
+    assert_compiled_as_python(filter_, filter_keys(range(3)), inputs, measurements)
+
+
+@pytest.mark.parametrize("blending", ["moments", "output"])
+def test_compiled_and_interpreted_agree_however_rules_are_blended(blending):
+    filter_ = make_filter("fuzzy", thruster_model(), blending=blending)
+    inputs, measurements = simulated(filter_.model, 12, count=3)
+    measurements[0, 3] = np.nan
+    assert_compiled_as_python(filter_, filter_keys(range(3)), inputs, measurements)
+
+
 @compiled_names
 def test_compiled_batch_loop_and_session_agree_over_500_steps(name):
     model = thruster_model()

@@ -5,8 +5,11 @@ import pytest
 from scipy.linalg import cholesky, solve
 from scipy.optimize import minimize_scalar
 
-from filters import EnsembleTransformFilter, FiniteSizeEnsembleFilter
+from filters import EnsembleTransformFilter, FiniteSizeEnsembleFilter, make_filter, run
 from tests.filters.test_square_root_ensembles import SCALES, linear_model, naive_transform, predicted, updated
+from tuning.evaluation.runs import state_errors
+from tuning.experiments import lorenz63
+from tuning.experiments.benchmark import mean_of_roots
 
 
 def naive_factor(y, v, r, certainty):
@@ -72,6 +75,18 @@ def test_a_missing_channel_takes_no_part():
     inflated = mean + spread * (forecast.members - mean)
     expected = naive_transform(inflated, predicted(model, inflated)[here], z[here], r)
     np.testing.assert_allclose(analysis.members, expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_it_needs_no_inflation_where_the_transform_filter_loses_the_truth():
+    data = lorenz63.problem.data(range(8))
+
+    def score(name):
+        filter_ = make_filter(name, lorenz63.model(), ensemble_size=6)
+        estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
+        return np.median(mean_of_roots(state_errors(filter_, estimates, data)[:, data.late]))
+
+    assert 1.2 * score("enkf-n") < score("etkf")
 
 
 @pytest.mark.parametrize("certainty", [0.0, -1.0, float("nan"), None])

@@ -1,8 +1,11 @@
 """Smoothing some steps behind a filter in closed loop, against theory, an augmented state, RTS and FilterPy."""
 
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 
 from filters import (
     CubatureKalmanFilter,
@@ -18,6 +21,7 @@ from filters import (
 )
 from filters.smoothers.smooth import WithSmoother
 from tests.models import KEY, affine, pendulum, scalar_model, simulated, wide_model
+from thruster_env.core.compiled import interpreted
 
 KINDS = {
     "kf": KalmanFilter,
@@ -99,6 +103,50 @@ def moving_target():
     return affine([[1.0, 1.0], [0.0, 1.0]], np.zeros((2, 0)), [[1.0, 0.0]], **noise, **prior)
 
 
+def covariances_in_theory(model, lags):
+    """Of the fixed-lag smoother when it has settled, at lags 0 ... lags: each later innovation adds information.
+
+    P_L = M - M (sum over i = 0 ... L of (A_c')^i C' S^-1 C A_c^i) M, where M is the prediction's covariance and
+    A_c = A - A K C the predictor's closed loop (Anderson, Moore 1979, section 7.3).
+    """
+    a, _, _, c, _ = model.matrices()
+    m = solve_discrete_are(a.T, c.T, model.process_noise_cov, model.measurement_noise_cov)
+    s = c @ m @ c.T + model.measurement_noise_cov
+    closed, moved, information, found = a - a @ m @ c.T @ np.linalg.solve(s, c), np.eye(len(a)), 0.0, []
+    for _ in range(lags + 1):
+        information = information + moved.T @ c.T @ np.linalg.solve(s, c @ moved)
+        found.append(m - m @ information @ m)
+        moved = closed @ moved
+    return np.array(found)
+
+
+@pytest.mark.slow
+def test_when_it_has_settled_its_errors_fall_with_the_lag_as_in_theory():
+    model, lags, steps, settled = moving_target(), 12, 400, 100
+    theory = covariances_in_theory(model, lags)
+    rng, count = np.random.default_rng(4), 400
+    states, z = np.zeros((count, steps + 1, 2)), np.zeros((count, steps + 1, 1))
+    roots = np.linalg.cholesky(model.process_noise_cov), np.sqrt(model.prior_cov)
+    x = rng.normal(size=(count, 2)) @ roots[1]
+    for k in range(steps + 1):
+        if k:
+            x = x @ model.matrices()[0].T + rng.normal(size=(count, 2)) @ roots[0].T
+        states[:, k], z[:, k, 0] = x, x[:, 0] + rng.normal(size=count)
+    filter_, inputs = KalmanFilter(model=model), np.zeros((count, steps, 0))
+    were = np.inf
+    for lag in (0, 1, 3, 6, 12):
+        found = smooth(filter_, None, inputs, z, lag)
+        np.testing.assert_allclose(found.covs[0, steps - lag], theory[lag], rtol=1e-7)
+        squares = ((found.means - states)[:, settled : steps - lag] ** 2).mean(
+            axis=1
+        )  # (count, 2), of single runs
+        mean, error = squares.mean(axis=0), squares.std(axis=0) / np.sqrt(count)
+        assert (abs(mean - np.diag(theory[lag])) < 3.5 * error).all()  # 99.95 % of right filters pass each time
+        assert (mean < were).all()
+        were = mean
+    assert theory[12][0, 0] < 0.5 * theory[0][0, 0]
+
+
 def test_it_is_nearer_to_the_truth_than_filterpy_s():
     """FilterPy's recursion smooths the updated estimate by A - K C; right are the predicted one and A - A K C."""
     peer = pytest.importorskip("filterpy.kalman")
@@ -131,6 +179,21 @@ def test_nothing_is_carried_back_over_a_restart():
     means, _ = lagged(filter_, inputs, measurements, 3)
     batch = smooth(filter_, np.array([KEY]), inputs[None], measurements[None], 3)
     np.testing.assert_allclose(means[3:], batch.means[0, :7], rtol=1e-12)
+
+
+def test_a_session_goes_on_after_a_pickle():
+    model = pendulum()
+    filter_ = ExtendedKalmanFilter(model=model)
+    inputs, measurements = simulated(model, 8)
+    with interpreted():
+        session = WithSmoother(filter_.session(), filter_, 3)
+        session.start(KEY, measurements[0, 0])
+        for k in range(8):
+            if k == 4:
+                session = pickle.loads(pickle.dumps(session))
+            session.step(inputs[0, k], measurements[0, k + 1])
+        means, _ = lagged(filter_, inputs[0], measurements[0], 3)
+        np.testing.assert_array_equal(session.smoothed()[0], means[-1])
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])

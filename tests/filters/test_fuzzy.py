@@ -11,6 +11,7 @@ from filters.gaussian.mixtures import BLENDINGS
 from filters.gaussian.sigma_points import memberships
 from tests.models import pendulum, random_affine, simulated
 from tests.oracles import each_close, kalman_update
+from thruster_env.core.streams import filter_keys
 
 KEYS = np.zeros((1, 2))
 
@@ -54,6 +55,14 @@ def test_with_equal_rules_it_is_the_kalman_filter(n, blending):
     each_close(found, exact, rtol=1e-11, atol=1e-12)
 
 
+def test_an_affine_model_needs_no_range():
+    model = random_affine(2, p=1)
+    z = np.ones((1, 5, 2))
+    found = run(FuzzyKalmanFilter(model=model), KEYS, np.zeros((1, 4, 1)), z)
+    exact = run(KalmanFilter(model=model), KEYS, np.zeros((1, 4, 1)), z)
+    np.testing.assert_allclose(found.means, exact.means, rtol=1e-10)
+
+
 @pytest.mark.parametrize("n", [1, 2, 6])
 def test_memberships_are_products_and_sum_to_one(n):
     rng = np.random.default_rng(n)
@@ -69,6 +78,26 @@ def test_memberships_are_products_and_sum_to_one(n):
         assert len(found) == 2**n and sum(found) == pytest.approx(1.0, rel=1e-14)
         assert min(found) >= 0.0
         np.testing.assert_allclose(found, products, rtol=1e-13, atol=1e-16)
+
+
+def test_in_a_corner_one_rule_holds():
+    weights = memberships((5.0, -1.0), (1.0, -1.0), (5.0, 2.0), (0, 1))
+    assert tuple(weights) == (0.0, 1.0, 0.0, 0.0)  # high in state 0, low in state 1
+
+
+def test_six_states_have_64_rules_and_each_a_filter():
+    filter_ = FuzzyKalmanFilter(model=six_states())
+    belief, _ = filter_.update(filter_.predict(filter_.init(), [0.5]), [0.7])
+    means, covs, weights = filter_.rule_estimates(belief)
+    assert len(filter_.rules) == 64
+    assert (means.shape, covs.shape, weights.shape) == ((64, 6), (64, 6, 6), (64,))
+    assert weights.sum() == pytest.approx(1.0)
+    assert len(np.unique(means.round(12), axis=0)) > 32  # rules differ
+    np.testing.assert_allclose(weights @ means, belief.mean, rtol=1e-12)
+    apart = means - belief.mean
+    within, between = np.tensordot(weights, covs, 1), np.einsum("r,ri,rj->ij", weights, apart, apart)
+    np.testing.assert_allclose(within, belief.cov, rtol=1e-11, atol=1e-15)
+    assert np.trace(between) > 0.01 * np.trace(within)  # what P leaves out
 
 
 def test_rules_are_the_model_s_tangents_in_the_corners():
@@ -133,6 +162,50 @@ def mixed(means, covs, weights, blending):
         if blending != "weights":
             cov = cov + w * np.outer(x - mean, x - mean)
     return mean, cov
+
+
+def test_the_blendings_differ_and_the_first_is_the_default():
+    inputs, z = simulated(pendulum(), 20)
+    found = {one: run(pendulum_rules(blending=one), KEYS, inputs, z) for one in BLENDINGS}
+    for one, other in itertools.combinations(found.values(), 2):
+        assert np.abs(one.means - other.means).max() > 1e-3
+    assert BLENDINGS[0] == FuzzyKalmanFilter.blending == "weights"
+    # After the first step, from the same beliefs, P differs by the spread between the rules' means alone.
+    assert np.linalg.eigvalsh(found["moments"].covs[0, 1] - found["weights"].covs[0, 1]).max() > 0
+
+
+@pytest.mark.parametrize("blending", BLENDINGS)
+def test_a_batch_is_the_loop(blending):
+    filter_, keys = pendulum_rules(blending=blending), filter_keys(range(2))
+    inputs, z = simulated(filter_.model, 12, count=2, missing=0.2)
+    found = run(filter_, keys, inputs, z)
+    for b in range(2):
+        belief = filter_.init()
+        for k in range(13):
+            belief = belief if k == 0 else filter_.predict(belief, inputs[b, k - 1])
+            belief, innovation = filter_.update(belief, z[b, k])
+            np.testing.assert_allclose(found.means[b, k], belief.mean, rtol=1e-12, atol=1e-13)
+            np.testing.assert_allclose(found.covs[b, k], belief.cov, rtol=1e-12, atol=1e-13)
+            np.testing.assert_allclose(found.innovations[b, k], innovation.value, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("blending", BLENDINGS[1:])
+def test_without_a_measurement_a_variant_only_predicts(blending):
+    filter_ = pendulum_rules(blending=blending)
+    belief = filter_.predict(filter_.init(), [1.0])
+    updated, _ = filter_.update(belief, [np.nan, np.nan])
+    np.testing.assert_allclose(updated.mean, belief.mean, rtol=1e-15)
+    np.testing.assert_allclose(updated.cov, belief.cov, rtol=1e-15)
+
+
+def test_the_thruster_s_range_is_that_of_its_voltages():
+    model = thruster_model(ambient_velocity=-0.4)
+    still = thruster_model()
+    np.testing.assert_allclose(still.state_low, -still.state_high)
+    np.testing.assert_allclose(model.state_high, still.state_high)
+    np.testing.assert_allclose(model.state_low, still.state_low - [0.0, 0.4])
+    filter_ = FuzzyKalmanFilter(model=model)
+    np.testing.assert_array_equal([filter_.low, filter_.high], [model.state_low, model.state_high])
 
 
 @pytest.mark.parametrize(

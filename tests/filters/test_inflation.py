@@ -5,7 +5,7 @@ import pytest
 
 from filters import FILTERS, make_filter, run
 from filters.ensembles.ensemble import EnsembleFilter
-from tests.models import KEY, plane_model, simulated
+from tests.models import KEY, plane_model, rescaled, simulated
 from thruster_env.core.streams import filter_keys
 
 NAMES = [name for name, kind in FILTERS.items() if issubclass(kind, EnsembleFilter)]
@@ -107,6 +107,18 @@ def test_next_to_nothing_is_nothing(name):
     assert plain.kernels() is not controlled.kernels() or name == "rhf"  # which has one kind of kernels
     for one, other in zip(run(plain, *data), run(controlled, *data), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("states", [(1000.0, 0.01), (2.0**20, 2.0**-9)])
+def test_a_change_of_units_changes_no_estimate(name, states):
+    model, channels = far_plane(), (60.0, 1e-3)
+    other = rescaled(model, states, channels)
+    keys, inputs, measurements = some_data(model)
+    choice = {"inflation": 1.05, "relaxation": 0.4}
+    before = run(*filters_of(name, model, choice), keys, inputs, measurements)
+    after = run(*filters_of(name, other, choice), keys, inputs, measurements * channels)
+    np.testing.assert_allclose(after.means / states, before.means, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(after.covs / np.outer(states, states), before.covs, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,11 @@ from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 from scipy.stats import invgamma, multivariate_normal
 
-from filters import make_filter
+from filters import make_filter, run
 from filters.ensembles.ensemble import relative_move, width_of
 from tests.filters.test_adaptive_inflation import drifting
 from tests.models import KEY, plane_model, simulated
+from thruster_env.core.compiled import interpreted
 
 OWN = {"ensemble_size": 8, "adaptive_inflation": 0.3, "least_deviation": 0.05}
 
@@ -111,6 +112,16 @@ def test_where_the_model_s_error_is_steady_the_deviation_shrinks_and_the_factor_
     assert width_of(0.1) <= belief.extras[1] < 0.6 * width_of(0.3)
     assert seen[0.1][0] == pytest.approx(seen[0.0][0], rel=0.05) and seen[0.1][0] > 1.2
     assert seen[0.1][1] < 0.75 * seen[0.0][1]
+
+
+@pytest.mark.slow
+def test_compiled_code_and_python_are_one():
+    filter_ = make_filter("etkf", plane_model(), **OWN, inflation_by_state=1)
+    inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)
+    with interpreted():
+        expected = run(filter_, None, inputs, z)
+    for one, other in zip(run(filter_, None, inputs, z), expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
 def test_wrong_numbers_are_refused():

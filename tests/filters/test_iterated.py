@@ -96,6 +96,25 @@ def test_on_an_affine_model_it_is_the_kalman_filter():
     each_close(found[:5], by_kalman[:5], rtol=1e-10, atol=1e-10)
 
 
+def test_a_missing_channel_of_a_nonlinear_measurement_has_no_effect():
+    both = landmark()
+    one = landmark(
+        observe=lambda x, c: (look(x, c)[0],),
+        observe_jacobian=lambda x, c: (look_jacobian(x, c)[0],),
+        measurement_noise_cov=[0.05],
+    )
+    found, innovation = IteratedExtendedKalmanFilter(model=both).update(
+        IteratedExtendedKalmanFilter(model=both).init(), [2.5, np.nan]
+    )
+    expected, alone = IteratedExtendedKalmanFilter(model=one).update(
+        IteratedExtendedKalmanFilter(model=one).init(), [2.5]
+    )
+    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-12)
+    np.testing.assert_allclose(found.cov, expected.cov, rtol=1e-12)
+    assert innovation.value[1] == 0.0
+    assert innovation.log_likelihood == pytest.approx(alone.log_likelihood, rel=1e-12)
+
+
 @pytest.mark.parametrize("iterations", [0, -1, 1.5, math.nan, "many", 21])
 def test_iterations_must_be_a_whole_number_from_1_to_20(iterations):
     with pytest.raises(

@@ -59,6 +59,20 @@ def test_an_update_is_the_textbook_s(iterations):
     np.testing.assert_allclose(analysis.cov, np.cov(expected), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("channel", [0, 1])
+def test_a_missing_channel_is_left_out_of_every_iteration(channel):
+    model, z = curved_model(), np.array([np.nan, np.nan])
+    z[channel] = 1.5
+    forecast, analysis, _ = updated(IteratedEnsembleKalmanFilter, model, z, iterations=4)
+
+    def observe(x, c):
+        return (curved(x, c)[channel],)
+
+    r = model.measurement_noise_cov[[channel], [channel]][:, None]
+    expected = naive_iterations(forecast.members, observe, z[[channel]], r, 4)
+    np.testing.assert_allclose(analysis.members, expected, rtol=1e-9, atol=1e-9)
+
+
 def test_its_first_iteration_is_the_transform_filter_with_its_innovation():
     model, z = curved_model(), [1.9, -1.4]
     _, first, innovation = updated(IteratedEnsembleKalmanFilter, model, z, iterations=1)

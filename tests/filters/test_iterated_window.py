@@ -13,8 +13,8 @@ from filters.ensembles.square_root import record_members
 from filters.smoothers.smooth import smooth_ensembles
 from filters.tensors import torch
 from tests.filters.test_ensemble_twins import step, whole
-from tests.filters.test_filter_paths import assert_paths_agree
-from tests.models import KEY, plane_model, simulated, state_space, varying_noise
+from tests.filters.test_filter_paths import assert_compiled_as_python, assert_paths_agree
+from tests.models import KEY, plane_model, random_affine, simulated, state_space, varying_noise
 from thruster_env.core.streams import filter_keys
 from thruster_env.model.simulate import simulate
 
@@ -185,12 +185,31 @@ def whole_filter():
     return filter_, *simulated(model, 12, missing=0.2)
 
 
+@pytest.mark.slow
+def test_compiled_code_is_python_s():
+    filter_, inputs, z = whole_filter()
+    noise = varying_noise(filter_.model, 12)
+    assert_compiled_as_python(filter_, np.array([KEY]), inputs, z, **noise)
+
+
 @pytest.mark.usefixtures("as_python")
 def test_all_paths_agree_and_members_of_now_are_recorded():
     filter_, inputs, z = whole_filter()
     assert_paths_agree(filter_, KEY, inputs, z)
     recorded = record_members(filter_, np.array([KEY]), inputs, z)
     assert recorded.members.shape == (1, 13, 2, SIZE) and recorded.weights is None
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("as_python")
+def test_large_models_are_called():
+    model = random_affine(38, 8, 1)
+    inputs, z = simulated(model, 4)
+    without, with_window = (
+        run(make_filter("ienkf", model, ensemble_size=6, window=lag, iterations=2), None, inputs, z)
+        for lag in (0, 2)
+    )
+    np.testing.assert_allclose(with_window.means, without.means, rtol=1e-8, atol=1e-8)
 
 
 def test_what_a_window_does_not_allow_is_refused():

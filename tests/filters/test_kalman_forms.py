@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from filters import KalmanFilter, run, thruster_model
-from tests.models import affine, simulated, wide_model
+from filters.engine.session import Session
+from tests.models import affine, rescaled, simulated, wide_model
 from tests.oracles import each_close
 from thruster_env.core.compiled import interpreted
 
@@ -31,6 +32,38 @@ def test_every_form_gives_the_same_estimates(form, kind):
     each_close(estimates, expected, rtol=1e-10, atol=1e-10)
 
 
+def test_compiled_batch_loop_session_and_python_agree(form):
+    model = wide_model()
+    inputs, z = simulated(model, 30)
+    z[0, 7, 1] = z[0, 9] = np.nan
+    filter_ = KalmanFilter(model=model, form=form)
+    close = {"rtol": 1e-12, "atol": 1e-12}
+    estimates = run(filter_, KEYS, inputs, z)
+    with interpreted():
+        each_close(run(filter_, KEYS, inputs, z), estimates, **close)
+    session = Session(filter_)
+    session.start(KEYS[0], z[0, 0])
+    belief, _ = filter_.update(filter_.init(), z[0, 0])
+    for k, u in enumerate(inputs[0], start=1):
+        session.step(u, z[0, k])
+        belief, innovation = filter_.update(filter_.predict(belief, u), z[0, k])
+        np.testing.assert_allclose(session.mean, estimates.means[0, k], **close)
+        np.testing.assert_allclose(session.cov, estimates.covs[0, k], **close)
+        np.testing.assert_allclose(belief.mean, estimates.means[0, k], **close)
+        np.testing.assert_allclose(belief.cov, estimates.covs[0, k], **close)
+        assert innovation.log_likelihood == pytest.approx(estimates.log_likelihoods[0, k], rel=1e-11)
+
+
+def test_covariances_are_symmetric_and_positive(form):
+    model = wide_model()
+    inputs, z = simulated(model)
+    with interpreted():
+        estimates = run(KalmanFilter(model=model, form=form), KEYS, inputs, z)
+    for covs in (estimates.covs[0], estimates.innovation_covs[0]):
+        assert (covs == covs.transpose(0, 2, 1)).all()
+        assert (np.linalg.eigvalsh(covs) > 0).all()
+
+
 def test_noise_may_vary_from_step_to_step(form):
     model = wide_model()
     inputs, z = simulated(model, 20)
@@ -43,6 +76,17 @@ def test_noise_may_vary_from_step_to_step(form):
         estimates = run(KalmanFilter(model=model, form=form), KEYS, inputs, z, **noise)
         expected = run(KalmanFilter(model=model), KEYS, inputs, z, **noise)
     each_close(estimates, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_a_change_of_units_changes_no_estimate(form):
+    model, units = wide_model(), np.array([1000.0, 0.01, 7.0])
+    other = rescaled(model, units, np.ones(2))
+    inputs, z = simulated(model)
+    with interpreted():
+        before = run(KalmanFilter(model=model, form=form), KEYS, inputs, z)
+        after = run(KalmanFilter(model=other, form=form), KEYS, inputs, z)
+    np.testing.assert_allclose(after.means / units, before.means, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(after.covs / np.outer(units, units), before.covs, rtol=1e-9, atol=1e-9)
 
 
 def test_the_square_root_form_starts_from_an_exact_state_and_the_information_form_refuses_it():

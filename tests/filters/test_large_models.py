@@ -1,5 +1,6 @@
 """Models of any size: what is written out for small ones is looped over arrays for large ones."""
 
+import linecache
 import sys
 from contextlib import contextmanager
 
@@ -23,7 +24,7 @@ from tests.models import (
 )
 from tests.slow import slow_but
 from tests.thruster_env.core.test_angles import turned, turning, turntable
-from thruster_env.core import equal_functions, sources
+from thruster_env.core import equal_functions, matrices, sources
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import shape
@@ -146,6 +147,29 @@ def kalman_step(model, mean, p, u, z):
     return mean + gain @ (z - c @ mean - shift), p - gain @ s @ gain.T
 
 
+GAUSSIAN = {
+    **{name: (name, {}) for name in ("kf", "ekf", "iekf", "ukf", "ckf", "fuzzy")},
+    "information": ("kf", {"form": "information"}),
+    "square-root": ("kf", {"form": "square-root"}),
+    "sage-husa": ("sage-husa", {"forgetting_factor": 1.0}),
+    "ekf-robust": ("ekf-robust", {"degrees_of_freedom": 1e12}),
+    "vb": ("vb", {"forgetting_factor": 1.0, "prior_weight": 1e12}),
+    "mhe": ("mhe", {"loss": "quadratic"}),
+}
+
+
+@pytest.mark.parametrize("name", GAUSSIAN)
+def test_a_filter_of_twelve_states_is_the_kalman_filter_on_an_affine_model(name):
+    model, (kind, numbers) = linear(12, 4), GAUSSIAN[name]
+    u, z = np.array([0.5, -1.0]), np.arange(4.0)
+    with interpreted():
+        made = make_filter(kind, model, **numbers)
+        belief, _ = made.update(made.predict(made.init(), u), z)
+    mean, p = kalman_step(model, model.prior_mean, model.prior_cov, u, z)
+    np.testing.assert_allclose(belief.mean, mean, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(belief.cov, p, rtol=1e-7, atol=1e-8)
+
+
 @pytest.mark.parametrize("name", ["kf", "ekf", "kf-steady"])
 def test_a_filter_of_forty_states_is_the_kalman_filter_on_an_affine_model(name):
     model = linear(40, 40)
@@ -243,6 +267,19 @@ def test_slopes_of_many_angles_are_those_of_an_angle_at_the_cut():
         assert (found[~angles, 40] < -1e4).all()
 
 
+def test_slopes_of_a_large_analytic_model_are_exact():
+    def grow(x, u, c):
+        return x * x
+
+    noise = {"q": np.ones(40), "r": [1.0, 1.0]}
+    prior = {"mean": np.arange(40.0), "cov": np.ones(40)}
+    model = state_space(grow, lambda x, c: (x[0] * x[39], x[1]), **noise, **prior, analytic=True)
+    x, expected = model.prior_mean, np.zeros((2, 40))
+    expected[0, [0, 39]], expected[1, 1] = (x[39], x[0]), 1.0
+    np.testing.assert_allclose(model.transition_jacobian(x, (0.0,), ()), np.diag(2 * x), rtol=1e-15)
+    np.testing.assert_allclose(model.observe_jacobian(x, ()), expected, rtol=1e-15)
+
+
 def test_what_a_large_model_is_and_whether_it_fits_its_data_is_found_with_arrays():
     """Its functions multiply whole states, which tuples refuse."""
     noise = {"process_noise_cov": np.ones(40), "measurement_noise_cov": [1.0]}
@@ -255,6 +292,15 @@ def test_what_a_large_model_is_and_whether_it_fits_its_data_is_found_with_arrays
     check_model(model, data, "large")
     with pytest.raises(ValueError, match="transition of the model of problem large must be finite"):
         check_model(model.replace(transition=lambda x, u, c: x / u[0]), data, "large")
+
+
+def test_a_traceback_shows_the_source_of_what_was_written_out_and_its_size():
+    with pytest.raises(IndexError) as caught:
+        matrices.multiplier(3, 2, 3)(((1.0, 2.0),) * 3, ((1.0, 2.0),) * 2)
+    place = caught.traceback[-1]
+    assert "multiply" in str(place.path) and "multiplier(3, 2, 3)" in str(place.path)
+    line = linecache.getline(place.frame.code.raw.co_filename, 2)
+    assert "a[0][0] * b[0][0] + a[0][1] * b[1][0]" in line
 
 
 def ring(x, u, c):

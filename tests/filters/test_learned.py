@@ -15,8 +15,10 @@ from filters.estimators.foreign import is_foreign, label_of
 from filters.learned.estimator import Equations, unit_scales
 from filters.learned.filters import LEARNED, GainNetwork, KalmanNet, read, write_estimator
 from filters.wrappers.envs import EstimateStates
-from tests.models import KEY, pendulum, plane_model, simulated
+from tests.models import KEY, pendulum, plane_model, random_affine, simulated
 from thruster_env.model.affine import affine_model
+from tuning.search.space import Choice
+from tuning.thruster.scenario import find_scenario
 
 GAIN = np.array([[0.3, 0.1], [-0.05, 0.2]])
 RUNS, STEPS = 3, 6
@@ -165,6 +167,16 @@ def test_the_gru_begins_with_the_mean_of_the_states_and_follows_its_equations(da
     np.testing.assert_allclose(untrained.run(KEYS, inputs, z).mean, np.broadcast_to([4.0, 5.0], (3, STEPS + 1, 2)))
 
 
+@pytest.mark.slow
+def test_untrained_the_ensemble_is_the_enkf(data):
+    inputs, z = data
+    model = plane_model()
+    known = run(make_filter("enkf", model, ensemble_size=8), KEYS, inputs, z)
+    found = LEARNED["differentiable-enkf"](model, ensemble_size=8).run(KEYS, inputs, z)
+    for name, one in zip(("means", "covs", "innovations", "innovation_covs"), found, strict=True):
+        np.testing.assert_allclose(one, getattr(known, name), rtol=1e-9, atol=1e-12, err_msg=name)
+
+
 def test_learned_noise_multiplies_q_by_the_state_and_r_by_the_innovation(data, as_python):
     inputs, z = data
     estimator = made("differentiable-enkf", ensemble_size=6, width=4)
@@ -293,6 +305,16 @@ def test_a_file_of_another_model_or_none_at_all_is_refused(tmp_path, as_python):
         read(tmp_path / "odd.safetensors")(plane_model())
 
 
+def test_a_file_of_another_preset_names_both_and_the_constants_that_differ(tmp_path, as_python):
+    path = tmp_path / "gain.safetensors"
+    own, other = (find_scenario("nominal").replace(preset=preset) for preset in ("tunnel", "t200"))
+    write_estimator(path, made("kalmannet", own.model()), {"problem": "nominal", "plant": own.plant_data})
+    with pytest.raises(ValueError, match=r"that of nominal, but that had motor_damping .* \(here .*\)"):
+        read(path)(other.model())
+    with pytest.raises(ValueError, match=r"gain.safetensors was tuned for preset tunnel \(here t200\)"):
+        Choice(str(path), {}, {}).filter(other)
+
+
 def test_a_gru_is_refused_for_other_quantities_and_for_other_equations_of_unnamed_ones(tmp_path, as_python):
     def plant(a=0.9, named=True, **changes):
         names = {
@@ -328,6 +350,15 @@ def test_a_gru_is_refused_for_other_quantities_and_for_other_equations_of_unname
         read(tmp_path / "old.safetensors")(plant(a=0.8))
 
 
+def test_unknown_and_wrong_options_are_refused():
+    with pytest.raises(ValueError, match="width must be a whole number of at least 2, but got 1"):
+        LEARNED["gru"](plane_model(), width=1)
+    with pytest.raises(ValueError, match="an option of kalmannet"):
+        KalmanNet(plane_model(), size=3)
+    with pytest.raises(ValueError, match="at most 16 states and measurements, but got 17 and 2"):
+        KalmanNet(random_affine(n=17))
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_numbers_that_are_not_finite_are_refused(tmp_path, as_python, value):
     path, estimator = tmp_path / "gain.safetensors", made("gru", width=7)
@@ -336,4 +367,14 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path, as_python, value):
     write_estimator(path, estimator, {})
     with pytest.raises(ValueError, match=f"{name} must be finite, but have NaN or infinity") as said:
         read(path)
+    assert "\n" not in str(said.value)
+
+
+def test_numbers_of_other_shapes_are_refused_in_one_line(tmp_path, as_python):
+    path = tmp_path / "gain.safetensors"
+    write_estimator(path, made("gru", width=7), {})
+    found = read(path)
+    found._options["width"] = 5
+    with pytest.raises(ValueError, match="must have the numbers of a gru, but: size mismatch") as said:
+        found(plane_model())
     assert "\n" not in str(said.value)

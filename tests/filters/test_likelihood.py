@@ -5,6 +5,7 @@ import pytest
 
 from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, run
 from filters.sensitivity import information, likelihood
+from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
@@ -100,6 +101,17 @@ def test_the_information_is_that_of_the_innovations_slopes():
     scale = np.sqrt(np.einsum("bii,bjj->bij", expected, expected))
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-4)
     assert (abs(expected / scale) > 0.01).all()
+
+
+def test_the_interpreted_likelihood_is_the_compiled_one():
+    model = two_channels()
+    _, inputs, measurements = data_of(model)
+    slopes = tuple(directions(model))
+    compiled = likelihood(model, inputs, measurements, *slopes)
+    with interpreted():
+        plain = likelihood(model, inputs, measurements, *slopes)
+    for a, b in zip(compiled, plain, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
 
 
 def test_shapes_that_do_not_fit_are_refused():

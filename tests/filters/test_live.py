@@ -1,6 +1,8 @@
 """Real clocks: any dt, sensors at their own times, late samples in order; the same numbers as on a grid."""
 
+import copy
 import math
+import pickle
 from typing import NamedTuple
 
 import numpy as np
@@ -233,6 +235,18 @@ def test_long_steps_are_divided_as_far_as_accuracy_asks():
     np.testing.assert_allclose(plant.densities, S, rtol=1e-6, atol=1e-9)
 
 
+def test_noise_of_no_white_noise_is_refused():
+    with pytest.raises(ValueError, match="process_noise_cov must be that of white noise in continuous time"):
+        noise_for_dt([0.0, 1.0], 0.1, 0.2, A)
+    q = exact_noise(0.3)
+    np.testing.assert_allclose(noise_for_dt(q, 0.3, 1.7, A), exact_noise(1.7), rtol=1e-9)
+
+
+def test_a_continuous_model_needs_a_substep():
+    with pytest.raises(ValueError, match="constants must be a NamedTuple with a field substep"):
+        ContinuousModel(rates=rates, observe=both, densities=S, constants=(), arguments={"prior_mean": [0.0, 0.0]})
+
+
 def watched(filter_, samples, late, **monitor):
     """Live with a monitor over samples (stamp, arrival, channel, value); the alarms at each arrival."""
     live = filter_.live(late=late, monitor={"steps_between": 100_000.0, **monitor})
@@ -292,6 +306,18 @@ def test_late_samples_of_one_stamp_come_in_the_order_of_arrival_with_the_length_
     late.update(0.03, "position", 0.7)
     np.testing.assert_allclose(late.mean, early.mean, rtol=1e-12)
     np.testing.assert_allclose(late.cov, early.cov, rtol=1e-12)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_copy_of_live_has_its_own_estimate():
+    live = make_filter("ekf", thruster_model()).live(late=0.5, monitor=1000)
+    live.start(1.0)
+    live.predict_to(1.02, [4.0])
+    for other in (copy.deepcopy(live), pickle.loads(pickle.dumps(live))):
+        before = live.mean.copy()
+        other.update(1.02, "thrust", 3.0)
+        np.testing.assert_array_equal(live.mean, before)
+        assert (other.mean != before).any() and not np.shares_memory(other.mean, live.mean)
 
 
 @pytest.mark.parametrize("start", [0.0, 1.7e9, -1.7e9])
@@ -356,6 +382,17 @@ def test_a_clock_that_jumps_is_an_error_of_one_line_and_nothing_changes():
     live.update(0.02, "thrust", 0.1)  # goes on
     live.start(1.7e9)
     live.predict_to(1.7e9 + 0.01, [1.0])
+
+
+@pytest.mark.usefixtures("as_python")
+def test_stamps_of_a_coarse_recorder_are_one_within_its_resolution():
+    live = make_filter("ekf", thruster_model()).live(resolution=0.001)
+    live.start(1.0)
+    live.predict_to(1.011, [4.0])
+    assert live._session.belief().step == 1
+    live.predict_to(1.0105, [4.0])  # of the same time
+    live.update(1.0115, "thrust", 0.2)
+    assert live.time == 1.011
 
 
 @pytest.mark.usefixtures("as_python")

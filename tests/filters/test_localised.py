@@ -133,6 +133,23 @@ def test_a_radius_beyond_everything_is_none(name):
         assert of_far.log_likelihood == pytest.approx(of_plain.log_likelihood, rel=1e-8)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LOCAL)
+def test_few_members_follow_a_long_ring_only_with_a_radius(name):
+    """Of 8 states and 5 members: one with a page and one by parts have the same numbers compiled."""
+    model, numbers = ring(), {"ensemble_size": SIZE}
+    inputs, z = simulated(model, 30, count=2, missing=0.2)
+    local = make_filter(name, model, radius=1.0, **numbers)
+    with interpreted():
+        found = run(local, None, inputs, z)
+        plain = run(make_filter(name, model, **numbers), None, inputs, z)
+    if name in ("enkf", "letkf"):
+        for one, other in zip(run(local, None, inputs, z), found, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+    assert found.divergences.tolist() == [0, 0]
+    assert found.log_likelihoods[:, 5:].mean() > plain.log_likelihoods[:, 5:].mean()
+
+
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", ["enkf", "denkf"])
 def test_tapered_covariances_are_those_of_c_and_of_tensors(name, tmp_path):

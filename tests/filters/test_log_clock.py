@@ -1,17 +1,25 @@
 """Logs on their own stamps: the numbers of the grid where stamps lie on it, and those of `live` elsewhere."""
 
+import dataclasses
+import inspect
+import pickle
+
 import numpy as np
 import pytest
 
 from filters import make_filter
 from filters.logs.estimate import by_the_clock, estimate
+from filters.logs.findings import alarms_of
+from filters.monitoring import Monitor
 from tests.filters.test_live import oscillator
 from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.grid import Series
 from thruster_env.logs.log import Log, in_steps
 from thruster_env.logs.read import at_own_stamps, read_log
+from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.quantities import Quantity
 from thruster_env.thruster.model import logged_model, thruster_model
+from tuning.identification.family import ModelFamily
 from tuning.problems.log_problem import LogProblem
 
 
@@ -76,6 +84,39 @@ def test_a_clock_offset_moves_stamps_and_inputs_are_held_from_their_own():
     rate = log.measurements[~np.isnan(log.measurements[:, 1])]
     np.testing.assert_allclose(rate[:, 1], stamps[1:] ** 2)  # its first sample was before the log's
     assert np.isnan(rate[:, 0]).all()
+
+
+def damped(damping=0.6):
+    """A function that makes a model in continuous time, as users offer one."""
+    plant = oscillator()
+    return dataclasses.replace(plant, constants=plant.constants._replace(damping=damping))
+
+
+def test_a_function_may_make_a_model_in_continuous_time():
+    rng = np.random.default_rng(7)
+    stamps = 0.05 * np.arange(40.0)
+    data = {"time_s": stamps, "u_1": rng.normal(size=40), "position": rng.normal(size=40), "rate": stamps}
+    of_model, of_function = (estimate(data, "ekf", one, grid=False) for one in (oscillator(), damped))
+    np.testing.assert_array_equal(of_function.means, of_model.means)
+    assert of_function.noise is not None
+    on_grid = estimate(data, "ekf", damped, model_arguments={"damping": 0.6})
+    np.testing.assert_allclose(on_grid.means, of_model.means, rtol=1e-9, atol=1e-12)
+    made = pickle.loads(pickle.dumps(in_discrete_time(damped)))
+    assert list(inspect.signature(made).parameters) == ["damping", "dt"]
+    family = ModelFamily(made, ["damping"], dt=0.05)
+    assert family.model(damping=0.7).constants.damping == 0.7 and {"damping", "Q11"} <= set(family.known)
+    assert in_discrete_time(thruster_model) is thruster_model
+
+
+@pytest.mark.slow
+def test_alarms_and_isolation_work_on_own_stamps():
+    rng = np.random.default_rng(5)
+    stamps = np.cumsum(rng.uniform(0.01, 0.09, size=300))
+    data = {"time_s": stamps, "u_1": np.zeros(300), "position": 0.1 * rng.normal(size=300)}
+    data["rate"] = np.where(np.arange(300) < 200, 0.3 * rng.normal(size=300), 0.25)
+    found = estimate(data, "ekf", oscillator(), grid=False, dt=0.05)
+    told = alarms_of(found, Monitor(stuck=10), isolate=True)
+    assert any(one.test == "stuck" and one.step in (208, 209) for one in told.alarms)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,14 @@
 """A filter over a log: what its innovations tell, errors against channels it did not see, smoothers, files."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy.stats import chi2, multivariate_normal
 
 from filters import make_filter, run, smooth
 from filters.logs.estimate import estimate
-from filters.logs.findings import compared, draw_log, findings
+from filters.logs.findings import columns_of, compared, draw_log, findings, log_figure
 from tests.thruster_env.logs.test_logs import MODEL
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs.log import Log
@@ -92,6 +94,23 @@ def test_a_smoother_is_closer_to_the_truth(log):
     np.testing.assert_array_equal(lagged.means, smooth(make_filter("kf", SEEN), *data, 3).means[0])
 
 
+def test_a_filter_without_a_covariance_has_errors_alone(log):
+    told = findings(estimate(log, "open-loop", SEEN))
+    assert np.isnan(told.mean_nis) and np.isnan(told.log_likelihood) and told.whiteness is None
+    assert told.references[0].rmse > 0
+
+
+def test_columns_and_picture_hold_all_of_it(log, tmp_path):
+    found = estimate(log, "kf", SEEN)
+    columns = columns_of(found)
+    assert list(columns)[:4] == ["time_s", "input_V_s_V", "measured_tach_rad_per_s", "reference_n_rad_per_s"]
+    np.testing.assert_array_equal(columns["n_rad_per_s"], found.means[:, 0])
+    np.testing.assert_array_equal(columns["std_n_rad_per_s"], found.stds[:, 0])
+    np.testing.assert_array_equal(columns["innovation_tach_rad_per_s"], found.innovations[:, 0])
+    assert {"P_W", "std_P_W", "reference_P_W", "innovation_std_tach_rad_per_s"} <= set(columns)
+    assert log_figure(tmp_path / "est.png", found, "kf on run").read_bytes().startswith(b"\x89PNG")
+
+
 def test_what_is_measured_stands_behind_the_state_or_output_that_it_measures(log):
     drawn = [
         [dots.get_offsets()[:, 1] for dots in axis.collections if dots.get_label() == "measurement"]
@@ -100,3 +119,24 @@ def test_what_is_measured_stands_behind_the_state_or_output_that_it_measures(log
     (speed,), *others = drawn  # h(x) = n
     np.testing.assert_array_equal(speed.filled(np.nan), log.measurements[:, 0])
     assert others == [[], []]  # the output P and the innovation
+
+
+def test_an_estimate_at_which_h_has_no_value_is_drawn_all_the_same(log):
+    def root(x, c):
+        return (math.sqrt(x[0]),)
+
+    own = make_filter("ekf", SEEN.replace(prior_mean=[1.0], observe=root, observe_jacobian=None))
+    axes = draw_log(estimate(log, "kf", SEEN)._replace(filter=own), "ekf").axes
+    assert not any(dots.get_label() == "measurement" for axis in axes for dots in axis.collections)
+
+
+def test_the_prior_s_band_does_not_widen_the_picture(log, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("filters.logs.findings.save_figure", lambda figure, path: drawn.extend(figure.axes))
+    found = estimate(log, "kf", SEEN.replace(prior_cov=[1e6]))
+    log_figure(tmp_path / "est.png", found, "kf on run")
+    speed, innovation = drawn[0], drawn[-1]
+    for axis, line in ((speed, found.means[:, 0]), (innovation, found.innovations[:, 0])):
+        low, high = axis.get_ylim()
+        assert low < np.nanmin(line) and np.nanmax(line) < high
+        assert high - low < 3 * np.nanmax(np.abs(line)) + 6 * found.stds[-1, 0]

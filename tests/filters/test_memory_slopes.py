@@ -1,4 +1,4 @@
-"""Derivatives of all filters that have them: values of the filter, slopes of differences."""
+"""Derivatives of filters that keep more than mean and covariance: values of the filter, slopes of differences."""
 
 import dataclasses
 
@@ -13,14 +13,20 @@ from tests.filters.test_pages import MADE, assert_slopes, wide_pendulum, with_no
 from tests.filters.test_pages_called import turn_if
 from tests.filters.test_sensitivity import slopes_of
 from tests.filters.test_state_scores import WEIGHTS, data_of, textbook
-from tests.models import state_space
+from tests.models import simulated, state_space
+from tests.slow import slow_but
+from thruster_env.core.streams import episode_keys
 from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.programs import Place, values_of
 from thruster_env.model.traced import Traced
+from tuning.auv.scenario import find_scenario as find_vehicle
 from tuning.cli.templates.filter import Template
+from tuning.likelihood.gradient import tune_by_gradient
+from tuning.problems.data import training_seeds
+from tuning.search.space import untuned_choice
+from tuning.thruster.scenario import find_scenario
 
-KEEPING = ("ekf-robust", "sage-husa", "vb")  # more than mean and covariance
-NAMES = ("iekf", "ukf", "ckf", *KEEPING)
+NAMES = ("ekf-robust", "sage-husa", "vb")
 WRITTEN = ("iterations",)  # parameters that programs are written out for
 
 
@@ -76,7 +82,7 @@ def test_a_score_is_that_of_the_estimates_and_its_gradient_that_of_differences(n
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("score", [None, "log-score", "squares"])
-@pytest.mark.parametrize("name", KEEPING)
+@pytest.mark.parametrize("name", NAMES)
 def test_slopes_along_a_filters_own_numbers_are_those_of_differences(name, score):
     model, own = two_channels(), {key: value for key, value in MADE[name].items() if key not in WRITTEN}
     data = data_of(model, steps=12)
@@ -118,6 +124,59 @@ def test_slopes_along_constants_and_the_prior_are_those_of_differences(name, dec
     found = sensitivity(model_of(**values), inputs, z, slopes, filter=made(name, model_of(**values)))
     expected = [differences(lambda t, key=key: value(key, t), 1e-3) for key in values]
     assert_slopes(found.gradients, np.stack(expected, axis=1))
+
+
+def assert_gradient_on(scenario, name, steps, mixed=None):
+    """The gradient on two training runs, along each variance of Q and along R, or along mixtures of these."""
+    model, data = scenario.model(), scenario.data(training_seeds(0, 2))
+    inputs, z = data.inputs[:, :steps], data.measurements[:, : steps + 1]
+    q, r = model.process_noise_cov, model.measurement_noise_cov
+    dq = np.array([np.diag(row) for row in np.eye(model.n) * np.diag(q)] + [np.zeros_like(q)])
+    dr = np.array([np.zeros_like(r)] * model.n + [r])
+    moved = [k for k in range(len(dq)) if dq[k].any() or dr[k].any()]
+    dq, dr = dq[moved], dr[moved]
+    if mixed:
+        parts = np.random.default_rng(1).uniform(0.3, 1.0, (mixed, len(moved))) * (-1.0) ** np.arange(len(moved))
+        dq, dr = np.tensordot(parts, dq, 1), np.tensordot(parts, dr, 1)
+
+    def value(k, t):
+        changed = with_noise(model, q + t * dq[k], r + t * dr[k])
+        return run(made(name, changed), episode_keys(range(2)), inputs, z).log_likelihoods.sum(axis=1)
+
+    found = likelihood(model, inputs, z, dq, dr, filter=made(name, model))
+    np.testing.assert_allclose(found.values, value(0, 0.0), rtol=1e-9)
+    expected = np.stack([differences(lambda t, k=k: value(k, t), 1e-4) for k in range(len(dq))], axis=1)
+    np.testing.assert_allclose(found.gradients, expected, rtol=0, atol=1e-6 * abs(expected).max())
+
+
+@pytest.mark.parametrize("name", slow_but(NAMES, NAMES[:1]))
+def test_on_a_scenario_the_gradient_is_that_of_differences(name):
+    assert_gradient_on(find_scenario("outliers"), name, 100)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", NAMES[:1])
+def test_on_a_vehicle_the_gradient_is_that_of_differences(name):
+    assert_gradient_on(find_vehicle("auv:motion"), name, 15, mixed=2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES[-1:])
+def test_on_a_vehicle_the_compiled_gradient_is_that_of_differences(name):
+    assert_gradient_on(find_vehicle("auv:motion"), name, 100)
+
+
+@pytest.mark.parametrize("name", slow_but(NAMES, NAMES[:1]))
+def test_gradients_tune_such_a_filter(name):
+    scenario = find_scenario("outliers")
+    data = scenario.data(training_seeds(0, 2))
+    found = tune_by_gradient(name, scenario, data, starts=[1.0])
+    tuned, untuned = (choice.filter(scenario) for choice in (found.choice, untuned_choice(name, scenario)))
+    levels = [run(one, None, data.inputs, data.measurements).log_likelihoods.sum() for one in (tuned, untuned)]
+    assert (
+        found.best.converged and found.best.value == pytest.approx(levels[0], rel=1e-9) and levels[0] > levels[1]
+    )
 
 
 def test_runs_that_lie_together_begin_with_what_a_filter_keeps_at_its_start():
@@ -168,6 +227,13 @@ def test_kalmans_forms_have_the_derivatives_of_the_covariance_form(form):
         for one in (form, "covariance")
     )
     np.testing.assert_array_equal(found.gradients, expected.gradients)
+
+
+def test_own_slopes_of_another_size_are_refused():
+    model = two_channels()
+    inputs, z = simulated(model, 3)
+    with pytest.raises(ValueError, match=r"own_slopes must have the shape \(6, 2\), but got \(6, 1\)"):
+        likelihood(model, inputs, z, *directions(model), filter=made("vb", model), own_slopes=np.zeros((6, 1)))
 
 
 def folded(x, c):

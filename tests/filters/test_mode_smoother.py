@@ -8,9 +8,12 @@ import pytest
 from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, make_filter, run, smooth, smooth_modes
 from filters.smoothers.rts import passes, relation_of
 from filters.smoothers.smooth import condition_on_later, merged
+from tests.filters.test_multiple_models import merged as mixture
 from tests.filters.test_multiple_models import moving
 from tests.filters.test_unequal_modes import moving as point
 from tests.models import pendulum, simulated
+from tests.slow import slow_but
+from thruster_env.core.compiled import interpreted
 
 MODELS = [moving(0.01), moving(4.0)]
 TRANSITION, P = np.array([[0.9, 0.1], [0.2, 0.8]]), np.array([0.7, 0.3])
@@ -148,6 +151,31 @@ def test_a_lag_and_a_mode_without_a_smoother_are_refused():
         smooth(imm(mode_filter="fading"), None, inputs, z)
 
 
+def test_the_smoother_of_models_that_stay_is_that_of_each_by_itself():
+    """Pi = I: each model's own smoother, weighed by its posterior; the acceleration of the mode that has it."""
+    whole, small, p = point("pva", 0.3), point("vp", 0.3), np.array([0.4, 0.6])
+    filter_ = make_filter("mmae", whole, modes=[small, whole], mode_filter="kf", probabilities=p)
+    z = np.random.default_rng(5).normal(0.0, 1.5, (1, 16, 1))
+    keys, inputs, found, levels = np.array([[0, 0]]), np.zeros((1, 15, 1)), [], []
+    with interpreted():
+        for one in (small, whole):
+            alone = make_filter("kf", one)
+            found.append(smooth(alone, keys, inputs, z))
+            levels.append(run(alone, keys, inputs, z).log_likelihoods.sum())
+        both = smooth_modes(filter_, keys, inputs, z)
+    mu = p * np.exp(levels) / (p @ np.exp(levels))
+    assert 0.05 < mu[0] < 0.95
+    np.testing.assert_allclose(both.probabilities[0], np.tile(mu, (16, 1)), rtol=1e-7)
+    (vp, pva), (vp_cov, pva_cov) = [one.means[0] for one in found], [one.covs[0] for one in found]
+    means, covs = np.tile(pva, (2, 1, 1)), np.tile(pva_cov, (2, 1, 1, 1))
+    means[0, :, :2], covs[0, :, :2, 2], covs[0, :, 2, :2] = vp[:, ::-1], 0.0, 0.0
+    covs[0, :, :2, :2] = vp_cov[:, ::-1, ::-1]
+    for k in range(16):
+        mean, cov = mixture(mu, means[:, k], covs[:, k])
+        np.testing.assert_allclose(both.means[0, k], mean, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(both.covs[0, k], cov, rtol=1e-6, atol=1e-9)
+
+
 def test_a_step_back_from_a_mode_of_fewer_states_tells_the_others_by_their_covariance():
     """x + G (later - A x_o), P + G (E - C) G', G = P_:o A' C^-1, C = A P_oo A' + Q, of own states o."""
     small = point("pv", 0.3)
@@ -168,6 +196,20 @@ def test_a_step_back_from_a_mode_of_fewer_states_tells_the_others_by_their_covar
         np.testing.assert_allclose(cov, p + gain @ (e[:2, :2] - c) @ gain.T, rtol=1e-8, atol=1e-9)
     first, second = (-0.5 * one @ np.linalg.solve(c, one) for one in off)
     assert found[1][0] - found[0][0] == pytest.approx(second - first, rel=1e-8)
+
+
+@pytest.mark.parametrize("given", slow_but([None, {"a": (0.0, 1.0)}], [None]))
+def test_later_measurements_help_modes_of_unequal_sizes(given):
+    whole = point("pva", 0.1)
+    filter_ = make_filter("imm", whole, modes=[point("pv", 1e-3), whole], mode_filter="kf", stay=0.9, absent=given)
+    rng, a, x = np.random.default_rng(6), whole.matrices()[0], np.zeros((12, 61, 3))
+    for k in range(60):
+        x[:, k + 1] = x[:, k] @ a.T
+        x[:, k + 1, 2] = 2.0 * (20 <= k < 35)
+    data = np.array([[i, 0] for i in range(12)]), np.zeros((12, 60, 1)), x[:, :, :1] + rng.normal(size=(12, 61, 1))
+    filtered_, smoothed = run(filter_, *data).means, smooth(filter_, *data).means
+    before, after = (np.sqrt(np.mean((one - x) ** 2, axis=(0, 1))) for one in (filtered_, smoothed))
+    assert (after < 0.75 * before).all(), (before, after)
 
 
 @pytest.mark.usefixtures("as_python")

@@ -11,6 +11,7 @@ import thruster_env  # noqa: F401 - registers its envs
 from filters import EstimateState, EstimateStates
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import alarms_of, columns_of, episode_sentence, episodes
+from filters.monitoring import monitor as of_monitors
 from filters.monitoring.monitor import (
     TESTS,
     Alarm,
@@ -23,6 +24,7 @@ from filters.monitoring.monitor import (
     monitor_of,
 )
 from filters.registry import make_filter
+from thruster_env.core.compiled import interpreted, is_interpreting
 from thruster_env.logs.log import Log
 from thruster_env.model.quantities import Quantity
 from tuning.problems.find import find_problem
@@ -267,3 +269,20 @@ def test_a_dead_sensor_is_not_healthy_again_until_it_moves(dead, channels):
         again.step(v[last], s[last], np.full(channels, 7.0))
         again.recall(memory)
         assert [again.step(v[k], s[k], z[k]).ok for k in range(last, 300)] == ok[last:]
+
+
+def test_a_monitor_that_ran_as_python_first_is_compiled_afterwards():
+    with interpreted():
+        Monitor().alarms(np.zeros((3, 1)), np.ones((3, 1, 1)), np.zeros((3, 1)))
+        assert of_monitors._compiled(is_interpreting())[1].in_python
+    assert not of_monitors._compiled(is_interpreting())[1].in_python
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    """Machine code would read behind them."""
+    v, s, z = np.zeros((5, 2)), np.tile(np.eye(2), (5, 1, 1)), np.zeros((5, 2))
+    for arguments in ((v[:4], s, z), (v, s[:4], z), (v[:, :1], s, z), (v, s, z[:, :1]), (v[0], s[0], z[0])):
+        with pytest.raises(ValueError, match=r"must have the shape \(K, m\), covs \(K, m, m\), but got"):
+            Monitor().alarms(*arguments)
+    with pytest.raises(ValueError, match="a monitor of 2 channels must get as many innovations"):
+        Monitor().watch(2).step(v[0, :1], s[0], z[0])

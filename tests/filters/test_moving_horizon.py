@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from filters import MovingHorizonFilter, make_filter, run
+from filters import MovingHorizonFilter, make_filter, run, smooth
 from tests.models import KEY, line_model, plane_model, simulated, state_space
 from tests.oracles import each_close
 
@@ -59,6 +59,17 @@ def stepped(filter_, inputs, measurements):
     for u, z in zip(inputs, measurements[1:], strict=True):
         belief, _ = filter_.update(filter_.predict(belief, u), z)
     return belief
+
+
+def test_its_window_is_the_smoother_s_and_its_last_state_the_filter_s():
+    model = line_model()
+    inputs, measurements = simulated(model, 12)
+    smoothed = smooth(make_filter("ekf", model), KEYS, inputs, measurements).means[0]
+    for horizon in (4, 20):
+        filter_ = MovingHorizonFilter(model=model, horizon=horizon, loss="quadratic")
+        window = filter_.window(stepped(filter_, inputs[0], measurements[0]))
+        assert len(window) == min(horizon, 13)
+        np.testing.assert_allclose(window, smoothed[-horizon:], **CLOSE)
 
 
 # The cost, written naively, and its minimum by SciPy
@@ -208,6 +219,18 @@ def test_the_covariance_is_the_last_block_of_the_inverse_hessian_without_bounds(
             J[:, at], J[:, 2 * k + 2 : 2 * k + 4] = -slopes(transition, x, inputs[k], ()), np.eye(2)
             hessian += J.T @ np.linalg.solve(Q, J)
     np.testing.assert_allclose(belief.cov, np.linalg.inv(hessian)[-2:, -2:], rtol=1e-6)
+
+
+@pytest.mark.parametrize("loss", ["huber", "student"])
+def test_of_functions_that_cannot_be_traced_it_is_the_same(loss):
+    def decides(x, u, c):
+        return transition(x, u, c) if int(x[0] < 1e9) else x
+
+    inputs, measurements = curved_data()
+    data = KEYS, inputs[None], measurements[None]
+    models = curved_model().replace(transition=decides), curved_model()
+    found, expected = (run(MovingHorizonFilter(model=one, horizon=3, loss=loss), *data) for one in models)
+    each_close(found, expected, rtol=1e-6, atol=1e-8)
 
 
 def test_with_a_horizon_of_one_it_is_the_iterated_filter():

@@ -5,7 +5,9 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from filters import make_filter, run
+from docs.scripts.filter_sampled import followed, half_lost
+from filters import StateSpaceModel, make_filter, run
+from filters.gaussian.mixtures import Parts, blender
 from tests.models import pendulum
 from tests.thruster_env.core.test_angles import turning
 from thruster_env.model.affine import affine_model, linearize
@@ -146,6 +148,16 @@ def test_the_static_estimator_has_the_posterior_of_the_models():
     assert total == pytest.approx(np.log(weights.sum()) + max(levels), rel=1e-10)
 
 
+def switching(models, stay, steps, rng):
+    """A run of a plant that switches among models: modes, states, inputs, measurements."""
+    modes = np.zeros(steps + 1, dtype=int)
+    for k in range(steps):
+        modes[k + 1] = modes[k] if rng.uniform() < stay else rng.integers(len(models))
+    inputs = np.repeat(rng.uniform(-20.0, 20.0, steps // 25 + 1), 25)[:steps, None]
+    states, seen = followed(models, modes, inputs, rng)
+    return modes, states, inputs, seen
+
+
 def improbable():
     """Filters, one of whose modes has no probability or none that a float64 has, and then fits best; positions."""
     quiet, wild = moving(0.01), moving(4.0)
@@ -193,6 +205,64 @@ def test_a_mode_of_no_probability_fits_best_and_one_that_was_out_comes_back():
         was_out = np.minimum.accumulate(np.where(np.isfinite(logs), logs, 0.0)) < -745.0  # exp of it is 0
         returned += int((was_out & (logs > -3.0)).any())
     assert returned >= 2
+
+
+def pulled(x, u, c):
+    """A state that decays to 1, and overflows under an input of 1."""
+    return (0.5 * x[0] + 0.5 + (1e200 * u[0]) * (1e200 * u[0]),)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_mode_whose_filter_begins_anew_is_out_but_not_for_good():
+    noise = {"process_noise_cov": [0.01], "measurement_noise_cov": [0.01], "prior_mean": [1.0], "prior_cov": [1.0]}
+    model = affine_model(a=[[0.5]], b=[[0.0]], c=[[1.0]], **noise)
+    other = StateSpaceModel(transition=pulled, observe=lambda x, c: (x[0],), inputs=1, **noise)
+    filter_ = make_filter("mmae", model, modes=[model, other])
+    inputs = np.zeros((400, 1))
+    inputs[5] = 1.0
+    belief, found = filter_.init(), []
+    for u in inputs:
+        belief, _ = filter_.update(filter_.predict(belief, u), [1.0])
+        found.append(filter_.mode_probabilities(belief)[1])
+    assert belief.divergences == 1 and found[4] > 0.99 and found[5] < 1e-200 and found[-1] > 0.99
+
+
+def test_parts_far_away_that_have_no_weight_do_not_count():
+    parts = Parts(8, 6, 2)
+    row = np.zeros(20)
+    row[6:8] = 1.0, 0.0
+    row[8:14], row[14:20] = [1.0, 2.0, 3.0, 0.5, 0.5, 4.0], [1e200, -1e200, 1e308, 0.0, 0.0, 1e308]
+    with np.errstate(all="ignore"):
+        blender(parts, 2, 0, 2, (False, False))(row, 6, 0)
+    np.testing.assert_array_equal(row[:6], [1.0, 2.0, 3.0, 0.5, 0.5, 4.0])
+
+
+@pytest.mark.slow
+def test_a_thruster_that_loses_thrust_is_followed_almost_as_if_the_mode_were_known():
+    whole = thruster_model()
+    models = [whole, half_lost(whole)]
+    filters = [make_filter("ekf", one) for one in models]
+    imm = make_filter("imm", whole, modes=models, stay=0.96)
+    errors, brier = {"told": [], "imm": [], "ekf": []}, []
+    for seed in range(12):
+        modes, states, inputs, seen = switching(models, 0.96, 300, np.random.default_rng(seed))
+        told = filters[0].init()
+        several, single = imm.init(), filters[0].init()
+        for k, (mode, x, z) in enumerate(zip(modes, states, seen, strict=True)):
+            if k:
+                told, u = filters[mode].predict(told, inputs[k - 1]), inputs[k - 1]
+                several, single = imm.predict(several, u), filters[0].predict(single, u)
+            told, _ = filters[mode].update(told, z)
+            several, _ = imm.update(several, z)
+            single, _ = filters[0].update(single, z)
+            for name, belief in (("told", told), ("imm", several), ("ekf", single)):
+                errors[name].append(belief.mean - x)
+            brier.append((imm.mode_probabilities(several)[1], mode == 1))
+    rmse = {name: np.sqrt(np.mean(np.square(one), axis=0)) for name, one in errors.items()}
+    assert (rmse["imm"] < 1.1 * rmse["told"]).all() and (rmse["ekf"] > 1.5 * rmse["imm"]).all(), rmse
+    said, true = np.array(brier).T
+    assert np.mean((said - true) ** 2) == pytest.approx(np.mean(said * (1.0 - said)), rel=0.25)  # calibrated
+    assert np.mean((said - true) ** 2) < 0.1
 
 
 def test_an_angle_is_mixed_the_short_way_round():

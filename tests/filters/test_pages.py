@@ -15,8 +15,9 @@ from tests.filters.test_differentiated import units
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.filters.test_sensitivity import turn
-from tests.filters.test_state_scores import data_of
+from tests.filters.test_state_scores import WEIGHTS, data_of, textbook
 from tests.models import plane_model, simulated, wide_model
+from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 
 NAMES = ("iekf", "ukf", "ckf")
@@ -59,6 +60,17 @@ def made(name, model):
 
 def with_noise(model, q, r):
     return model.replace(process_noise_cov=q, measurement_noise_cov=r)
+
+
+def central(model, value, q_slopes, r_slopes):
+    """Slopes (B, p) of the values of models by central differences."""
+    q, r = model.process_noise_cov, model.measurement_noise_cov
+    found = []
+    for dq, dr in zip(q_slopes, r_slopes, strict=True):
+        h = 1e-4 * (np.diag(q).min() if dq.any() else np.diag(r).min())
+        above, below = (value(with_noise(model, q + s * dq, r + s * dr)) for s in (h, -h))
+        found.append((above - below) / (2 * h))
+    return np.stack(found, axis=1)
 
 
 def assert_slopes(found, expected, accuracy=1e-6):
@@ -145,6 +157,38 @@ def assert_page_is_the_filter(filter_):
 
 
 @pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("make", [two_channels, wide_pendulum])
+@pytest.mark.parametrize("name", NAMES)
+def test_the_likelihood_is_the_filters_and_its_gradient_that_of_central_differences(name, make):
+    model = make()
+    keys, inputs, z, _ = data_of(model, steps=12)
+    q_slopes, r_slopes = map(np.array, directions(model))
+
+    def value(changed):
+        return run(made(name, changed), keys, inputs, z).log_likelihoods.sum(axis=1)
+
+    found = likelihood(model, inputs, z, q_slopes, r_slopes, filter=made(name, make()))
+    np.testing.assert_allclose(found.values, value(model), rtol=1e-10)
+    assert_slopes(found.gradients, central(model, value, q_slopes, r_slopes))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("score", ["log-score", "squares"])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_score_is_that_of_the_estimates_and_its_gradient_that_of_central_differences(name, score):
+    model = wide_pendulum()
+    data = data_of(model, steps=12)
+    q_slopes, r_slopes = (np.array(one)[[0, 2, 5]] for one in directions(model))
+
+    def value(changed):
+        return textbook(changed, lambda model: made(name, model), data, score)
+
+    found = state_score(model, *data[1:], q_slopes, r_slopes, score, WEIGHTS, filter=made(name, model))
+    np.testing.assert_allclose(found.values, value(model), rtol=1e-10)
+    assert_slopes(found.gradients, central(model, value, q_slopes, r_slopes))
+
+
+@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", NAMES)
 def test_of_an_affine_model_all_filters_have_the_derivatives_of_kalmans(name):
     model = two_channels()
@@ -157,6 +201,20 @@ def test_of_an_affine_model_all_filters_have_the_derivatives_of_kalmans(name):
             np.testing.assert_allclose(b, a, rtol=1e-10, atol=1e-10 * abs(a).max())
     kalman, other = (state_score(model, inputs, z, x, *slopes, filter=one) for one in filters)
     np.testing.assert_allclose(other.gradients, kalman.gradients, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_interpreted_likelihood_is_the_compiled_one(name):
+    model = wide_pendulum()
+    _, inputs, z, _ = data_of(model, steps=12)
+    slopes = tuple(map(np.array, directions(model)))
+    compiled = likelihood(model, inputs, z, *slopes, filter=make_filter(name, model))
+    alone = likelihood(model, inputs[3:4], z[3:4], *slopes, filter=make_filter(name, model))
+    np.testing.assert_array_equal(compiled.gradients[3], alone.gradients[0])
+    with interpreted():
+        plain = likelihood(model, inputs, z, *slopes, filter=make_filter(name, model))
+    for a, b in zip(compiled, plain, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * abs(b).max())
 
 
 @pytest.mark.usefixtures("as_python")

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import AuxiliaryParticleFilter, KalmanFilter, ParticleFilter, run
-from tests.models import KEY, line_model, plane_model, simulated
+from filters import AuxiliaryParticleFilter, KalmanFilter, ParticleFilter, run, thruster_model
+from filters.engine.session import Session
+from tests.models import KEY, held_voltages, line_model, plane_model, simulated
 from tests.oracles import convergence, normals, relative_errors
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
@@ -171,6 +172,22 @@ def test_the_likelihood_is_right_on_average_however_few_particles(kind):
 
 
 @both_kinds
+def test_the_likelihood_of_a_channel_is_its_own_where_the_other_is_missing(kind):
+    both = plane_model()
+    _, _, _, c, shift = both.matrices()
+    one = plane_model(
+        c=c[[1]], measurement_offset=shift[[1]], measurement_noise_cov=both.measurement_noise_cov[1:, 1:]
+    )
+    with interpreted():
+        found = []
+        for model, z in ((both, [np.nan, 2.0]), (one, [2.0])):
+            filter_ = kind(model=model, ensemble_size=50)
+            belief, innovation = filter_.update(filter_.predict(filter_.init(KEY), [1.0]), z)
+            found.append((innovation.log_likelihood, *belief.mean, *belief.extras))
+    np.testing.assert_allclose(*found, rtol=1e-12)
+
+
+@both_kinds
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python says so when a number overflows
 def test_an_impossible_measurement_is_counted_and_leaves_the_prior(kind):
     model = line_model()
@@ -190,6 +207,46 @@ def test_an_impossible_measurement_is_counted_and_leaves_the_prior(kind):
     assert filter_.effective_sample_size(held) == pytest.approx(1.0)
     # One particle has all the weight; how wrong it may be is what the others say.
     assert (np.diag(held.cov) > 0.3 * np.diag(belief.cov)).all()
+
+
+@both_kinds
+def test_a_second_measurement_of_the_same_step_is_taken_as_well(kind):
+    model = line_model()
+    with interpreted():
+        exact, found = KalmanFilter(model=model), kind(model=model, ensemble_size=4000)
+        means = []
+        for filter_ in (exact, found):
+            belief = filter_.predict(filter_.init(KEY), [1.0])
+            for z in ([2.0], [2.5]):
+                belief, _ = filter_.update(belief, z)
+            means.append(belief.mean)
+    assert (np.abs(means[0] - means[1]) < 0.1 * np.sqrt(np.diag(belief.cov))).all()
+
+
+@quick_kind
+def test_batch_and_session_agree_bit_for_bit_over_500_steps(kind):
+    model = thruster_model()
+    filter_ = kind(model=model, ensemble_size=1000)
+    inputs = held_voltages(1, 20, seed=2)
+    z = simulate.simulate(model, episode_keys([1]), inputs).measurements
+    z[0, 100:120] = np.nan
+    means = run(filter_, np.array([KEY]), inputs, z).means[0]
+    session = Session(filter_)
+    session.start(KEY, z[0, 0])
+    for k in range(500):
+        session.step(inputs[0, k], z[0, k + 1])
+        np.testing.assert_array_equal(session.mean, means[k + 1])
+
+
+def test_a_million_particles_are_enough_for_any_moment():
+    model = line_model()
+    inputs, keys = np.ones((1, 4, 1)), np.array([KEY], dtype=float)
+    z = simulate.simulate(model, episode_keys([1]), inputs).measurements
+    exact = run(KalmanFilter(model=model), keys, inputs, z)
+    found = run(ParticleFilter(model=model, ensemble_size=1_000_000), keys, inputs, z)
+    spread = np.sqrt(np.einsum("bkii->bki", exact.covs))
+    # The weights leave about a third of the particles; five standard errors of their mean.
+    assert (np.abs(found.means - exact.means) < 5 * spread * math.sqrt(3.0 / 1e6)).all()
 
 
 @pytest.mark.parametrize("size", [1, 0, -3, 2.5, math.nan, "many", None, 1_000_001])

@@ -18,7 +18,8 @@ from tests.filters.test_particle import (
     weighted_covariance,
 )
 from tests.models import KEY, line_model, plane_model, scalar_model, simulated, state_space, varying_noise
-from tests.oracles import assert_normal, normals
+from tests.oracles import assert_normal, each_close, normals
+from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import FILTER_KERNEL, FILTER_PRIOR, FILTER_PROCESS, FILTER_PROPOSAL, filter_keys
 
 
@@ -169,6 +170,22 @@ def slope_measurements(steps):
     return np.array(found)[None, :, None]
 
 
+@pytest.mark.slow
+def test_compiled_code_gives_what_python_does_and_an_accurate_sensor_asks_for_the_optimal_proposal():
+    model = scalar_model(measurement_noise_cov=[1e-4])
+    inputs, z = simulated(model, 60, missing=0.1)
+    exact = run(make_filter("kf", model), [KEY], inputs, z)
+    numbers = {"ensemble_size": 20, "resampling": "gaussian", "resampling_threshold": 0.9}
+    filter_ = make_filter("pf", model, proposal="optimal", **numbers)
+    found = run(filter_, [KEY], inputs, z)
+    with interpreted():
+        same, plain = run(filter_, [KEY], inputs, z), run(make_filter("pf", model, **numbers), [KEY], inputs, z)
+    each_close(found, same, rtol=1e-9, atol=1e-12)
+    there = ~np.isnan(z)
+    optimal, prior = (np.abs((one.means - exact.means)[there]).mean() for one in (found, plain))
+    assert optimal < 0.2 * prior
+
+
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize(
     "numbers", [{"proposal": "optimal"}, {"resampling": "gaussian", "resampling_threshold": 1.0}]
@@ -225,6 +242,21 @@ def test_particles_that_expect_no_number_have_hardly_any_weight(name, numbers):
             z[step % 2] = np.nan if step % 3 == 0 else z[step % 2]
             belief, _ = filter_.update(belief, z)
             assert np.isfinite(belief.members).all() and np.isfinite(belief.cov).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "numbers"), [("rbpf", {}), ("pf", {"proposal": "optimal", "smoothed": (0,), "regularisation": 1.0})]
+)
+def test_single_steps_and_batches_agree_to_the_last_bit(name, numbers):
+    filter_ = make_filter(name, scalar_model(), ensemble_size=9, **numbers)
+    inputs, z = simulated(scalar_model(), 40, missing=0.2)
+    session, found = filter_.session(), run(filter_, None, inputs, z)
+    session.start(filter_keys([0])[0], z[0, 0])
+    for k in range(40):
+        session.step(inputs[0, k], z[0, k + 1])
+        np.testing.assert_array_equal(session.mean, found.means[0, k + 1])
+        np.testing.assert_array_equal(session.cov, found.covs[0, k + 1])
 
 
 def test_what_the_kinds_may_not_be():

@@ -61,6 +61,19 @@ def test_noise_has_the_density_of_what_it_moves():
     np.testing.assert_allclose(room.process_noise_cov[0, 0], 60.0 * (1e4 / 5e6) ** 2, rtol=0.01)
 
 
+def test_a_filter_follows_a_swinging_pendulum(as_python):
+    plant = plants.pendulum(length=0.8, torque=0.02)
+    model, rng = plant.at(0.05), np.random.default_rng(1)
+    x, z, truth = (1.2, 0.0), [], []
+    for _ in range(60):
+        truth.append(x)
+        z.append(x[0] + 0.01 * rng.normal())
+        for _ in range(model.substeps):
+            x = model.transition(x, (0.0,), model.constants)
+    estimates = filters.run(filters.make_filter("ekf", model), inputs=np.zeros(59), measurements=z)
+    np.testing.assert_allclose(estimates.means[10:], truth[10:], atol=0.1)
+
+
 def test_matrices_have_the_letters_that_users_know():
     f, h, q, r, p = [[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.0]], [0.01, 0.1], [0.25], [10.0, 1.0]
     written = filters.affine_model(F=f, H=h, Q=q, R=r, P0=p)

@@ -13,6 +13,16 @@ from thruster_env.thruster.model import thruster_model
 INPUTS = np.repeat(np.random.default_rng(3).uniform(-12, 12, size=(5, 4, 1)), 3, axis=1)
 
 
+@pytest.mark.parametrize(("bytes_", "work"), [(1, 2e9), (2**28, 8 * 5 * 13 * 3), (1, 1)])
+def test_in_parts_they_are_those_of_the_whole_bound_to_the_bit(monkeypatch, bytes_, work):
+    model = thruster_model()
+    whole = np.einsum("bkii->bki", posterior_bound(model, INPUTS, truths=7, seed=2))
+    monkeypatch.setattr(bounds, "MOST_BYTES", bytes_)
+    monkeypatch.setattr(bounds, "WORK_AT_ONCE", work)
+    monkeypatch.setattr(bounds, "cores", lambda: 2)
+    np.testing.assert_array_equal(posterior_variances(model, INPUTS, truths=7, seed=2), whole)
+
+
 def test_of_a_large_model_the_work_limits_the_sequences_and_equal_ones_are_one(monkeypatch):
     inputs = np.arange(40.0)[:, None, None] * np.ones((40, 150, 2))
     sized = namedtuple("Sized", "n substeps", defaults=(1,))

@@ -6,8 +6,10 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from filters import KalmanFilter, make_filter
-from tests.models import KEY, plane_model, state_space, wide_model
+from filters import KalmanFilter, make_filter, run, smooth
+from filters.c.project import c_filter
+from filters.tensors import torch
+from tests.models import KEY, plane_model, simulated, state_space, wide_model
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 
@@ -129,3 +131,18 @@ def test_channels_with_correlated_noise_are_made_independent():
         b=np.zeros((3, 0)), c=c[1:], measurement_offset=shift[1:], measurement_noise_cov=[root[1] @ root[1]]
     )
     np.testing.assert_allclose(alone, updated(second, x, [-0.5]), rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_compiled_code_and_python_are_one_and_pages_alone_are_refused():
+    filter_ = make_filter("rhf", plane_model(), ensemble_size=9, relaxation=0.3, inflation=1.02)
+    inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)
+    with interpreted():
+        expected = run(filter_, None, inputs, z)
+    for one, other in zip(run(filter_, None, inputs, z), expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+    for use, where in ((torch, "on tensors"), (c_filter, "in C")):
+        with pytest.raises(ValueError, match=f"{where} must have a page for its whole update.* but got 'rhf'"):
+            use(filter_)
+    with pytest.raises(ValueError, match="must have one gain for all states, but got 'rhf'"):
+        smooth(filter_, None, inputs, z)

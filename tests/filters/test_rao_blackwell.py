@@ -9,7 +9,9 @@ from scipy.stats import multivariate_normal
 from filters import RaoBlackwellisedParticleFilter, affine_model, make_filter, run
 from tests.models import KEY, line_model, plane_model, simulated, state_space
 from tests.oracles import assert_normal, each_close, normals
+from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, uniform_block
+from tuning.experiments import mixed_linear
 
 Q = np.array([[0.04, 0.01, -0.01], [0.01, 0.03, 0.008], [-0.01, 0.008, 0.02]])  # of s, a, b: s and the others too
 R = np.array([[0.1, 0.02], [0.02, 0.05]])
@@ -192,6 +194,33 @@ def test_regularised_particles_have_the_kernels_covariance_in_the_next_step():
     np.testing.assert_allclose(after.members[1], before.members[1, parents], rtol=1e-12)
     cov = filter_.particle_covariances(before)[parents, 1, 1] + 0.1
     np.testing.assert_allclose(filter_.particle_covariances(after)[:, 1, 1], cov, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_tenth_of_the_particles_is_as_good_and_compiled_code_gives_what_python_does():
+    """On the example of the source: with particles for one state instead of four."""
+    data, model = mixed_linear.problem.data(range(60)), mixed_linear.model()
+
+    def found(name, size):
+        filter_ = make_filter(name, model, ensemble_size=size)
+        estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
+        squares = ((estimates.means - data.states)[:, data.late] ** 2).mean(axis=(0, 1))
+        return squares, estimates.log_likelihoods.sum(axis=1).mean()
+
+    (few, few_level), (many, many_level), (plain, plain_level) = (
+        found("rbpf", 100),
+        found("pf", 1000),
+        found("pf", 100),
+    )
+    assert (few < 1.03 * many).all() and (few < 0.9 * plain).all()
+    assert few_level > many_level - 0.3 and few_level > plain_level + 5.0
+
+    filter_ = make_filter("rbpf", model, ensemble_size=12)
+    first = data.filter_keys[:1], data.inputs[:1, :15], data.measurements[:1, :16]
+    compiled = run(filter_, *first)
+    with interpreted():
+        as_python = run(filter_, *first)
+    each_close(compiled, as_python, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("sampled", [(), "0", 1, (3,), (0.5,)])

@@ -5,11 +5,12 @@ import json
 
 import pytest
 
-from filters import EnsembleKalmanFilter, make_filter, thruster_model
+from filters import FILTERS, EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, make_filter, thruster_model
 from filters.registry import filter_type
 from filters.tuned_file import read_tuned_file, sealed
 from filters.wrappers import PLANTS, plant_ids
 from tests.models import TUNED
+from tuning.problems.problem import Parameter
 
 
 def changed(**entries):
@@ -30,6 +31,12 @@ def write(tmp_path):
     return write
 
 
+def test_filters_go_by_their_names():
+    known = {"kf": KalmanFilter, "ekf": ExtendedKalmanFilter, "enkf": EnsembleKalmanFilter}
+    assert known.items() <= FILTERS.items()
+    assert all(filter_type(name).filter_class is kind and kind.name == name for name, kind in FILTERS.items())
+
+
 def test_a_filter_is_made_by_name_with_its_own_numbers():
     spread = "inflation", "relaxation", "adaptive_inflation", "inflation_by_state", "least_deviation"
     ensemble = "ensemble_size", *spread, "radius", "centred_perturbations"
@@ -37,6 +44,32 @@ def test_a_filter_is_made_by_name_with_its_own_numbers():
     made = make_filter("enkf", thruster_model(), ensemble_size=7)
     assert isinstance(made, EnsembleKalmanFilter)
     assert made.ensemble_size == made.size == 7
+
+
+class Declaring:
+    """An estimator with a parameter to tune, without a covariance."""
+
+    has_covariance = False
+    parameters = (Parameter("gain", 0.1, 1.0),)
+
+    def __init__(self, model, gain=0.5):
+        self.mean = model.prior_mean * gain
+
+    def reset(self, key, z):
+        return self.mean, None
+
+    def step(self, u, z):
+        return self.mean, None
+
+
+def test_a_user_s_estimator_and_class_of_filters_go_by_their_objects():
+    estimator, own = filter_type(Declaring), filter_type(EnsembleKalmanFilter)
+    assert (estimator.is_estimator, estimator.numbers, estimator.label) == (True, ("gain",), "Declaring")
+    assert (own.is_estimator, own.filter_class, own.has_ensemble) == (False, EnsembleKalmanFilter, True)
+    assert estimator.is_foreign
+    assert own.is_foreign
+    assert not filter_type("enkf").is_foreign
+    assert isinstance(estimator.make(thruster_model(), gain=0.1).estimator, Declaring)
 
 
 def test_an_unknown_filter_is_refused_with_the_known_names():

@@ -1,5 +1,6 @@
 """Restarts are told: how many, the first step and states, and the likely cause, on every path."""
 
+import json
 import math
 import pickle
 import warnings
@@ -15,10 +16,12 @@ from filters.logs.estimate import estimate_with
 from filters.logs.findings import findings, verdict
 from filters.wrappers.envs import EstimateStates
 from tests.models import affine, state_space
-from thruster_env.env.model_env import ModelEnv
+from thruster_env.env.model_env import ModelEnv, Split
 from thruster_env.logs.log import Log
 from tuning.evaluation.evaluate import evaluate, restart_sentences
+from tuning.evaluation.held_out import Comparison, summarised, summary
 from tuning.problems.data import Data
+from tuning.problems.model_problem import RunsProblem
 
 
 class Clock(NamedTuple):
@@ -189,6 +192,78 @@ def test_real_clocks_tell_the_same_and_logs_by_them(cause):
     assert estimate_with(filter_, log).restarts[4:] == (step, states, cause)
 
 
+@pytest.mark.usefixtures("as_python")
+def test_the_noise_and_dt_that_a_session_was_set_to_are_those_of_the_cause():
+    def transition(x, u, c):
+        return 0.9 * x[0], x[1] + u[0] + (math.inf if c.dt > 1.5 else 0.0)
+
+    live = make_filter("ekf", model(transition=transition, constants=Clock(2.0))).live()
+    live.start(0.0)
+    live.predict_to(1.0, [0.0])
+    live.update(1.0, None, [0.0])
+    assert live.restarts is None
+    live.predict_to(3.0, [0.0])
+    live.update(3.0, None, [0.0])
+    assert live.restarts[4:] == (2, ("b",), "f(x, u) is infinite, it overflows")
+
+
+@pytest.mark.usefixtures("as_python")
+def test_measured_inputs_are_known_to_the_cause():
+    def split(self, model):
+        return Split(inputs=(1,), measurements=(0,), channels=2)
+
+    class Copies(gym.vector.SyncVectorEnv):
+        """Copies of it."""
+
+        measured_inputs = split
+
+    class Measuring(ModelEnv):
+        """Two channels, of which the second is an input of the model."""
+
+        def __init__(self):
+            super().__init__(model(), model, low=-9.0, high=9.0, dt=1.0)
+            self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(2,), dtype=np.float32)
+
+        measured_inputs = split
+
+        def reset(self, **given):
+            observation, info = super().reset(**given)
+            info["measurement"] = np.array([0.0, 4.0])
+            return np.zeros(2, dtype=np.float32), info
+
+        def step(self, action):
+            *_, info = super().step(action)
+            info["measurement"] = np.array([0.0, 4.0])
+            return np.zeros(2, dtype=np.float32), 0.0, False, False, info
+
+    def transition(x, u, c):
+        return 0.9 * x[0], x[1] + u[1] if x[1] < 5.0 else math.nan
+
+    filter_ = make_filter("ekf", model(transition=transition, inputs=2))
+    single, copies = (EstimateState(Measuring(), filter_), EstimateStates(Copies([Measuring, Measuring]), filter_))
+    told = []
+    for env, action in ((single, [0.0]), (copies, np.zeros((2, 1)))):
+        env.reset(seed=0)
+        infos = [env.step(action)[-1] for _ in range(4)]
+        told.append(next(one["estimate_restarts"] for one in infos if "estimate_restarts" in one))
+    assert "(b): f(x, u) is NaN." in told[0] and told[1].tolist() == [told[0]] * 2
+
+
+@pytest.mark.usefixtures("as_python")
+def test_reports_tell_them_also_of_stored_evaluations():
+    filter_, (inputs, z) = make_filter("ekf", model(**FAILING["F = df/dx is NaN"][1])), data(2, lost=1)
+    runs = [(u, 0.1 + rows + i) for i in range(3) for u, rows in zip(inputs, z, strict=True)]
+    problem = RunsProblem(runs, filter_.model, first_scored_step=1, held_out=[0, 1])
+    found = evaluate(filter_, Data((0, 1), inputs, z, np.zeros((2, 2)), 1), None)
+    stored = summarised(json.loads(json.dumps(summary(found))), problem)
+    assert stored.restarts == found.restarts and stored.divergences == found.divergences
+    quiet = found._replace(restarts=None)
+    assert "restarts" not in summary(quiet) and summarised(summary(quiet), problem).restarts is None
+    comparison = Comparison(quiet, found, None, bound=np.full(2, np.nan), seeds=range(1, 2))
+    page = " ".join(restart_sentences(comparison.evaluations))
+    assert f"tuned: {found.restarts.sentence}" in page and page.count("restarted from the prior") == 1
+
+
 @pytest.mark.parametrize("name", ["imm", "mmae"])
 @pytest.mark.parametrize("place", [0, 1])
 @pytest.mark.parametrize("cause", FAILING)
@@ -230,3 +305,14 @@ def test_a_smoother_warns_as_the_filter_does(name, lag):
             filters.smooth(filter_, None, inputs, z, lag)
     assert [str(one.message) for one in caught] == [str(one.message) for one in of_run]
     assert caught[0].filename == __file__
+
+
+@pytest.mark.usefixtures("as_python")
+def test_runs_that_begin_where_they_are_measured_are_repeated_from_there():
+    inputs, z = data(2, lost=1)
+    runs = [(u, 0.1 + 0.01 * i + rows) for i in range(3) for u, rows in zip(inputs, z, strict=True)]
+    failing = model(**FAILING["f(x, u) is NaN"][1])
+    problem = RunsProblem(runs, failing, start="measurement", held_out=[0, 1])
+    assert (problem.model().prior_cov != failing.prior_cov).any()
+    found = evaluate(make_filter("ekf", problem.model()), problem.data(range(6)), None)
+    assert found.divergences and found.restarts.cause == "f(x, u) is NaN" and found.restarts.states == ("b",)

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from filters import make_filter, thruster_model
+from filters import make_filter, smooth, thruster_model
 from filters.engine.belief import memory_offsets
 from filters.ensembles.stochastic import rotator
 from thruster_env.graphs.loops import Loops
@@ -62,3 +62,14 @@ def test_a_filter_with_rotations_has_the_moments_of_one_without_after_an_update(
     np.testing.assert_allclose(np.cov(other.members), one.cov, rtol=1e-10)
     np.testing.assert_array_equal(other.cov, one.cov)
     assert not np.allclose(other.members, one.members)
+
+
+def test_a_smoother_refuses_rotations():
+    filter_ = make_filter("etkf", thruster_model(), ensemble_size=5, rotations=1)
+    with pytest.raises(ValueError, match="a smoothed filter must have rotations 0, but got 1"):
+        smooth(filter_, np.zeros((1, 2)), np.zeros((1, 3, 1)), np.zeros((1, 4, 1)), lag=2)
+
+
+def test_rotations_are_none_or_one():
+    with pytest.raises(ValueError, match="rotations must be 0 or 1, but got 2"):
+        make_filter("etkf", thruster_model(), rotations=2)

@@ -53,6 +53,33 @@ def test_it_is_the_kalman_filter_of_the_model_between_the_nearest_two(count):
         np.testing.assert_allclose(estimates.covs[0, k], p, rtol=1e-9, atol=1e-9)
 
 
+def test_compiled_batch_loop_and_python_agree():
+    model = thruster_model()
+    z, inputs = simulated(model)
+    filter_ = KalmanFilter(model=model, schedule=5)
+    estimates = run(filter_, KEYS, inputs, z)
+    with interpreted():
+        for one, other in zip(run(filter_, KEYS, inputs, z), estimates, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+    belief, _ = filter_.update(filter_.init(), z[0, 0])
+    for k, u in enumerate(inputs[0], start=1):
+        belief, _ = filter_.update(filter_.predict(belief, u), z[0, k])
+        np.testing.assert_allclose(belief.mean, estimates.means[0, k], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(belief.cov, estimates.covs[0, k], rtol=1e-12, atol=1e-12)
+
+
+def test_on_the_thruster_it_is_much_better_than_the_filter_of_one_point():
+    model = thruster_model()
+    inputs = held_voltages(40, 20)
+    drawn = simulate.simulate(model, episode_keys(range(40)), inputs)
+
+    def rmse(filter_):
+        errors = (run(filter_, np.zeros((40, 2)), inputs, drawn.measurements).means - drawn.states)[:, 50:]
+        return np.sqrt(np.mean(errors**2, axis=(0, 1)))
+
+    assert (rmse(KalmanFilter(model=model, schedule=9)) < 0.75 * rmse(KalmanFilter(model=model))).all()
+
+
 def grow(x, u, c):
     return (x[0] * x[0] + u[0],)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from filters import affine_model, make_filter, thruster_model
+from filters.engine.session import Session
 from tests.models import affine, state_space
 from thruster_env.core.compiled import interpreted
 
@@ -44,6 +45,31 @@ def test_a_belief_of_another_filter_is_refused(filter_, other, rule):
             with pytest.raises(ValueError, match=rule) as error:
                 use()
             assert "\n" not in str(error.value)
+
+
+def test_a_session_goes_on_from_a_belief_of_its_own_filter():
+    with interpreted():
+        filter_ = made("pf", ensemble_size=9)
+        belief, _ = filter_.update(filter_.init((1, 2)), [3.0])
+        session = Session(filter_)
+        session.load(belief)
+        session.step([5.0], [4.0])
+        expected, _ = filter_.update(filter_.predict(belief, [5.0]), [4.0])
+        np.testing.assert_array_equal(session.belief().members, expected.members)
+
+
+def test_a_session_from_a_pickle_calls_machine_code_directly_after_its_first_step(monkeypatch):
+    stored, calls = pickle.dumps(Session(made("enkf", ensemble_size=9))), []
+
+    def operation_on(kernels, memory):
+        calls.append("make")
+        return lambda task: calls.append("call") or 0
+
+    monkeypatch.setattr("filters.engine.session.operation_on", operation_on)
+    session = pickle.loads(stored)
+    for _ in range(3):
+        session.step([5.0], [4.0])
+    assert calls == ["make", "call", "call", "call"]
 
 
 class Timed(NamedTuple):
@@ -122,6 +148,22 @@ def test_a_belief_that_was_made_here_is_checked_once_it_was_written_to():
     with pytest.raises(ValueError, match="u must be 1 number"):
         filter_.predict(after, [np.inf])
     assert repr(after).startswith("Belief(mean=")
+
+
+def test_predict_and_update_of_a_session_are_its_step():
+    first, second, third = (make_filter("ekf", thruster_model()).session() for _ in range(3))
+    first.start((1, 2), [0.1])
+    second.start((1, 2))
+    second.update([0.1])
+    for z in ([0.3], [np.nan]):
+        first.step([3.0], z)
+        second.predict([3.0])
+        second.update(z)
+    np.testing.assert_array_equal(first.mean, second.mean)
+    with pytest.raises(ValueError, match="z must be 1 number, each finite or NaN, but got"):
+        second.update([np.inf])
+    with pytest.raises(ValueError, match="a session must begin with start"):
+        third.predict([1.0])
 
 
 def test_threads_share_a_filter_and_not_its_memory():

@@ -70,6 +70,18 @@ def test_all_forms_of_models_of_any_size_are_kalman_s(name, form, n, m):
     np.testing.assert_allclose(found.log_likelihoods[0], levels, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "fields", "n", "m"), [("kf", {}, 3, 12), ("ekf", {"form": "ud"}, 8, 20)])
+def test_compiled_code_of_many_sensors_has_these_numbers_too(name, fields, n, m):
+    model, inputs, z = drawn(n, m)
+    filter_ = make_filter(name, model, **fields)
+    found, (means, covs, _) = run(filter_, KEYS, inputs, z), kalman_filter(model, inputs[0], z[0])
+    np.testing.assert_allclose(found.means[0], means, rtol=1e-8, atol=1e-8)
+    mean, cov = stepped(filter_, inputs, z)
+    np.testing.assert_allclose(mean, means[-1], rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(cov, covs[-1], rtol=1e-8, atol=1e-8)
+
+
 @pytest.mark.parametrize("m", [1, 12])
 def test_a_negative_variance_is_lost_for_any_number_of_sensors(m):
     magnitude, row = row_magnitude(2, m, 2), np.ones(200)

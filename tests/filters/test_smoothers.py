@@ -112,6 +112,19 @@ def test_no_lag_is_the_filter_and_the_longest_the_full_smoother(kind):
     assert not np.allclose(some.means[:, :10], full.means[:, :10])
 
 
+@pytest.mark.parametrize("kind", [ExtendedKalmanFilter, EnsembleKalmanFilter])
+def test_compiled_and_as_python_it_is_the_same(kind):
+    model = find_scenario("nominal").model()
+    filter_ = kind(model=model, **({} if kind is ExtendedKalmanFilter else {"ensemble_size": 11}))
+    inputs, measurements = with_gaps(model, 12, count=2, level=6.0)
+    keys = episode_keys(range(2))
+    compiled = smooth(filter_, keys, inputs, measurements, lag=5)
+    with interpreted():
+        plain = smooth(filter_, keys, inputs, measurements, lag=5)
+    for one, other in zip(compiled, plain, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+
+
 def test_on_the_pendulum_it_is_the_textbook_recursion():
     model = pendulum()
     inputs, measurements = with_gaps(model, 40, level=3.0)
@@ -206,6 +219,12 @@ def test_on_the_thruster_the_smoother_beats_the_filter_and_stays_consistent(nomi
     ratios, nees = ratios_and_nees(kind(model=model), data, lag=None)
     assert ratios[0].high < 1.0 and ratios[1].high < 0.9  # 95 % intervals, paired by run
     assert 0.97 * 2 < nees.low < nees.high < 1.05 * 2
+
+
+def test_on_the_thruster_the_ensemble_smoother_beats_the_filter_where_thrust_tells(nominal):
+    model, data = nominal
+    ratios, _ = ratios_and_nees(EnsembleKalmanFilter(model=model, ensemble_size=50), data, lag=10)
+    assert ratios[1].high < 0.95
 
 
 @pytest.mark.parametrize("kind", [KalmanFilter, EnsembleKalmanFilter])

@@ -9,7 +9,8 @@ import filters
 from filters import ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, affine_model, run, smooth
 from tests.filters.test_c import built, estimated
 from tests.filters.test_differentiated import swing_if
-from tests.models import pendulum, simulated, wide_model
+from tests.models import KEY, pendulum, simulated, wide_model
+from tests.slow import slow_but
 
 FORMS = [
     partial(KalmanFilter, form="square-root"),
@@ -43,6 +44,23 @@ def test_the_estimates_are_those_of_the_covariance_form(kind, make):
         assert (covs == covs.transpose(0, 2, 1)).all() and (np.linalg.eigvalsh(covs) > 0.0).all()
     smoothed = [smooth(it, None, inputs, z).means for it in (filter_, plain(filter_))]
     np.testing.assert_allclose(*smoothed, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", slow_but(FORMS[1:-1], FORMS[1:2]))
+def test_compiled_batch_session_and_python_agree(kind, request):
+    model = wide_model() if kind.func is KalmanFilter else pendulum()
+    filter_ = kind(model=model)
+    inputs, z = simulated(model, 20, missing=0.2)
+    compiled = run(filter_, np.array([KEY]), inputs, z)
+    session = filter_.session()
+    session.start(KEY, z[0, 0])
+    for k in range(20):
+        session.step(inputs[0, k], z[0, k + 1])
+        np.testing.assert_allclose(session.mean, compiled.means[0, k + 1], rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(session.cov, compiled.covs[0, k + 1], rtol=1e-9, atol=1e-11)
+    request.getfixturevalue("as_python")
+    slow = run(filter_, np.array([KEY]), inputs, z)
+    np.testing.assert_allclose(slow.means, compiled.means, rtol=1e-8, atol=1e-10)  # of central differences
 
 
 @pytest.mark.usefixtures("as_python")

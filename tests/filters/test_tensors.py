@@ -3,6 +3,8 @@
 import copy
 import math
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from tests.filters.test_pages import wide_pendulum
 from tests.models import lonely_model, plane_model, random_affine, scalar_model, simulated, state_space, wide_model
 from tests.slow import slow_but
 from thruster_env.auv.model import auv_model
+from thruster_env.core.compiled import interpreted
 from tuning.cli.templates.filter import Template
 
 NAMES = ("kf", "ekf", "iekf", "ukf", "ckf")
@@ -93,6 +96,12 @@ def test_estimates_of_a_users_filter_are_those_of_run(which):
     filter_ = Template(model=MODELS[which](), bandwidth=2.0)
     inputs, z = simulated(filter_.model, 12, count=3, level=1.0, missing=0.3)
     assert_same(filters.torch(filter_).run(inputs, z), run(filter_, None, inputs, z))
+
+
+def test_estimates_are_those_of_compiled_code_over_many_steps():
+    filter_ = made("ekf", thruster_model())
+    inputs, z = simulated(filter_.model, 200, count=4, missing=0.2)
+    assert_same(filters.torch(filter_).run(torch.tensor(inputs), torch.tensor(z)), run(filter_, None, inputs, z))
 
 
 @pytest.mark.usefixtures("as_python")
@@ -223,6 +232,28 @@ def test_a_network_in_a_model_has_a_gradient(name):
         assert float(weights.grad[at]) == pytest.approx(float(sides[0] - sides[1]) / 2e-5, rel=1e-6)
 
 
+def test_a_belief_that_is_lost_becomes_the_prior():
+    for name in ("ekf", "ukf", "kf-steady", "ekf-robust", "sage-husa", "vb"):
+        filter_, inputs, z = diverging(name)
+        with interpreted(), np.errstate(all="ignore"):
+            expected = run(filter_, None, inputs, z)
+        found = filters.torch(filter_).run(inputs, z)
+        assert found.divergences.tolist() == expected.divergences.tolist() != [0]
+        assert_same(found, expected)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_steps_are_those_of_the_filter():
+    model = wide_model()
+    filter_, (inputs, z) = made("ukf", model), simulated(model, 1, count=1)
+    tensors = filters.torch(filter_)
+    expected, of_expected = filter_.update(filter_.predict(filter_.init(), inputs[0, 0]), z[0, 1])
+    found, of_found = tensors.update(tensors.predict(tensors.init(5), inputs[0, 0]), z[0, 1])
+    assert found.mean.shape == (5, 3) and of_found.value.shape == (5, 2) and found.divergences.tolist() == [0] * 5
+    assert_same([found.mean[4], found.cov[4]], [expected.mean, expected.cov])
+    assert_same(of_found, [np.broadcast_to(one, (5, *np.shape(one))) for one in of_expected])
+
+
 @pytest.mark.usefixtures("as_python")
 def test_a_state_that_is_known_has_a_root():
     model = plane_model(process_noise_cov=[0.3, 0.0], prior_cov=[1.0, 0.0], a=[[0.9, 0.3], [0.0, 1.0]])
@@ -319,6 +350,12 @@ def deciding():
     return filters.torch(made("ekf", model))
 
 
+def test_the_rest_of_filters_does_not_import_torch():
+    code = "import sys, filters; filters.torch; print('torch' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"
+
+
 @pytest.mark.usefixtures("as_python")
 def test_a_lost_trajectory_restarts_where_that_is_asked_once_a_run(monkeypatch):
     """As on a GPU: the run without restarts is repeated with them."""
@@ -342,3 +379,11 @@ def test_compiled_steps_have_the_estimates_and_gradients_of_others(name):
         (gradient,) = torch.autograd.grad(estimates.log_likelihoods.sum(), q)
         results.append([*(part.detach().numpy() for part in estimates), gradient.numpy()])
     assert_same(*results)
+
+
+def test_only_functions_that_can_be_traced_are_compiled():
+    def drift(x, u, c):
+        return (torch.tanh(x[0]),)
+
+    with pytest.raises(ValueError, match="compiled=True must go with a model whose functions can be traced"):
+        filters.torch(made("ekf", scalar_model()), transition=drift, compiled=True)

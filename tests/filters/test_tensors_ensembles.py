@@ -1,6 +1,7 @@
 """Ensembles on tensors: the estimates of `run` from the same keys, and derivatives of one realisation."""
 
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from filters import make_filter, run, thruster_model
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.registry import FILTERS
 from tests.filters.test_c import ENSEMBLES, made
+from tests.filters.test_ensemble_pages import PartlyFilter
 from tests.filters.test_filter_paths import diverging
 from tests.filters.test_pages import wide_pendulum
 from tests.filters.test_tensors import Drag, assert_same, one_thread  # noqa: F401 - a fixture
@@ -43,6 +45,12 @@ def test_estimates_are_those_of_run(name, which):
     assert_same(filters.torch(filter_).run(inputs, z), run(filter_, None, inputs, z))
     keys = episode_keys([5, 6, 7])
     assert_same(filters.torch(filter_).run(inputs, z, keys), run(filter_, keys, inputs, z))
+
+
+def test_estimates_are_those_of_compiled_code_over_many_steps():
+    filter_ = make_filter("enkf", thruster_model(), ensemble_size=50)
+    inputs, z = simulated(filter_.model, 60, count=4, missing=0.2)
+    assert_same(filters.torch(filter_).run(torch.tensor(inputs), torch.tensor(z)), run(filter_, None, inputs, z))
 
 
 @pytest.mark.usefixtures("as_python")
@@ -116,6 +124,42 @@ def test_everything_that_is_a_tensor_has_derivatives(name, make):
     assert torch.autograd.gradcheck(score, zeros, eps=1e-6, atol=1e-6, rtol=1e-5)
     slopes = torch.autograd.grad(score(*zeros)[0], zeros)
     assert all(abs(one).max() > 1e-6 for one in slopes if one.numel())
+
+
+@pytest.mark.usefixtures("as_python")
+def test_own_parameters_as_tensors_are_those_of_the_filter():
+    model = wide_model()
+    inputs, z = simulated(model, 8, count=3)
+    expected = run(made("denkf", model).__class__(model=model, ensemble_size=13, inflation=1.2), None, inputs, z)
+    changed = filters.torch(made("denkf", model)).replace(inflation=1.2)
+    assert_same(changed.run(inputs, z), expected)
+    assert_same(pickle.loads(pickle.dumps(changed)).run(inputs, z), expected)
+    several = changed.replace(inflation=torch.tensor([1.0, 1.2, 1.3], dtype=torch.float64)).run(inputs, z)
+    assert_same([several.means[1]], [expected.means[1]])
+    user = PartlyFilter(model=model, ensemble_size=9, part=0.7)
+    assert_same(filters.torch(user).run(inputs, z), run(user, None, inputs, z))
+    with pytest.raises(ValueError, match="a number of a filter must be one of process_noise_cov, .*inflation"):
+        changed.replace(ensemble_size=3)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_network_in_a_model_has_a_gradient():
+    torch.manual_seed(0)
+    drag, model = Drag(), wide_pendulum(start=0.5, spread=0.2)
+    inputs, z = simulated(model, 4, count=2, level=0.3)
+    learning = filters.torch(made("etkf", model), transition=drag)
+
+    def score():
+        return learning.run(inputs, z).log_likelihoods.sum()
+
+    score().backward()
+    weights, at = drag.layers[0].weight, (2, 1)
+    with torch.no_grad():
+        sides = []
+        for step in (1e-5, -2e-5):
+            weights[at] += step
+            sides.append(score())
+    assert float(weights.grad[at]) == pytest.approx(float(sides[0] - sides[1]) / 2e-5, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ENSEMBLES)

@@ -117,6 +117,14 @@ def test_the_least_floor_makes_the_steady_gain_forget_in_the_time_that_is_allowe
     assert time_constants(make_filter("kf", raised), runs(300)).steps[0] == pytest.approx(20.0, rel=2e-3)
 
 
+def test_a_q_that_is_large_enough_stays_and_nothing_to_forget_is_refused():
+    model = walk(1.0)
+    path = slopes_along(make_filter("kf", model), runs(40))
+    np.testing.assert_array_equal(forgetting_noise(path, model, 5.0).cov, [[1.0]])
+    with pytest.raises(ValueError, match="must observe a state, but its measurements tell of none"):
+        forgetting_noise(path._replace(observations=0.0 * path.observations), model, 5.0)
+
+
 def test_along_slopes_that_change_it_is_the_mean_growth_of_errors():
     noise = {"q": [1e-3, 1e-4], "r": 0.1}
     prior = {"mean": [0.0, 1.0], "cov": [1.0, 1.0]}

@@ -1,6 +1,7 @@
 """States with bounds as logarithms and logits: by hand, positive throughout, coverage of what is drawn."""
 
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -67,6 +68,26 @@ def test_it_is_what_one_writes_by_hand(name):
     np.testing.assert_allclose(one.means, other.means, rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(one.covs, other.covs, rtol=1e-8, atol=1e-10)
     assert [state.symbol for state in model.states] == ["log_c", "logit_y"] and model.bounds == ()
+
+
+def test_the_states_and_what_follows_from_them_are_outputs():
+    model = pickle.loads(pickle.dumps(transformed_model(tank())))
+    s = np.array([[math.log(0.2), math.log(0.25 / 0.75)], [0.0, 0.0]])
+    np.testing.assert_allclose(model.output("c", s), [0.2, 1.0])
+    np.testing.assert_allclose(model.output("y", s), [0.25, 0.5])
+    np.testing.assert_allclose(model.output("s", s), [0.7, 2.0])
+    assert model.outputs["c"].quantity == tank().states[0]
+
+
+def test_a_bound_from_above_and_states_without_one():
+    model = transformed_model(tank(bounds={"c": (None, 3.0)}, prior_mean=[2.0, 0.4]))
+    assert [state.symbol for state in model.states] == ["log_c", "y"]
+    np.testing.assert_allclose(model.prior_mean, [-math.log(1.0), 0.4])
+    np.testing.assert_allclose(model.prior_cov, [[0.04, 0.0], [0.0, 0.01]])
+    np.testing.assert_allclose(model.observe((-5.0, 0.1), ()), [3.0 - math.exp(5.0), 0.1])
+    np.testing.assert_allclose(model.observe((50.0, 0.1), ()), [3.0, 0.1])  # never beyond
+    partly = transformed_model(tank(), {"c": (0.0, None)})
+    assert partly.bounds == ((1, 0.0, 1.0),)  # which filters keep in the other way
 
 
 @pytest.mark.usefixtures("as_python")

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import StateSpaceModel, affine_model, make_filter, run
+from filters import StateSpaceModel, Unknown, affine_model, augmented_model, make_filter, run
 from tests.filters.test_multiple_models import merged
 from tests.models import wide_model
 from tests.thruster_env.core.test_angles import RATE, turning
 from thruster_env.core.compiled import interpreted
+from thruster_env.thruster.model import thruster_model
 
 DT = 0.5
 QUANTITIES = {"p": ("position", "p", "m"), "v": ("speed", "v", "m/s"), "a": ("acceleration", "a", "m/s^2")}
@@ -44,6 +45,21 @@ def kalman(model):
         return x + gain @ (z - c @ x), p - gain @ s @ gain.T, multivariate_normal.logpdf(z, c @ x, s)
 
     return lambda x, p, u: (a @ x, a @ p @ a.T + model.process_noise_cov), update
+
+
+def filtered(model):
+    """The same of a model's extended filter."""
+    one = make_filter("ekf", model)
+    begun = one.init()
+
+    def predict(x, p, u):
+        return one.predict(begun._replace(mean=x, cov=p), u)[:2]
+
+    def update(x, p, z):
+        belief, innovation = one.update(begun._replace(mean=x, cov=p), z)
+        return belief.mean, belief.cov, innovation.log_likelihood
+
+    return predict, update
 
 
 def completed(beliefs, places, weights, n, given):
@@ -132,6 +148,29 @@ def test_equals_a_naive_filter_of_unequal_sizes(name):
     told = {"pva".index(one): value for one, value in given.items()}
     with nullcontext() if name == "two" else interpreted():
         compared(filter_, models, list(map(kalman, models)), places, np.zeros((59, 1)), np.array(z), told)
+
+
+@pytest.mark.parametrize("how", [interpreted, pytest.param(nullcontext, marks=pytest.mark.slow)])
+def test_a_thruster_with_and_without_an_unknown_constant(how):
+    """Nonlinear functions with Jacobians and constants by name, in a mode and in a larger one."""
+    small = thruster_model()
+    name = "thrust_30"
+    whole = augmented_model(small, {name: Unknown(std=0.3 * getattr(small.constants, name), walk_std=1e-8)})
+    models = [small, whole]
+    filter_ = make_filter("imm", whole, modes=models, stay=0.9)
+    assert filter_.mode_filters[0].model.transition_jacobian is not None
+    rng = np.random.default_rng(3)
+    inputs = np.repeat(rng.uniform(-20.0, 20.0, (8, 1)), 10, axis=0)
+    truth = augmented_model(small, {name: Unknown(std=1e-9, mean=0.6 * getattr(small.constants, name))})
+    x = truth.prior_mean.copy()
+    z = [truth.functions.observe(tuple(x), truth.given_constants)]
+    for u in inputs:
+        for _ in range(truth.substeps):
+            x = truth.functions.transition(tuple(x), tuple(u), truth.given_constants)
+        z.append(truth.functions.observe(x, truth.given_constants))
+    z = np.array(z) + rng.normal(0.0, 0.5, (81, 1))
+    with how():
+        compared(filter_, models, list(map(filtered, models)), [[0, 1], [0, 1, 2]], inputs, z)
 
 
 def test_the_mixture_does_not_pull_a_missing_state_to_a_value_of_its_own():

@@ -1,19 +1,22 @@
 """Noise and sample times that are set: a filter does what one made for them would do, or refuses in one line."""
 
+import copy
+import pickle
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from filters import FILTERS, make_filter, run, smooth, torch
+from filters import FILTERS, KalmanFilter, make_filter, run, smooth, torch
 from filters.differentiated.recursion import Wanted
 from filters.differentiated.runs import ModelSlopes, derivatives
 from filters.smoothers.smooth import WithSmoother
 from tests.filters.test_session import cart
 from tests.fuzz import unequal_steps
-from tests.kalman_by_hand import LIKE_KALMAN, KalmanByHand, LinearModel, close, covariance_of
+from tests.kalman_by_hand import LIKE_KALMAN, KalmanByHand, LinearModel, close, covariance_of, smoothed_by_hand
 from tests.models import affine, plane_model, simulated, small
 from tests.slow import slow_but
+from thruster_env.logs.log import in_any_steps
 
 pytestmark = pytest.mark.usefixtures("as_python")
 
@@ -157,6 +160,19 @@ def test_a_smoother_takes_q_and_r_of_each_step(kind):
     unequal_steps._smoother(rng, LinearModel(rng, 3, 2, 1), kind, kind)
 
 
+def test_a_smoother_of_members_takes_q_and_r_of_each_step():
+    rng = np.random.default_rng(5)
+    of = LinearModel(rng, 2, 1, 1)
+    q, r = unequal_steps._noises(rng, of, 8)
+    u, z = rng.normal(size=(1, 8, 1)), rng.normal(size=(1, 9, 1))
+    noise = {"process_noise_covs": q, "measurement_noise_covs": r}
+    found = smooth(make_filter("etkf", of.model(), ensemble_size=4000), None, u, z, **noise)
+    x, P = smoothed_by_hand(of, u[0], z[0], q, r)
+    deviations = np.sqrt(np.array([one.diagonal() for one in P]))
+    assert (np.abs(found.means[0] - x) / deviations).max() < 0.15
+    assert np.abs(found.covs[0] / P - 1.0).max() < 0.3
+
+
 def test_smoothers_refuse_noise_that_their_filter_refuses():
     noise = {"process_noise_covs": np.array([np.eye(2)])}
     with pytest.raises(ValueError, match="Q and R of the filter 'imm' cannot vary"):
@@ -203,6 +219,41 @@ def test_a_window_of_members_keeps_the_length_of_each_step():
     np.testing.assert_allclose(window.cov, plain.cov, rtol=1e-9)
 
 
+def test_two_measurements_at_one_time_both_count_in_a_window():
+    model, rng = plane_model(), np.random.default_rng(7)
+    for horizon in (1, 2, 10):
+        window, plain = make_filter("mhe", model, horizon=horizon, loss="quadratic"), make_filter("ekf", model)
+        beliefs = [window.init(), plain.init()]
+        for _ in range(5):
+            for z in (rng.normal(size=2), [np.nan, np.nan], [rng.normal(), np.nan], rng.normal(size=2)):
+                beliefs = [one.update(b, z)[0] for one, b in zip((window, plain), beliefs, strict=True)]
+                close(beliefs[0].mean, beliefs[1].mean, 1e-9)
+                close(beliefs[0].cov, beliefs[1].cov, 1e-9)
+            beliefs = [one.predict(b, [0.3]) for one, b in zip((window, plain), beliefs, strict=True)]
+        assert len(window.window(beliefs[0])) == min(horizon, 16)
+
+
+@pytest.mark.parametrize("name", ["ekf", "mhe", "sage-husa", "enkf"])
+def test_copies_and_pickles_of_a_session_keep_what_was_set(name):
+    session = made(name, moving()).session()
+    session.start((1, 2), [0.1, 0.2])
+    session.set_dt(0.3)
+    session.set_noise(process_noise_cov=[0.5, 0.2])
+    session.step([1.0], [0.3, 0.1])
+    copies = copy.deepcopy(session), pickle.loads(pickle.dumps(session))
+    for one in (session, *copies):
+        one.step([1.0], [0.4, 0.1])
+    for one in copies:
+        np.testing.assert_array_equal(one.mean, session.mean)
+        one.clear()
+        one.start((1, 2), [0.1, 0.2])
+        one.step([1.0], [0.3, 0.1])
+    first = made(name, moving()).session()
+    first.start((1, 2), [0.1, 0.2])
+    first.step([1.0], [0.3, 0.1])
+    np.testing.assert_array_equal(copies[1].mean, first.mean)
+
+
 @pytest.mark.parametrize("name", ["kf", "ekf", "ukf", "ckf"])
 def test_a_smoother_does_not_mind_the_order_of_states_of_which_some_are_known_exactly(name):
     a, q, p, c = (
@@ -222,6 +273,13 @@ def test_a_smoother_does_not_mind_the_order_of_states_of_which_some_are_known_ex
         found.append(smoothed.means[..., np.argsort(order)])
     for one in found[1:]:
         np.testing.assert_allclose(one, found[0], rtol=1e-7, atol=1e-9)
+
+
+def test_filters_of_one_affine_model_refuse_steps_of_any_length():
+    for name in ("kf", "kf-steady"):
+        with pytest.raises(ValueError, match=f"must know steps of any length, but '{name}' does not: 'ekf' does"):
+            make_filter(name, in_any_steps(moving()))
+    assert not KalmanFilter.any_step
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from filters import EstimateState, EstimateStates
+from filters import FILTERS, EstimateState, EstimateStates
+from filters.wrappers import ALIASES, filtered_id
 from tests.models import affine
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -134,6 +135,15 @@ def test_a_copy_of_an_env_that_reports_a_measurement_now_and_then_is_a_single_en
                 compare(i, begun, single.reset() if ended[i] else latest[i])
 
 
+def test_many_copies_on_all_cores_are_the_few():
+    many = EstimateStates(gym.make_vec("BowThruster-v0", num_envs=600), "enkf", ensemble_size=10)
+    few = EstimateStates(gym.make_vec("BowThruster-v0", num_envs=2), "enkf", ensemble_size=10)
+    many.reset(seed=1), few.reset(seed=1)
+    for _ in range(5):
+        of_many, of_few = many.step(np.full((600, 1), 9.0)), few.step(np.full((2, 1), 9.0))
+    np.testing.assert_allclose(of_many[-1]["estimate"][:2], of_few[-1]["estimate"], rtol=1e-12)
+
+
 def test_a_third_party_vector_env_takes_a_filter_too():
     env = gym.make_vec("Pendulum-v1", num_envs=2, vectorization_mode="sync")
     wrapped = EstimateStates(env, "ekf", model="tests.filters.test_vector_wrapper:still")
@@ -159,6 +169,16 @@ def test_filtered_ids_make_single_and_vector_envs(task):
     first = env.reset(seed=4)[0]
     np.testing.assert_array_equal(again.reset(seed=4)[0], first)
     np.testing.assert_allclose(vector.reset(seed=4)[0][0], first, rtol=1e-6)
+
+
+def test_every_task_has_an_id_that_takes_any_filter_and_some_short_ones():
+    assert filtered_id("BowThruster-v0", "EnKF") == "BowThruster-EnKF-v0"
+    for task in ("", "Tracking", "Reversal", "Linear"):
+        for word in ("Filtered", *ALIASES.values()):
+            assert filtered_id(f"BowThruster{task}-v0", word) in gym.registry
+    assert set(ALIASES) <= set(FILTERS)
+    env = gym.make("filters:BowThruster-Filtered-v0", filter="denkf", filter_arguments={"ensemble_size": 7})
+    assert (env.unwrapped.spec.id, env.get_wrapper_attr("filter").size) == ("BowThruster-Filtered-v0", 7)
 
 
 def test_filter_arguments_must_be_a_mapping():

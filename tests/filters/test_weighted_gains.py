@@ -110,6 +110,13 @@ def test_the_steady_state_of_a_scalar_game():
     assert before == pytest.approx((1.0 + np.sqrt(7.0)) / 2.0, rel=1e-12)
 
 
+def test_a_bound_that_nothing_keeps_is_a_divergence():
+    model = scalar_model()
+    filter_ = make_filter("h-infinity", model, theta=100.0, scale=[0.1])
+    belief, _ = filter_.update(filter_.predict(filter_.init(), [0.0]), [0.0])
+    assert belief.divergences == 1
+
+
 @pytest.mark.parametrize(
     ("name", "numbers", "rule"),
     [

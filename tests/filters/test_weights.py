@@ -16,6 +16,7 @@ from filters.algebra.points import (
 )
 from filters.pages.kernels import Stage, as_calls, of_members
 from filters.particles.kernels import systematic_resampler
+from thruster_env.core.streams import exponential
 from thruster_env.graphs.programs import OF_MEMBERS, Place
 
 SIZE = 11
@@ -39,6 +40,22 @@ def test_resampling_draws_each_particle_as_often_as_its_weight_says():
         counts += count
     # Over all u a particle is drawn N w times; a grid of 2000 of them leaves an error of 1/2000 for each edge.
     np.testing.assert_allclose(counts / repeats, size * weights / weights.sum(), atol=2.0 / repeats)
+
+
+def test_resampling_of_no_weight_at_all_changes_nothing():
+    table = np.zeros((5, 8))
+    table[0] = np.arange(8.0)
+    for weight in (0.0, np.nan):
+        table[1] = weight
+        systematic_resampler(1, 1, 2)(table, 6, 0.5)
+        np.testing.assert_array_equal(table[0], np.arange(8.0))
+
+
+def test_the_exponential_is_one():
+    x = np.random.default_rng(0).uniform(-45.0, 5.0, size=2000)
+    np.testing.assert_allclose([exponential(v) for v in x], np.exp(x), rtol=1e-13)
+    assert exponential(0.0) == 1.0
+    assert exponential(-math.inf) == exponential(math.nan) == pytest.approx(math.exp(-46.0))
 
 
 def on_arrays(page, x, log_w):

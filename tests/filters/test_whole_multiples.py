@@ -50,6 +50,10 @@ def runs_of(transition, name):
     return run(filter_, filter_keys([0]), np.zeros((1, STEPS, 0)), np.full((1, STEPS + 1, 1), np.nan)).means[0]
 
 
+def test_python_has_a_counter_that_returns_to_zero():
+    assert (expected()[1::49, 0] == 0.0).all() and expected()[:, 0].max() == 48.0
+
+
 @pytest.mark.parametrize(
     "compiled, transition, name",
     [

@@ -10,8 +10,9 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import thruster_env  # noqa: F401 - registers the env
-from filters import FILTERS, EstimateState, make_filter, run, thruster_model
-from tests.models import TUNED, affine
+from filters import FILTERS, EstimateState, StateSpaceModel, make_filter, run, thruster_model
+from filters.tuned_file import sealed
+from tests.models import TUNED, affine, state_space
 from thruster_env.thruster.parameters import TUNNEL, derive_constants
 
 # Both checkers would like a bare env with actions in [-1, 1]; volts and a wrapper are what is tested here.
@@ -177,6 +178,16 @@ class TestNumbers:
         found = infos_of("estimate", played(env, wild, seed=0)[2])
         np.testing.assert_allclose(found, expected.means[0], rtol=1e-12, atol=1e-12)
 
+    @pytest.mark.parametrize("voltage", [100.0, -100.0])
+    def test_on_the_thruster_a_voltage_out_of_range_counts_as_the_limit(self, voltage):
+        limit = math.copysign(24.0, voltage)
+        over, at = wrapped("ekf"), wrapped("ekf")
+        for env, action in ((over, voltage), (at, limit)):
+            env.reset(seed=1)
+            info = env.step(np.array([action], dtype=np.float32))[4]
+            env.found = info["state"], info["estimate"]
+        np.testing.assert_array_equal(over.found, at.found)
+
     def test_the_measurement_is_that_of_info_in_float64_and_else_the_observation(self):
         inputs = np.zeros((1, 5, 2))
         for in_info, z in ((True, SCRIPT), (False, SCRIPT.astype(np.float32))):
@@ -231,6 +242,14 @@ class TestSeeds:
         np.testing.assert_array_equal(first, again)
         assert not np.array_equal(first[0], first[1])
         assert not np.array_equal(first[1], first[2])
+
+    def test_another_seed_is_another_key(self, still):
+        one, other = (infos_of("estimate", played(still, voltages(5), seed)[2]) for seed in (1, 2))
+        assert not np.array_equal(one, other)
+
+    def test_envs_that_were_never_seeded_differ(self):
+        one, other = (played(wrapped(), [])[2][0]["estimate"] for _ in range(2))
+        assert not np.array_equal(one, other)
 
 
 def own_model(process_noise_cov=(1.0, 4e-4)):
@@ -308,6 +327,11 @@ class TestModels:
         expected = thruster_model(**arguments)
         np.testing.assert_array_equal(env.filter.model.numbers, expected.numbers)
 
+    def test_the_noise_is_the_filter_s_own_where_it_is_given(self):
+        model = wrapped("ekf", **assumed(process_noise_cov=[4.0, 0.01], measurement_noise_cov=9.0)).filter.model
+        np.testing.assert_array_equal(model.process_noise_cov, np.diag([4.0, 0.01]))
+        np.testing.assert_array_equal(model.measurement_noise_cov, [[9.0]])
+
     def test_a_mismatch_is_a_factor_on_a_parameter_of_the_model_alone(self):
         factors = {"lift_coefficient": 1.15, "voltage_gain": 0.95}
         env = wrapped("ekf", **assumed(parameter_factors=factors))
@@ -321,6 +345,10 @@ class TestModels:
         np.testing.assert_array_equal(infos_of("state", one), infos_of("state", other))
         error = [abs((infos_of("estimate", i) - infos_of("state", i))[100:, 0].mean()) for i in (one, other)]
         assert error[0] > 2.0 > 1.0 > error[1]  # a voltage gain 5 % low: 4 rad/s of bias at 80
+
+    def test_a_module_s_factory_makes_the_model_from_its_arguments(self):
+        env = wrapped("ekf", model=f"{__name__}:own_model", **assumed(process_noise_cov=[9.0, 0.1]))
+        np.testing.assert_array_equal(env.filter.model.process_noise_cov, np.diag([9.0, 0.1]))
 
     def test_a_kalman_filter_works_about_the_operating_voltage(self):
         default, other = wrapped("kf"), wrapped("kf", **assumed(operating_voltage=-3.0))
@@ -392,6 +420,28 @@ def test_a_wrong_argument_is_refused_with_rule_and_value(arguments, rule):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        json.dumps(TUNED)[:40],
+        json.dumps({**TUNED, "version": 3}),
+        json.dumps({**TUNED, "filter": {**TUNED["filter"], "name": "ekf"}}),
+        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "name": "no filter"}})),
+        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "numbers": {"ensemble_size": 1}}})),
+        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "numbers": {"size": 9}}})),
+        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "numbers": [9]}})),
+        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "model": None}})),
+    ],
+    ids=["truncated", "version", "edited", "filter", "value", "number", "list", "model"],
+)
+def test_a_damaged_tuned_file_is_refused(tmp_path, content):
+    path = tmp_path / "tuned.json"
+    path.write_text(content)
+    with pytest.raises(ValueError) as error:
+        EstimateState(bow_thruster(), tuned=str(path))
+    assert "\n" not in str(error.value)
+
+
 class TestOtherEnvs:
     def test_an_env_without_a_known_plant_needs_a_model(self):
         with pytest.raises(ValueError, match="must come with a model"):
@@ -414,6 +464,48 @@ class TestOtherEnvs:
         with pytest.raises(ValueError, match="measurement|observation"):
             EstimateState(bow_thruster(), model=one_input).reset(seed=0)
 
+    def test_a_bow_thruster_offers_its_model(self):
+        assert isinstance(bow_thruster().unwrapped.state_space_model(), StateSpaceModel)
+
     def test_any_env_may_offer_its_model(self):
         env = EstimateState(Offering(SCRIPT), "kf", model_arguments={"noise": 4.0})
         np.testing.assert_array_equal(env.filter.model.process_noise_cov, 4.0 * np.eye(2))
+
+
+def swing(x, u, c):
+    """Gymnasium's pendulum: angle from upright [rad], speed [rad/s]; gravity 10, length and mass 1, dt 0.05."""
+    speed = x[1] + 0.05 * (15.0 * math.sin(x[0]) + 3.0 * u[0])
+    speed = min(max(speed, -8.0), 8.0)
+    return (x[0] + 0.05 * speed, speed)
+
+
+def see(x, c):
+    return (math.cos(x[0]), math.sin(x[0]), x[1])
+
+
+class TestPendulum:
+    def wrapped(self, filter):
+        model = state_space(swing, see, q=[1e-6, 1e-6], r=[1e-4, 1e-4, 1e-4], mean=[0.0, 0.0], cov=[1.0, 1.0])
+        numbers = {"ensemble_size": 50} if filter == "enkf" else {}
+        return EstimateState(gym.make("Pendulum-v1"), filter=filter, model=model, **numbers)
+
+    @quiet
+    def test_both_checkers_accept_it(self):
+        checkers = pytest.importorskip("stable_baselines3.common.env_checker")
+        check_env(self.wrapped("ekf"), skip_render_check=True)
+        checkers.check_env(self.wrapped("ekf"), skip_render_check=True)
+
+    @pytest.mark.parametrize("filter", ["ekf", "enkf"])
+    def test_the_estimate_follows_the_hidden_state(self, filter):
+        env = self.wrapped(filter)
+        observation, info = env.reset(seed=2)
+        for k in range(150):
+            action = np.array([3.0 * math.sin(0.3 * k)], dtype=np.float32)  # beyond the limits of 2
+            observation, _, _, _, info = env.step(action)
+            angle, speed = env.unwrapped.state
+            difference = np.angle(np.exp(1j * (info["estimate"][0] - angle)))
+            if k > 20:
+                assert abs(difference) < 0.02
+                assert abs(info["estimate"][1] - speed) < 0.05
+        np.testing.assert_array_equal(observation, info["estimate"].astype(np.float32))
+        assert info["estimate_divergences"] == 0

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
@@ -72,6 +73,15 @@ def refused(call, rule):
 )
 def test_an_env_of_numbers_beyond_floating_point_is_refused(name, arguments, rule):
     refused(lambda: gym.make(f"BowThruster{name}-v0", **arguments), rule)
+
+
+@pytest.mark.parametrize("vector_env", [False, True])
+def test_an_episode_does_not_start_beyond_floating_point(vector_env):
+    env = gym.make_vec("BowThruster-v0", 2) if vector_env else gym.make("BowThruster-v0").unwrapped
+    rule = r"the state of options must be within plus and minus 1e\+50, but got \[1e\+300, 0\]"
+    refused(lambda: env.reset(options={"state": [1e300, 0]}), rule)
+    info = env.reset(seed=0, options={"state": [1e50, -1e50]})[1]
+    assert all(np.isfinite(value).all() for value in info.values())
 
 
 def test_counts_have_limits():

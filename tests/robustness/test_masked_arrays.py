@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from filters import EstimateState, make_filter, run
+from filters import EstimateState, EstimateStates, make_filter, run
 from filters.sensitivity import likelihood
 from tests.models import KEY, line_model, simulated, wide_model
 from tests.thruster_env.logs.test_logs import MODEL
@@ -14,7 +14,11 @@ from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
+from thruster_env.model.simulate import simulate
+from tuning.problems.check import check_data
+from tuning.problems.data import Data
 from tuning.problems.env_problem import EnvProblem
+from tuning.problems.model_problem import ModelProblem
 
 pytestmark = pytest.mark.usefixtures("as_python")
 BEHIND = 1e6  # what stands behind the mask
@@ -122,6 +126,18 @@ def test_wrappers_and_problems_of_envs_take_them_as_missing(place):
     assert np.isnan(data["nan"][1]).sum() == 6 and type(data["masked"][1]) is np.ndarray
 
 
+def test_a_vector_env_may_have_them():
+    found = []
+    for way in ("masked", "nan"):
+        envs = gym.vector.SyncVectorEnv([lambda: Sensor("nan")] * 2, autoreset_mode="SameStep")
+        wrapper = EstimateStates(envs, filter=make_filter("ekf", plane()))
+        z = np.array([[0.5, 1.0], [2.0, 3.0]])
+        where = np.array([[True, False], [False, False]])
+        given = masked(z, where) if way == "masked" else np.where(where, np.nan, z)
+        found.append(wrapper._measurements(given, {}))
+    np.testing.assert_array_equal(*found)
+
+
 def test_logs_and_tables_take_them_as_missing(tmp_path):
     columns = {"t": 0.1 * np.arange(6), "V_s": np.arange(6.0), "tach": np.arange(6.0)}
     where = np.array([False, False, True, False, True, False])
@@ -136,3 +152,17 @@ def test_logs_and_tables_take_them_as_missing(tmp_path):
     np.testing.assert_array_equal(log.measurements[:, 0], plain["tach"])
     env = EstimateState(ReplayEnv(log, MODEL), filter="kf")
     assert np.isfinite(env.reset(seed=0)[0]).all()
+
+
+def test_where_nothing_may_be_missing_they_are_refused_in_one_line():
+    model = line_model()
+    inputs, measurements = simulated(model, 6)
+    hidden = masked(inputs, np.ones(inputs.shape, dtype=bool))
+    with pytest.raises(ValueError, match="must be finite numbers"):
+        ModelProblem(model, inputs=hidden[0])
+    data = Data((0,), inputs, masked(measurements, measurements > 1e9), filter_keys([0]), 0)
+    with pytest.raises(
+        ValueError, match="measurements of problem here must be a plain array, NaN where .* masked"
+    ):
+        check_data(data, model, "here")
+    assert np.isnan(simulate(model, filter_keys([0]), hidden).states[0, -1]).all()

@@ -1,21 +1,61 @@
 """What held under attack: angles about any heading, missing samples, bands of NIS, processes, forms of tables."""
 
+import asyncio
 import itertools
 import math
+import multiprocessing
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
-from filters import make_filter, run
+from filters import FILTERS, EstimateState, make_filter, run
 from filters.logs.estimate import LogEstimate
 from filters.logs.findings import findings
-from tests.models import scalar_model
+from tests.filters.test_filter_paths import assert_paths_agree
+from tests.models import KEY, line_model, scalar_model, simulated, small
+from tests.slow import slow_but
+from tests.thruster_env.core.test_angles import data_of, makers, plain_run, rotated
 from tests.thruster_env.logs.test_logs import MODEL
+from thruster_env.core.angles import difference
+from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import filter_keys
+from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 
 LOGS, LEVEL = 600, 3.9  # deviations that a binomial share stays within, but once in 10 000 seeds
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", FILTERS)
+def test_about_any_heading_a_filter_errs_alike(name):
+    _, plain, make = makers(name)
+    keys, inputs, measurements = data_of(plain)
+    for heading in (0.5 * math.pi, -0.5 * math.pi, math.pi, -math.pi, -3.0):
+        found = run(small(name, make(heading)), keys, inputs, rotated(measurements, heading))
+        reference = plain_run(name)
+        apart = difference(found.means, reference.means + [0.0, heading], (False, True))
+        assert np.abs(apart).max() < 2e-8, heading
+        for one, other in zip(found[1:], reference[1:], strict=True):
+            np.testing.assert_allclose(one, other, rtol=2e-8, atol=2e-8)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", FILTERS)
+def test_with_a_fifth_of_all_samples_missing_all_paths_agree(name):
+    model, steps = line_model(), 30
+    inputs, measurements = simulated(model, steps)
+    measurements[np.random.default_rng(5).random(measurements.shape) < 0.2] = np.nan
+    assert 3 <= np.isnan(measurements).sum() <= 12
+    filter_ = small(name, model)
+    assert_paths_agree(filter_, KEY, inputs, measurements)
+    log = Log("run", 0.1, inputs[0], measurements[0], model.input_quantities, model.measurements)
+    env = EstimateState(ReplayEnv(log, model), filter=filter_)
+    infos = [env.reset(seed=3)[1]] + [env.step(np.zeros(model.inputs))[-1] for _ in range(steps)]
+    batch = run(filter_, filter_keys([3]), inputs, measurements)
+    for part, key in ((batch.means, "estimate"), (batch.covs, "estimate_cov"), (batch.innovations, "innovation")):
+        np.testing.assert_allclose([info[key] for info in infos], part[0], rtol=5e-13, atol=5e-13)
 
 
 @pytest.mark.slow
@@ -38,6 +78,41 @@ def test_the_band_of_the_mean_nis_holds_95_percent_of_logs():
         low, high = told.nis_band
         inside += low <= told.mean_nis <= high
     assert abs(inside / LOGS - 0.95) < LEVEL * math.sqrt(0.95 * 0.05 / LOGS)
+
+
+def means_of(seed):
+    """The estimates of some runs of an ensemble, as any process or thread computes them."""
+    model = scalar_model()
+    with interpreted():
+        inputs, measurements = simulated(model, 8, count=2, seed=seed)
+        return run(make_filter("enkf", model, ensemble_size=6), filter_keys([seed, 9]), inputs, measurements).means
+
+
+@pytest.mark.parametrize("way", slow_but(["fork", "spawn"], ["fork"]))
+def test_another_process_finds_the_same_numbers(way):
+    if way not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"there is no {way} here")
+    with multiprocessing.get_context(way).Pool(1) as pool:
+        np.testing.assert_array_equal(pool.apply(means_of, (3,)), means_of(3))
+
+
+def test_threads_and_tasks_find_the_same_numbers():
+    inputs, measurements = simulated(scalar_model(), 8, count=2, seed=3)
+    filter_ = make_filter("enkf", scalar_model(), ensemble_size=6)
+
+    def means(seed):
+        return run(filter_, filter_keys([seed, 9]), inputs, measurements).means
+
+    alone = [means(seed) for seed in range(6)]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(means, range(6)))
+
+    async def together():
+        return await asyncio.gather(*(asyncio.to_thread(means, seed) for seed in range(6)))
+
+    for one, other, third in zip(alone, found, asyncio.run(together()), strict=True):
+        np.testing.assert_array_equal(one, other)
+        np.testing.assert_array_equal(one, third)
 
 
 TABLES = list(

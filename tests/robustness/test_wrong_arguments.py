@@ -49,6 +49,14 @@ def test_a_seed_is_a_whole_number(make, seed):
         refused(lambda: make().reset(seed=seed), rule)
 
 
+@pytest.mark.parametrize("make", ENVS.values(), ids=ENVS)
+def test_a_seed_may_be_a_number_of_numpy(make):
+    for kind in (np.int64, np.uint8):
+        expected = make().reset(seed=7)
+        for one, other in zip(make().reset(seed=kind(7)), expected, strict=True):
+            np.testing.assert_equal(one, other)
+
+
 def test_a_vector_env_takes_one_seed_a_copy():
     refused(lambda: vector().reset(seed=[1, 2]), "seed must be None, a number or 3 of these, but got")
     observations = vector().reset(seed=np.array([5, 6, 7]))[0]
@@ -172,6 +180,21 @@ def test_a_belief_that_a_prediction_lost_says_so_and_restarts():
     assert isinstance(lost, LostBelief) and not np.isfinite(lost.mean).all()
     belief, _ = ekf.update(lost, [1.0])
     assert not isinstance(belief, LostBelief) and belief.divergences == 1 and belief.mean == [3.0]
+
+
+def test_a_negative_variance_counts_as_a_failure():
+    # Joseph's form leaves one, by rounding, where variances lie many orders of magnitude apart.
+    model = thruster_model(process_noise_cov=[1e-8, 1e-8], measurement_noise_cov=1e-8)
+    rng, count = np.random.default_rng(0), 0
+    for _ in range(200):
+        scale = 10.0 ** rng.uniform(-8, 8, size=2)
+        factor = rng.normal(size=(2, 2)) * scale[:, None]
+        filter_ = make_filter("ekf", model.replace(prior_cov=factor @ factor.T))
+        belief, _ = filter_.update(filter_.init(KEY), [5.0])
+        belief, _ = filter_.update(filter_.predict(belief, [12.0]), [6.0])
+        assert (np.diag(belief.cov) >= 0).all()
+        count += belief.divergences
+    assert count > 0
 
 
 def test_every_path_counts_a_negative_variance_alike():

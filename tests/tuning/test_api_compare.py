@@ -1,20 +1,34 @@
 """`tuning.compare`: the rows of the command, as a value; and filters that are tuned first."""
 
+import copy
+import pickle
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
+import matplotlib.figure
 import numpy as np
 import pytest
 
 import tuning
+from filters.augmented import Unknown
+from filters.registry import make_filter
 from tests import pendulum_problem
 from tests.linear_problem import LinearProblem
 from tests.models import wide_model
 from tests.small_problems import UNITS, pair
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
-from tuning.evaluation.evaluate import evaluate
+from thruster_env.model.affine import affine_model
+from tuning.api.compare import default_filters
+from tuning.cli.verbs import described
+from tuning.evaluation.compare import known
+from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.evaluation.residuals import model_error
+from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
+from tuning.problems.model_problem import ModelProblem
 from tuning.reporting.leaderboard import as_json as boards_as_json
+from tuning.search.plan import Plan
 from tuning.search.space import given_choice
 
 SHORT = find_problem("nominal").replace(steps=70, name="short")
@@ -45,6 +59,20 @@ def test_compare_is_the_command_in_one_call(as_json):  # noqa: F811
     assert found.filters == ("ekf", "ekf + U_0", "enkf 7", "enkf 7 + U_0")
 
 
+def test_a_comparison_shows_itself(comparison):
+    assert repr(comparison).startswith("FilterComparison(short: ekf ") and comparison.ranked() == ["ekf", "kf"]
+    assert comparison.sentences() == ["By the score on short, ekf is better than kf."]
+    table = comparison.to_frame()
+    rows = comparison.boards[0].rows
+    assert table["filter"].tolist() == ["kf", "ekf"] and table["verdict"].tolist() == ["", rows[1].verdict]
+    assert table["score over first"].tolist() == [row.score_ratio.value for row in rows]
+    assert table["score"].tolist() == [row.evaluation.score.value for row in rows]
+    text = comparison._repr_html_()
+    assert "better" in text and "nan" not in text and text.count("<table") == 2
+    for other in (copy.deepcopy(comparison), pickle.loads(pickle.dumps(comparison))):
+        assert repr(other) == repr(comparison)
+
+
 def test_rows_have_the_labels_of_a_mapping_and_their_numbers_from_any_executor(comparison):
     with ThreadPoolExecutor(2) as pool:
         own = tuning.compare({"mine": "kf", "theirs": "ekf"}, SHORT, seeds=6, executor=pool, progress=False)
@@ -52,6 +80,15 @@ def test_rows_have_the_labels_of_a_mapping_and_their_numbers_from_any_executor(c
         dict(zip(one["filter"], one["score"], strict=True)) for one in (own.to_frame(), comparison.to_frame())
     )
     assert mine == {"mine": theirs["kf"], "theirs": theirs["ekf"]}
+
+
+def test_scores_are_drawn_with_their_intervals(comparison):
+    figure = comparison.plot_scores()
+    assert isinstance(figure, matplotlib.figure.Figure)
+    (axis,) = figure.axes
+    assert [text.get_text() for text in axis.get_yticklabels()] == ["kf", "ekf"]
+    whiskers = [line.get_xdata().tolist() for line in axis.lines if len(line.get_xdata()) == 2]
+    assert whiskers == [[row.evaluation.score.low, row.evaluation.score.high] for row in comparison.boards[0].rows]
 
 
 def test_filters_are_tuned_first_where_that_is_asked_for(tmp_path):
@@ -85,6 +122,64 @@ def test_filters_with_what_a_model_came_with_are_those_of_the_baseline():
         tuning.compare("ekf", SHORT, seeds=2, knows="given")
 
 
+def sluggish(**options):
+    """A plant that is slower than its model; both have the same Q and R."""
+    noise = {"process_noise_cov": [0.04], "measurement_noise_cov": [1.0]}
+    start = {"prior_mean": [0.0], "prior_cov": [1.0], "b": np.ones((1, 1)), "c": [[1.0]], "states": ["x"], **noise}
+    truth, assumed = (affine_model(a=[[a]], **start) for a in (0.98, 0.7))
+    return ModelProblem(truth, assumed, Steps(hold=5), steps=20, first_scored_step=4, scale=(1.0,), **options)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_caption_says_of_each_row_whose_q_and_r_it_has():
+    model = sluggish(name="sluggish").truth
+    problem = ModelProblem(model, inputs=Steps(hold=5), steps=20, first_scored_step=4, scale=(1.0,), name="right")
+    mine = make_filter("kf", model.replace(process_noise_cov=[9.0]))
+    found = tuning.compare({"mine": mine, "kf": "kf"}, problem, seeds=4, knows="true", progress=False)
+    text = " ".join(str(found).split())
+    assert "Q and R: of mine those of the filter itself; of kf the plant's own (oracle" in text
+    assert [row.knows for row in found.boards[0].rows] == ["own", "true"]
+
+
+@pytest.mark.usefixtures("as_python")
+def test_with_a_wrong_model_each_filter_has_the_best_q_and_r_of_a_study_and_noise_estimation():
+    problem = sluggish(name="sluggish")
+    assert model_error(problem).startswith("the residuals of x have ")
+    found = tuning.compare("kf", problem, seeds=20, progress=False)
+    oracle = tuning.compare("kf", problem, seeds=20, knows="true", progress=False)
+    (row,), (other,) = found.boards[0].rows, oracle.boards[0].rows
+    assert row.knows in ("study", "noise") and other.knows == "true"
+    assert score_ratio(row.evaluation, other.evaluation).high < 0.9
+    text = " ".join(str(found).split())
+    assert "Model and plant differ: the residuals of x have" in text and "Model and plant" not in str(oracle)
+    right = ModelProblem(problem.truth, inputs=problem.inputs, steps=20, first_scored_step=4, scale=(1.0,))
+    assert model_error(right) == "" and known(None, "kf", right).source == "true"
+
+
+@pytest.mark.usefixtures("as_python")
+def test_particles_are_left_out_by_default_where_there_are_many_states():
+    found = tuning.compare(problem=LinearProblem(n=7, m=1, steps=20), seeds=2, knows="untuned", progress=False)
+    assert found.filters == ("ekf", "enkf 30") and "pf is left out: by default particles" in str(found)
+    assert default_filters([SHORT]) == (["ekf", "enkf", "pf"], {})
+
+
+def test_a_comparison_s_study_does_not_tune_the_ensemble_size():
+    assert Plan("enkf", (SHORT,)).space()["N"].single() is False
+    plan = Plan("enkf", (SHORT,), ensemble_size=7)
+    assert plan.space()["N"].single() and plan.choice_of({"N": 7}).numbers["ensemble_size"] == 7
+    assert plan.identity != Plan("enkf", (SHORT,)).identity
+
+
+def test_what_filters_know_has_one_explanation(thruster):  # noqa: F811
+    page = (Path(__file__).parents[2] / "docs" / "appendix" / "tuning.md").read_text()
+    help_text = thruster("compare", "--help").stdout.replace("│", " ")
+    columns = "".join(line[30:] for line in help_text.splitlines(keepends=True))  # without names and types
+    explanation = described(tuning.compare)[1]["knows"].partition(": ")[2]
+    assert len(explanation) > 200
+    for text in (page, columns):
+        assert explanation in " ".join(text.split())
+
+
 WRONG = [
     (lambda: tuning.compare(["ekf", "ekf"], SHORT, seeds=2), "must be of different filters, but got ekf, ekf"),
     (lambda: tuning.compare([]), "a comparison must have at least one filter, but got none"),
@@ -111,6 +206,14 @@ WRONG = [
 def test_errors_state_the_rule_and_the_value(call, said):
     with pytest.raises(ValueError, match=said):
         call()
+
+
+def test_beliefs_have_several_forms():
+    from tuning.problems.assumed import unknowns_of
+
+    mine = Unknown(0.2)
+    assert unknowns_of(["a", "b"]) == {"a": None, "b": None} == unknowns_of({"a": None, "b": None})
+    assert unknowns_of({"a": mine, "b": 0.2, "c": (0.2, 0.1)}) == {"a": mine, "b": mine, "c": Unknown(0.2, 0.1)}
 
 
 def test_a_filter_that_refuses_the_model_is_left_out_and_the_others_are_compared():

@@ -1,7 +1,10 @@
 """`tuning.estimate` and `identify`: the numbers of the commands on recorded runs, as values."""
 
+import copy
 import json
+import pickle
 
+import matplotlib.figure
 import numpy as np
 import pytest
 
@@ -30,6 +33,11 @@ def runs(recorded, tmp_path):
     return [f"run{place}.csv" for place in range(len(recorded))]
 
 
+@pytest.fixture(scope="module")
+def found(recorded):
+    return tuning.identify(tuning.read_logs(recorded, **WHOSE), FREE, noise=False, starts=1, progress=False)
+
+
 def test_estimate_is_the_command_in_one_call(as_json, runs, tmp_path):  # noqa: F811
     told = as_json("estimate", "run0.csv", *OF_LOGS, "--smoother", "--lag", 5, "--skip", 20, "--out", "theirs.csv")
     mine = tuning.estimate(tuning.read_logs("run0.csv", **WHOSE), smoother=True, lag=5, skip=20)
@@ -50,6 +58,14 @@ def test_a_pair_of_model_and_log_is_the_same(recorded):
         tuning.identify(tuning.read_logs(("tunnel_physical", [recorded[0]]), sensors=WHOSE["sensors"]), "mass")
 
 
+def test_estimates_are_drawn_and_copied(recorded):
+    mine = tuning.estimate(tuning.read_logs(recorded[0], **WHOSE))
+    whole, innovations = mine.plot_states(), mine.plot_innovations()
+    assert isinstance(whole, matplotlib.figure.Figure) and len(whole.axes) > len(innovations.axes) == 2
+    for other in (copy.copy(mine), pickle.loads(pickle.dumps(mine))):
+        assert repr(other) == repr(mine)
+
+
 def test_a_baseline_has_no_nis(recorded):
     mine = tuning.estimate(tuning.read_logs(recorded[0], **WHOSE), filter="open-loop")
     assert repr(mine).endswith("rows)") and "nan" not in mine._repr_html_()
@@ -67,6 +83,16 @@ def test_identify_is_the_command_in_one_call(as_json, runs, tmp_path):  # noqa: 
     assert mine.save("mine.toml").read_text() == (tmp_path / "theirs.toml").read_text()
     assert read_preset("mine.toml").parameters.voltage_gain == mine.values["voltage_gain"]
     assert json.dumps(mine.sentences()) == json.dumps(told["sentences"])
+
+
+def test_what_was_identified_shows_itself(found):
+    assert repr(found).startswith("Identified(motor_damping ") and repr(found).endswith("all determined, 2 runs)")
+    table = found.to_frame()
+    assert table["value"].to_dict() == found.values and table.loc["voltage_gain", "unit"] == "rad/(s^2 V)"
+    assert "voltage_gain" in found._repr_html_() and found.model.n == 2
+    assert found.plot_profiles(["voltage_gain"]).axes
+    for other in (copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
+        assert other.values == found.values
 
 
 def test_runs_that_are_held_out_only_validate(recorded):
@@ -114,6 +140,11 @@ WRONG = [
 def test_errors_state_the_rule_and_the_value(call, said, recorded):
     with pytest.raises(ValueError, match=said):
         call(recorded[0])
+
+
+def test_a_file_of_what_was_identified_ends_in_toml(found, tmp_path):
+    with pytest.raises(ValueError, match=r"must end in \.toml, but got 'x\.json'"):
+        found.save("x.json")
 
 
 LAG = """from filters import affine_model

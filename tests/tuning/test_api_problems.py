@@ -1,5 +1,7 @@
 """What a user may give for a problem: names, problems, and pairs of a model and recorded runs in any form."""
 
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pandas
@@ -12,6 +14,7 @@ from tests.pendulum_problem import problem as pendulum
 from tests.slow import slow_but
 from tests.small_problems import pair
 from thruster_env.logs.log import Log
+from thruster_env.logs.read import read_log
 from thruster_env.logs.write import write_log
 from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
@@ -79,6 +82,19 @@ def test_recorded_runs_are_the_same_in_any_form(logs, tmp_path):
     )
 
 
+def test_tuning_on_a_model_and_frames_finds_a_filter(logs):
+    frames = [pandas.DataFrame(table_of(log)) for log in logs]
+    study = tuning.tune(tuning.read_logs(frames, model=cart(), lead=20), "kf", trials=3, progress=False)
+    assert study.plan.objectives == ("likelihood",) and "log-likelihood" in repr(study)
+    assert study.problem.name == "run1 and 1 more" and study.filter.name == "kf"
+    estimates = tuning.estimate((cart(), frames[0]), study)
+    assert estimates.filter.name == "kf" and np.isfinite(estimates.means).all()
+    assert "log-likelihood" in study.held_out.to_frame().columns
+    assert "log-likelihood" in repr(study.held_out) and "nan" not in study._repr_html_()
+    with pytest.raises(ValueError, match="a figure of errors needs the truth"):
+        study.plot_errors()
+
+
 def test_columns_with_true_states_are_the_truth():
     problem = find_problem("nominal")
     data = problem.data([5])
@@ -132,6 +148,12 @@ def test_two_logs_of_one_name_are_told_apart(logs):
         problem_of(tuning.read_logs(logs, model=cart(), dt=0.2))
 
 
+def test_a_table_is_read_as_a_file_is(logs, tmp_path):
+    write_log(tmp_path / "run.csv", logs[0])
+    found = read_log(table_of(logs[0]), cart(), name="mine")
+    assert found.name == "mine" and found.digest == read_log(tmp_path / "run.csv", cart()).digest
+
+
 @pytest.mark.parametrize("name", slow_but(["nominal", "published_tunnel", "auv:motion"], ["nominal"]))
 def test_an_env_of_a_scenario_makes_its_data(name):
     problem = find_problem(name)
@@ -179,6 +201,18 @@ def test_actions_of_a_models_env_are_within_what_the_problem_applies(inputs, low
     assert problem.make_env(high=9.0).action_space.high.tolist() == [9.0, 9.0]
 
 
+def test_a_reset_without_info_is_said():
+    class Bare(gym.Wrapper):
+        def reset(self, **options):
+            return super().reset(**options)[0]
+
+    problem = pendulum().__class__(
+        Bare(gym.make("Pendulum-v1").unwrapped), "random", pendulum().model(), steps=60, has_truth=False
+    )
+    with pytest.raises(ValueError, match=r"must return \(observation, info\), but returned"):
+        problem.data([1])
+
+
 def test_envs_of_other_problems(logs):
     mine = pair()
     env, data = mine.make_env(low=-9.0, high=9.0), mine.data([2])
@@ -194,6 +228,15 @@ def test_envs_of_other_problems(logs):
         recorded.make_env(run=2)
     with pytest.raises(ValueError, match="must come with run alone, but got low"):
         recorded.make_env(low=1.0)
+
+
+def test_outliers_in_logs_name_the_filter_that_bears_them(logs):
+    assert not any("ekf-robust" in sentence for sentence in LogProblem(logs, cart()).remarks)
+    values = logs[0].measurements.copy()
+    values[100] += 9.0
+    wild = dataclasses.replace(logs[0], measurements=values)
+    sentences = LogProblem([wild, logs[1]], cart()).remarks
+    assert "1 isolated outlier in row 100" in sentences[0] and "--filter ekf-robust" in sentences[1]
 
 
 def test_only_constants_with_names_of_a_problem_that_tunes_q_and_r_may_be_estimated(logs):

@@ -1,13 +1,17 @@
 """`tuning.tune`, `evaluate` and `report`: the numbers of the commands, as values that show and keep themselves."""
 
 import copy
+import html
 import json
 import pickle
 import signal
+import subprocess
 import sys
+from dataclasses import replace
 
 import matplotlib.figure
 import numpy as np
+import optuna
 import pytest
 
 import tuning
@@ -16,6 +20,8 @@ from filters.c.project import c_filter
 from filters.monitoring import Monitor
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.problems.find import find_problem
+from tuning.reporting.sections import lines_section
+from tuning.reporting.tuning_report import report
 
 TRIALS = 5
 SHORT = find_problem("nominal").replace(steps=70, name="short")  # quick to tune on
@@ -67,12 +73,74 @@ def test_the_tuned_filter_is_ready_to_use(study, tmp_path):
         EstimateState(wrapped.env, study)
 
 
+def test_what_is_printed_are_the_tables_of_the_command_line(study):
+    found = study.held_out
+    lines = str(found).splitlines()
+    printed = report(study)
+    assert printed[0].startswith(lines[0]) and lines[0].startswith(
+        "The study returns trial 4 rescaled for its log score"
+    )
+    assert any(line.startswith("RMSE on held-out seeds") for line in lines) and "\x1b" not in str(found)
+    assert any(line.startswith(" scaled ") or line.startswith(" scaled default") for line in lines)
+    assert f"{found.evaluation.rmse[0].value:.3f}" in str(found) and "Score of the tuned filter" in str(found)
+    assert "\n" not in repr(found) and "\n" not in repr(study)
+    assert str(study).splitlines()[0] == lines[0] and str(study).count(lines[0]) == 1
+    assert all(line in str(study) for line in lines) and html.escape(printed[0]) in study._repr_html_()
+
+
+def lines_of(page):
+    """The lines of Python of a report."""
+    found = page.read_text().split("from filters import EstimateState", 1)[1].split("</pre>", 1)[0]
+    return "from filters import EstimateState" + html.unescape(found)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
+def test_lines_to_copy_name_the_file_that_was_saved_and_run(study, tmp_path):
+    fresh, page, file = replace(study, file=None), tmp_path / "page.html", tmp_path / "motor.json"
+    assert "tuned='TUNED.json'" in lines_of(tuning.report(fresh, page, progress=False).page)
+    fresh.save(file)
+    lines = lines_of(tuning.report(fresh, page, progress=False).page)
+    names = {"measurements": [[1.0]], "inputs": [[0.0]]}
+    exec(compile(lines.replace("'motor.json'", repr(str(file))), "lines to copy", "exec"), names)
+    assert "tuned='motor.json'" in lines and names["tuned"].name == study.choice.name
+    (code,) = [
+        part for part in lines_section(study.choice, SHORT, None).parts if getattr(part, "title", "") == "Python"
+    ]
+    assert "from your_module import problem" in code.text
+
+
 def test_baselines_are_filters_that_go_around_an_env(study):
     filters = study.held_out.filters
     assert list(filters) == list(study.held_out.evaluations)
     q = study.held_out.choices["rule of thumb"].model["process_noise_cov"]
     wrapped = EstimateState(study.problem.make_env(), filter=filters["rule of thumb"])
     np.testing.assert_allclose(wrapped.filter.model.process_noise_cov.diagonal(), q)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
+def test_a_study_in_memory_is_that_of_a_storage_and_goes_on_there(tmp_path, capsys):
+    storage = tmp_path / "studies.journal"
+    options = {"storage": storage, "progress": True}
+    short = tuning.tune(SHORT, trials=2, **options)
+    whole = tuning.tune(SHORT, trials=TRIALS, **options)
+    assert "continues after 2 finished trials" in capsys.readouterr().err
+    alone = tuning.tune(SHORT, trials=2, progress=False)
+    first = [trial.params for trial in alone.trials]
+    assert first == [trial.params for trial in short.trials] == [trial.params for trial in whole.trials[:2]]
+    page = tuning.report(whole.name, tmp_path / "page.html", storage=storage, problem=SHORT, progress=False).page
+    assert "Study &#x27;" not in page.read_text() and page.with_suffix(".md").is_file()
+
+
+def test_results_show_themselves_in_few_words(study):
+    assert repr(study).startswith("Study(ekf on mismatch, 5 trials: score ") and len(repr(study)) < 250
+    found = study.held_out
+    assert repr(found).startswith("HeldOut(ekf on mismatch, 200 held-out seeds: score ") and len(repr(found)) < 150
+    for one in (study, found):
+        text = one._repr_html_()
+        assert text.count("<table") == text.count("</table>") > 1 and "nan" not in text
+    assert "tuned" in study._repr_html_() and "oracle" in found._repr_html_()
 
 
 def test_tables_have_what_is_in_the_values(study):
@@ -123,6 +191,25 @@ def test_a_report_of_a_value_is_that_of_its_file_and_storage(study, tmp_path, mo
     assert page.with_suffix(".md").read_text() == (folder / "ekf-mismatch-seed0.md").read_text()
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
+def test_a_report_of_two_is_that_of_the_command(study, thruster, monkeypatch, tmp_path):  # noqa: F811
+    monkeypatch.setattr("tuning.api.report.run_sections", lambda *_: [])
+    other = tuning.tune("mismatch", filter="kf", trials=1, progress=False)
+    study.save("a.json")
+    other.save("b.json")
+    done = thruster("report", "a.json", "b.json", "--out", "theirs")
+    assert done.returncode == 0, done.stderr
+    mine = tuning.report(["a.json", "b.json"], "mine.html", progress=False).page
+    theirs = tmp_path / "theirs" / "a-beside-b.html"
+    assert mine.read_text() == theirs.read_text()
+    assert mine.with_suffix(".md").read_text() == theirs.with_suffix(".md").read_text()
+    with pytest.raises(ValueError, match=r"two studies must be in one list, but got out=Study\(ekf on mismatch"):
+        tuning.report("b.json", study)
+    values = tuning.report((study, "b.json"), progress=False).page  # what is no file goes into the folder out
+    assert values.as_posix() == "out/ekf-mismatch-seed0-beside-b.html" and "a.json" in values.read_text()
+
+
 def test_ctrl_c_keeps_what_is_finished(monkeypatch):
     from tuning.search import study as module
 
@@ -137,6 +224,28 @@ def test_ctrl_c_keeps_what_is_finished(monkeypatch):
     found = tuning.tune(SHORT, trials=30, progress=False)
     assert found.interrupted and found.result.finished == 3 and "3 trials, interrupted" in repr(found)
     assert found.filter.name == "ekf" and found.held_out.score.value > 0
+
+
+def test_progress_is_silent_where_nobody_looks(capsys):
+    before = optuna.logging.get_verbosity()
+    tuning.tune(SHORT, trials=1)
+    assert capsys.readouterr() == ("", "") and optuna.logging.get_verbosity() == before
+    tuning.tune(SHORT, trials=1, progress=True)
+    assert "tuning ekf on short" in capsys.readouterr().err
+
+
+def test_importing_tuning_is_light_and_says_what_there_is():
+    code = (
+        "import sys, tuning; print([n for n in ('numpy', 'optuna', 'rich') if n in sys.modules], tuning.__all__)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    names = ["SearchSpace", "compare", "estimate", "evaluate", "explore", "export", "find_problem", "fit"]
+    names += ["identify", "read_logs", "report", "train_estimator", "tune", "verify"]
+    assert done.stdout.strip() == f"[] {names}" and set(names) <= set(dir(tuning))
+    with pytest.raises(AttributeError, match="module 'tuning' has no attribute 'tunes'"):
+        tuning.tunes  # noqa: B018
+    for name in filter(str.islower, names):  # functions
+        assert "Args:" in getattr(tuning, name).__doc__ and "tuning." in getattr(tuning, name).__doc__
 
 
 WRONG = [
@@ -171,3 +280,11 @@ def test_errors_state_the_rule_and_the_value(call, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=said):
         call()
+
+
+def test_a_scenario_that_was_changed_has_another_name_in_files(tmp_path):
+    changed = find_problem("nominal").replace(steps=120)
+    found = tuning.tune(changed, trials=1, progress=False)
+    assert found.problem.name == "nominal (changed)" and found.problem.steps == 120
+    file = found.save(tmp_path / "t.json")
+    assert tuning.evaluate(file, seeds=2, progress=False).problem.steps == 120

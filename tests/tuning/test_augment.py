@@ -13,7 +13,7 @@ from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.tuned import read_tuned
 from tuning.policies.setup import make_configuration
 from tuning.problems.assumed import AugmentedProblem, augmented, name_and_unknown, unknowns_of
-from tuning.problems.find import find_problem
+from tuning.problems.find import find_given, find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Parameter
 
@@ -62,6 +62,16 @@ def test_its_model_data_and_score_are_those_of_its_parts():
 )
 def test_a_name_says_which_constants_are_states(text, plain, unknown):
     assert name_and_unknown(text) == (plain, unknown)
+
+
+@pytest.mark.slow
+def test_a_study_is_found_by_its_name_and_estimates_the_flow(study):
+    """On `ambient` the filter does not know the flow: with it as a state the error is significantly lower."""
+    assert find_given(NAME, (), "a study").digest == study.problem.digest
+    plain = tuning.tune("ambient", trials=4, **quiet)
+    both = tuning.compare([study, plain], find_problem("ambient"), seeds=20, **quiet)
+    (board,) = both.boards
+    assert board.rows[1].score_ratio.low > 1.2
 
 
 @pytest.mark.filterwarnings("ignore:.* was tuned for flow")  # the log's thruster is in still water

@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import warnings
 
 import numpy as np
 import optuna
@@ -11,16 +12,23 @@ from optuna.distributions import CategoricalDistribution
 from optuna.trial import TrialState
 from rich.progress import Progress
 
+import tuning
 from filters.registry import FILTERS
+from tuning.api.tune import warn_of_few_trials
 from tuning.cli.main import main
 from tuning.evaluation.baselines import noise_estimated
-from tuning.problems.model_problem import RunsProblem
+from tuning.evaluation.held_out import evaluate_held_out
+from tuning.evaluation.tuned import write_tuned
+from tuning.problems.excitation import Steps
+from tuning.problems.model_problem import ModelProblem, RunsProblem
 from tuning.reporting.sections import trials_of_type
 from tuning.search import trials as tuning_trials
 from tuning.search.among_types import (
     ESTIMATED,
     ESTIMATED_Q,
+    NEAR_BEST,
     RESCALED,
+    SMALLER,
     TRANSFERRED,
     UNTUNED,
     filter_types_tried,
@@ -71,6 +79,13 @@ def test_the_kinds_are_all_filters_with_a_covariance_the_ekf_first():
     assert set(AUTO_FILTER_TYPES) == {name for name, kind in FILTERS.items() if kind.has_covariance}
 
 
+def test_a_filter_that_a_model_does_not_allow_is_left_out():
+    model = MISMATCH.model().replace(operating_state=None, operating_input=None, operating_points=None)
+    plan = PLAN._replace(scenarios=(ModelProblem(model, inputs=Steps(12.0), steps=60),))
+    assert set(AUTO_FILTER_TYPES) - set(plan.filter_types) == {"kf", "kf-steady"}
+    assert PLAN.filter_types == AUTO_FILTER_TYPES
+
+
 @pytest.mark.parametrize("kind", AUTO_FILTER_TYPES)
 def test_a_choice_of_any_kind_survives_its_trial_parameters(kind):
     space, choice = joint_distributions(AUTO_FILTER_TYPES, MISMATCH), untuned_choice(kind, MISMATCH)
@@ -108,6 +123,14 @@ def test_each_kind_is_tried_with_the_noise_that_true_states_show(priced):
     assert trials[1].user_attrs[RESCALED] == 1  # before the next kind is begun
 
 
+def test_kinds_that_were_not_begun_are_begun_by_whoever_goes_on(priced):
+    storage = optuna.storages.InMemoryStorage()
+    for count in range(1, 11):
+        trials = run_study(open_study("s", PLAN, storage), PLAN, count).trials
+    assert [one.user_attrs[ESTIMATED_Q] for one in trials if ESTIMATED_Q in one.user_attrs] == list(FEW)
+    assert RESCALED in trials[1].user_attrs
+
+
 def test_on_recorded_runs_each_kind_begins_with_the_likeliest_noise(priced):
     model = MISMATCH.model()
     data = MISMATCH.data(range(5))
@@ -139,6 +162,14 @@ def test_what_is_over_the_budget_ends_at_once_and_never_wins(priced):
     assert {t.params[FILTER_TYPE] for t in trials_of_type(result.trials, "kf")} == {"kf"}
 
 
+def test_a_filter_over_the_budget_is_tried_with_fewer_members(priced):
+    result = studied(PLAN, 12)
+    untuned = next(trial for trial in result.trials if trial.params[FILTER_TYPE] == "enkf")
+    (smaller,) = [trial for trial in result.trials if SMALLER in trial.user_attrs]  # none for pf: 200 are too many
+    assert smaller.user_attrs[SMALLER] == untuned.number and smaller.params["enkf N"] == 18
+    assert {**smaller.params, "enkf N": 30} == untuned.params and not is_over_budget(smaller)
+
+
 def test_other_kinds_inherit_the_noise_of_the_best_one(priced):
     result = studied(PLAN._replace(budget=30.0), 17)  # a round of four types leaves two
     heirs = [trial for trial in result.trials if TRANSFERRED in trial.user_attrs]
@@ -147,6 +178,14 @@ def test_other_kinds_inherit_the_noise_of_the_best_one(priced):
     kinds = [trial.params[FILTER_TYPE] for trial in heirs]
     assert len(kinds) == 1 and best.params[FILTER_TYPE] not in kinds and heirs[0].number > len(FEW)
     assert all(trial.params[key] == best.params[key] for trial in heirs for key in ("Q11", "Q22", "R"))
+
+
+@pytest.mark.slow
+def test_a_budget_holds_one_kind_too_and_no_size_goes_beyond_it(priced):
+    plan = Plan("enkf", (MISMATCH,), budget=1.0)
+    result = studied(plan, 15)
+    assert result.choice.numbers["ensemble_size"] <= 20 and max(row.size for row in result.sizes) <= 20
+    assert filter_types_tried(result.trials) == []
 
 
 def test_a_budget_that_nothing_keeps_is_one_clear_line(priced):
@@ -208,6 +247,33 @@ def test_the_best_third_of_the_types_rounded_up_goes_on_with_twice_as_many_trial
     assert set(race_of(two, [finished(i, name, [1.0]) for i, name in enumerate(FEW)]).running) == set(FEW)
 
 
+def test_trials_after_the_first_are_of_the_types_in_the_race(priced):
+    result = studied(PLAN._replace(prune=False), 26)
+    for trial in result.trials[10:]:
+        before = [one for one in result.trials if one.number < trial.number]
+        enqueued = {UNTUNED, ESTIMATED_Q, ESTIMATED, TRANSFERRED, RESCALED, SMALLER} & trial.user_attrs.keys()
+        assert enqueued or trial.params[FILTER_TYPE] in race_of(PLAN, before).running
+    late = [trial.params[FILTER_TYPE] for trial in result.trials[18:]]
+    assert len(set(late)) <= 2 and any(NEAR_BEST in trial.user_attrs for trial in result.trials[10:])
+
+
+def test_without_a_budget_auto_has_a_default_one_and_few_trials_are_warned_of(monkeypatch, priced):
+    plans = []
+    monkeypatch.setattr("tuning.api.tune.run_tuning", lambda plan, *others, **named: plans.append(plan))
+    with pytest.warns(UserWarning, match="no budget .* may take 10 microseconds of one core, the default of 2 st"):
+        tuning.tune(MISMATCH, "auto", progress=False)
+    tuning.tune(MISMATCH, "auto", budget=3.0, progress=False)
+    tuning.tune(MISMATCH, "auto", objective=["score", "cost"], progress=False)
+    tuning.tune(MISMATCH, "ekf", progress=False)
+    assert [plan.budget for plan in plans] == [10.0, 3.0, None, None]
+    with pytest.warns(UserWarning, match="7 trials are fewer than 5 for each of 4 filter types: --trials 20"):
+        warn_of_few_trials(PLAN, 7)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_few_trials(PLAN, 20)
+        warn_of_few_trials(Plan("ekf", (MISMATCH,)), 1)
+
+
 @pytest.mark.parametrize(
     ("change", "rule"),
     [
@@ -223,6 +289,16 @@ def test_the_best_third_of_the_types_rounded_up_goes_on_with_twice_as_many_trial
 def test_a_plan_that_cannot_work_is_refused(change, rule):
     with pytest.raises(ValueError, match=rule):
         open_study("s", PLAN._replace(**change), optuna.storages.InMemoryStorage())
+
+
+def test_budget_and_kinds_belong_to_the_identity(monkeypatch):
+    storage = optuna.storages.InMemoryStorage()
+    open_study("s", PLAN, storage)
+    with pytest.raises(ValueError, match="must be for {'budget': 2.0}, but it was made for {'budget': 1.0}"):
+        open_study("s", PLAN._replace(budget=2.0), storage)
+    monkeypatch.setattr("tuning.search.plan.AUTO_FILTER_TYPES", FEW)
+    with pytest.raises(ValueError, match="must be for {'kinds': .*'pf'"):
+        open_study("s", PLAN, storage)
 
 
 def test_cost_is_of_one_core_and_grows_with_the_ensemble():
@@ -263,3 +339,13 @@ def test_the_command_says_which_filters_it_tried_and_reports_on_the_winner(price
     assert again["trials"] == content["study"]["trials"]
     assert "tuned on mismatch" in run("report", f"out/{name}.json") + (tmp_path / f"out/{name}.md").read_text()
     assert "Filters that were tried" in (tmp_path / f"out/{name}.html").read_text()
+
+
+@pytest.mark.parametrize("method", ["tpe", "gradient"])
+def test_the_tuned_file_says_what_made_the_choice(tmp_path, method):
+    plan, path = Plan("ekf", (MISMATCH,)), tmp_path / "t.json"
+    result = studied(plan, 1)
+    write_tuned(path, plan, result, [evaluate_held_out(result.choice, MISMATCH, 0, 2)], "s", method)
+    study = json.loads(path.read_text())["study"]
+    assert study["method"] == method
+    assert study["best_training_value"] == (result.best_value if method == "tpe" else None)

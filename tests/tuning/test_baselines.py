@@ -1,12 +1,17 @@
 """Baselines: what was given, the rule of thumb, the scaled default, noise estimation and the oracle."""
 
+import json
+
 import numpy as np
 import pytest
 
+from filters import make_filter, run
+from filters.consistency.nees import Interval
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
 from tests.models import wide_model
 from tests.small_problems import UNITS, pair, thruster
+from thruster_env.core.compiled import interpreted
 from tuning.evaluation.baselines import (
     GIVEN,
     NOISE,
@@ -23,15 +28,17 @@ from tuning.evaluation.baselines import (
     oracle,
     rule_label,
     rule_of_thumb,
+    same_filter,
 )
 from tuning.evaluation.compare import contender
-from tuning.evaluation.held_out import evaluate_held_out
+from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.held_out import Comparison, evaluate_held_out, summarised, summary
 from tuning.evaluation.residuals import noise_estimation, residuals
-from tuning.evaluation.worth import tuning_effect
+from tuning.evaluation.worth import gain, tuning_effect, warnings_of
 from tuning.experiments import lorenz63
 from tuning.experiments.benchmark import noise_free_problem
 from tuning.problems.problem import Parameter
-from tuning.reporting.choice_words import gains
+from tuning.reporting.choice_words import consistency_sentence, gains
 from tuning.search.parameters import correlations_of, full_covariance
 
 
@@ -104,6 +111,52 @@ def test_noise_estimation_finds_the_noise_of_a_simulation_and_what_a_model_lacks
     assert noise_estimation(LinearProblem(truth=False)).reason == "there is no truth"
 
 
+def test_a_headline_warns_of_a_nees_that_is_more_than_a_factor_of_three_off():
+    problem = LinearProblem(2, 2, scale=(0.3, np.inf))
+    data = problem.data(range(8))
+    noise = {"process_noise_cov": (2e-4, 2e-4), "measurement_noise_cov": (1e-3, 1e-3)}
+    with interpreted():
+        filters = [make_filter("kf", problem.model(**one)) for one in ({}, noise)]
+        good, bad = (evaluate(one, data, problem.scale) for one in filters)
+        found = run(filters[1], data.filter_keys, data.inputs, data.measurements)
+    errors, variances = (found.means - data.states)[:, 10:], np.einsum("btii->bti", found.covs)[:, 10:]
+    np.testing.assert_allclose(bad.state_nees, (errors**2 / variances).mean((0, 1)), rtol=1e-12)
+    assert warnings_of(good, problem) == [] and list(bad.scored_nees) == ["p [m]"]
+    (said,) = warnings_of(bad, problem)
+    assert said.startswith("Do not rely on the covariance, it is too small for p [m] (mean NEES ")
+    assert " where 1 is right) and too small jointly (" in said and said.endswith(" where 2 is right).")
+    singular = bad._replace(nees=Interval(219381.0, 0.0, 0.0), state_nees=np.array([1.2, 0.9]))
+    assert warnings_of(singular, problem) == [
+        "Do not rely on the covariance, it is too small jointly (219381 where 2 is right): each variance is about "
+        "right, but P is nearly singular, or its correlations are wrong."
+    ]
+    mixed = bad._replace(nees=Interval(4.9, 4.7, 5.1), state_nees=np.array([0.2, 0.9]))
+    assert warnings_of(mixed, problem) == [
+        "Do not rely on the covariance, it is too large for p [m] (mean NEES 0.2 where 1 is right) and too small "
+        "jointly (4.9 where 2 is right): its correlations are wrong, too."
+    ]
+    wide = bad._replace(nees=Interval(2.0, 1.8, 2.2), state_nees=np.array([0.2, 3.5]), scale=np.ones(2))
+    (said,) = warnings_of(wide, problem)
+    assert "(mean NEES 3.5 where 1 is right) and too large for p [m] (mean NEES 0.2 where 1 is right)." in said
+    comparison = Comparison(wide, wide, None, np.ones(2), range(8))
+    assert consistency_sentence(comparison).startswith("Consistent jointly, but not in each state: mean NEES 2 [")
+    again = summarised(json.loads(json.dumps(summary(bad))), problem)
+    assert warnings_of(again, problem) == warnings_of(bad, problem)
+    old = {name: value for name, value in summary(bad).items() if name != "state_nees"}
+    assert "of p" not in warnings_of(summarised(old, problem), problem)[0]
+
+
+def test_a_score_that_falls_to_a_small_part_is_a_factor_and_no_percentage():
+    small = Interval(0.004, 0.003, 0.005)
+    assert gain(small, 8) == "lowers the score by a factor of 250 [200, 333]"
+    assert gain(Interval(40.0, 30.0, 50.0), 8) == "raises the score by a factor of 40 [30, 50]"
+    assert gain(Interval(0.4, 0.3, 0.5), 8) == "lowers the score by 60 % [50, 70]"
+    comparison = evaluate_held_out(rule_of_thumb("kf", LinearProblem()), LinearProblem(), 0, 4)
+    ratios = dict.fromkeys(comparison.ratios, small)
+    said = gains(comparison._replace(stored_ratios=ratios), "seeds")[0]
+    assert "Tuning lowers the error by a factor of 250 [200, 333] against the " in said
+
+
 def test_noise_estimation_gives_no_noise_to_a_model_whose_residuals_are_rounding():
     quiet = noise_free_problem(lorenz63.model(), steps=40, first_scored_step=10, scale=[1.0] * 3)
     assert noise_estimated("ekf", quiet).model["process_noise_cov"] == (0.0, 0.0, 0.0)
@@ -129,3 +182,10 @@ def test_correlations_of_a_singular_covariance_are_none():
     np.testing.assert_allclose(full_covariance(np.diag(singular), correlations_of(singular)), singular, rtol=1e-2)
     regular = np.array([[2.0, 0.3, -0.1], [0.3, 1.0, 0.4], [-0.1, 0.4, 0.5]])
     np.testing.assert_allclose(full_covariance(np.diag(regular), correlations_of(regular)), regular, rtol=1e-12)
+
+
+def test_equal_filters_are_known_as_equal():
+    one = rule_of_thumb("kf", LinearProblem())
+    assert same_filter(one, rule_of_thumb("kf", LinearProblem())) and not same_filter(
+        one, one._replace(name="ekf")
+    )

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 import tuning
+from filters import make_filter
 from filters.consistency.nees import blow_up_sentence, root_mean_square
+from filters.consistency.report import sentences
 from thruster_env.model.affine import affine_model
+from tuning.evaluation.evaluate import check_consistency
 from tuning.problems.model_problem import RunsProblem
 from tuning.reporting.tuning_report import as_json, report
 
@@ -33,6 +36,15 @@ def test_a_study_of_a_model_that_blows_up_names_substeps_and_dt_and_not_more_tri
     assert "diverges between samples" in said and "more substeps" in said and "dt = 0.1 s" in said
     assert "More trials" not in said and "What may help" not in said
     assert as_json(study)["blows_up"][0].startswith("The model diverges between samples: its prediction of")
+
+
+@pytest.mark.parametrize("factor", [-3e4, 0.9])
+def test_the_advice_of_the_page_is_substeps_where_it_blows_up_and_noise_elsewhere(factor):
+    mine = problem(factor)
+    data = mine.data(range(9))
+    said = sentences(check_consistency(make_filter("kf", model(factor, 1e-4)), data, mine.dt))[-1]
+    assert ("more substeps" in said and "dt = 0.1 s" in said and "raise" not in said) == (factor < 0)
+    assert ("raise R" in said or "raise Q" in said) == (factor > 0)
 
 
 def test_a_prediction_a_thousand_spreads_off_is_a_blow_up_and_numbers_beyond_all_too():

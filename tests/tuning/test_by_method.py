@@ -21,7 +21,7 @@ from tuning.methods.task import Budget, Task
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import RunsProblem
 from tuning.search.objectives import reported, reported_name
-from tuning.search.plan import TRAINING_SEEDS
+from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import given_choice, untuned_choice
 
 SHORT = find_problem("nominal").replace(steps=70, name="short")
@@ -70,6 +70,66 @@ def test_what_a_method_lacks_is_said_in_one_line(problem, options, words):
     with pytest.raises(ValueError, match=words) as said:
         tuning.tune(problem, **{"filter": "ekf", **options}, trials=3, progress=False)
     assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize(("method", "former"), [("likelihood", "likelihood"), ("random-only", "random")])
+def test_a_journal_that_says_way_is_continued(tmp_path, monkeypatch, as_python, method, former):
+    """As `tune` wrote it before methods had one name."""
+    problem, storage = singular(first_scored_step=50), tmp_path / "studies.journal"
+    options = {"filter": "kf", "trials": 2, "progress": False, "storage": storage, "method": method}
+    plan = Plan("kf", (problem,), objectives=("likelihood",))
+    with monkeypatch.context() as before:
+        before.setattr(tune, "ANSWER", "answer of the way")
+        name = f"{tune.name_of(plan)}-way-{former}"
+        first = tuning.tune(problem, name=name, **options)
+    monkeypatch.setattr(tune, "Task", None)  # nothing is run again
+    again = tuning.tune(problem, **options)
+    assert same_filter(again.choice, first.choice) and again.name == name
+    assert again.answer.runs == first.answer.runs
+
+
+def test_former_names_are_answered_with_those_of_today(thruster):  # noqa: F811
+    for command, name in (
+        (("tune", "--way", "em"), "--method"),
+        (("tune", "--sampler=gp"), "--method"),
+        (("ways",), "'methods'"),
+        (("study", "methods"), "'reproduce'"),
+    ):
+        refused = thruster(*command)
+        assert refused.returncode == 2 and refused.stderr.strip().endswith(f"Did you mean {name}?")
+        assert refused.stderr.count("\n") == 1
+
+
+def test_a_study_cannot_be_run_on_a_task():
+    problem = singular()
+    with pytest.raises(ValueError, match="a study must be run by tuning.tune"):
+        find_method("tpe").run("tpe", Task("kf", problem, problem.data([0])))
+
+
+def test_an_unknown_method_is_refused_in_one_line(thruster):  # noqa: F811
+    unknown = thruster("methods", "magic")
+    assert unknown.returncode == 2 and "method must be one of" in unknown.stderr and "'magic'" in unknown.stderr
+
+
+@pytest.mark.slow
+def test_the_command_follows_a_method(as_json, thruster):  # noqa: F811
+    told = as_json("tune", "--filter", "enkf", "--problem", "nominal", "--method", "desroziers", "--trials", 4)
+    assert told["method"]["name"] == "desroziers"
+    assert told["method"]["runs"] % 32 == 0 and told["method"]["runs"] > 4 * 32
+    assert told["file"].endswith("enkf-nominal-seed0-method-desroziers.json") and told["trials"] <= 4
+    assert "true states" in thruster("methods").stdout
+    shown = thruster("methods", "EM").stdout
+    assert "Shumway" in shown and "dlog L/dq" in shown
+
+
+@pytest.mark.slow
+def test_gradients_of_full_matrices_begin_at_noise_estimation():
+    study = tuning.tune(
+        "deadband", "ekf", method="log-score", space=tuning.SearchSpace(full_q=True), trials=6, progress=False
+    )
+    ratios = study.held_out.ratios
+    assert ratios["noise estimation"].high < 0.85 and ratios["scaled default"].high < 0.5
+    assert study.held_out.evaluation.nees.value == pytest.approx(2.0, rel=0.1)
 
 
 def test_ctrl_c_ends_a_method_with_what_it_has_found(monkeypatch, tmp_path):

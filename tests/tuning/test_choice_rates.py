@@ -17,6 +17,7 @@ from docs.scripts.tuning_choice import (
 from filters.consistency.nees import Interval
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
+from tuning.evaluation.baselines import RULE
 from tuning.search.measures import Measured, Runs, logs_with_loss, over, signed_rank
 from tuning.search.plan import HELD_OUT_SEEDS, VALIDATION_SEEDS, Plan
 from tuning.search.space import untuned_choice
@@ -157,6 +158,26 @@ def test_what_suits_one_log_alone_is_not_taken():
     assert logs_with_loss(*_blocks(rest, noise[1] - 30.0), ratio=False) == []
 
 
+def test_of_the_worst_problem_alone_runs_are_compared():
+    generator = np.random.default_rng(2)
+    easy, hard = generator.exponential(size=(2, 30)) + [[0.1], [5.0]]
+
+    def filter_(a, b):
+        parts = [measured_of(some, True) for some in (a, b)]
+        return Measured(
+            parts[1].value,
+            (parts[1].left_out[0],) * 2,
+            0.0,
+            (1.0,),
+            runs=(*parts[0].runs, *parts[1].runs),
+            decisive=(1,),
+        )
+
+    one, other = filter_(easy * 4.0, hard * 0.8), filter_(easy, hard)
+    assert signed_rank(one, other, ratio=True) < 1e-5
+    assert signed_rank(one._replace(decisive=(0, 1)), other, ratio=True) > 0.1
+
+
 @pytest.mark.parametrize(("heavy", "time"), [(False, 60.0), (True, 240.0)])
 def test_dependent_blocks_do_not_pass_for_so_many_independent_ones(heavy, time):
     all_blocks, apart, _, chosen = choice_size(time, heavy, 400)
@@ -170,3 +191,18 @@ def test_a_filter_that_fails_in_one_place_is_replaced_and_one_that_is_right_stay
     assert rates.changed > 75.0 and rates.false_changes <= 100.0 / 40 * binom.isf(LEVEL, 40, 0.01)
     for case, truth in ((CASES[10], False), (TRUTH_CASES[2], True)):
         assert case_rates(case, truth, 40).changed <= 100.0 / 40 * binom.isf(LEVEL, 40, 0.04)
+
+
+@pytest.mark.parametrize(("gain", "least", "most"), [(0.0, 0.0, 0.06), (1.5, 0.95, 1.0), (-1.5, 0.0, 0.001)])
+def test_few_validation_blocks_are_helped_by_training_where_a_baseline_was_not_fitted(gain, least, most):
+    generator, studies, taken = np.random.default_rng(11), 200, 0
+    for _ in range(studies):
+        rule, given = {}, {}
+        for part, blocks in (("training", 20), ("validation", 6)):
+            rule[part], given[part] = _blocks(generator.standard_normal(blocks) * 3.0 - 3.0 * gain)
+        fitted = Choosing(plan_of(False), {GIVEN: given["validation"], RULE: rule["validation"]}, {}, {})
+        pair = {GIVEN: given["training"], RULE: rule["training"]}
+        choosing = Choosing(plan_of(False), {GIVEN: given["validation"], RULE: rule["validation"]}, {}, pair)
+        assert choosing.baseline == RULE or fitted.baseline == GIVEN
+        taken += choosing.baseline == RULE
+    assert binom.ppf(LEVEL, studies, least) <= taken <= binom.isf(LEVEL, studies, most)

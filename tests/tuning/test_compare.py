@@ -14,12 +14,14 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.core.executors import IN_PROCESS, task_map
 from thruster_env.model.affine import affine_model
 from tuning.cli.main import main
-from tuning.evaluation.compare import Leaderboard, Row, compare, contender, winners
+from tuning.evaluation.compare import Leaderboard, Row, compare, contender, sized, winners
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import write_tuned
+from tuning.problems.assumed import beliefs_of, default_belief
 from tuning.problems.data import held_out_seeds
 from tuning.problems.model_problem import ModelProblem
+from tuning.reporting.leaderboard import belief_sentences
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import StudyResult
@@ -71,6 +73,24 @@ def test_an_augmented_filter_is_judged_by_the_plant_s_states():
     assert board.rows[1].evaluation.nees.value < board.rows[0].evaluation.nees.value
 
 
+def test_what_is_believed_by_default():
+    assert default_belief("ambient_velocity", 0.0) == Unknown(0.5, 0.01)
+    assert default_belief("load_gain", -20.0) == Unknown(4.0, pytest.approx(0.08))
+    with pytest.raises(ValueError, match="the assumed asymmetry, .* must be positive, but got 0.0"):
+        default_belief("asymmetry", 0.0)
+
+
+def test_beliefs_are_said_with_their_numbers():
+    constants = NOMINAL.model().constants
+    found = beliefs_of(constants, {"load_gain": None, "ambient_velocity": Unknown(0.4, 0.01)})
+    first, second = belief_sentences([SimpleNamespace(beliefs=found)])
+    gain = constants.load_gain
+    assert first.startswith(
+        f"load_gain has a prior mean of {gain:.4g}, a standard deviation of {gain / 5:.3g} and"
+    )
+    assert "has a prior mean of 0, a standard deviation of 0.4 and a random walk of 0.01 per step" in second
+
+
 def scored(mean_squares, first=None):
     """A row and the first one, with these mean square errors by run."""
     one = EVALUATION._replace(mean_squares=np.array(mean_squares)[:, None], scale=np.ones(1), states=())
@@ -94,6 +114,12 @@ def test_a_verdict_says_how_much_it_is_worth(squares, said):
     first = scored(np.ones(30))
     board = Leaderboard(NOMINAL, range(30), np.ones(1), [first, scored(squares, first)])
     assert winners(board) == f"By the score on nominal, {said}"
+
+
+def test_a_size_is_for_filters_that_have_an_ensemble():
+    assert sized(oracle_choice("ekf", NOMINAL), 50) == oracle_choice("ekf", NOMINAL)
+    assert sized(oracle_choice("enkf", NOMINAL), 50).numbers["ensemble_size"] == 50
+    assert sized(oracle_choice("enkf", NOMINAL), None).numbers["ensemble_size"] == 30
 
 
 @pytest.mark.parametrize(
@@ -173,6 +199,19 @@ def test_the_command_ranks_filters_on_scenarios(thruster, tmp_path):
     assert len(row["rmse_over_first"]) == 2 and row["microseconds_a_step"] > 0
 
 
+@pytest.mark.slow
+def test_the_command_takes_sizes_augmentation_and_scenario_files(thruster, tmp_path):
+    (tmp_path / "my.toml").write_text('base = "ambient"\nsteps = 100\nscale = [1.0, 0.05]\n')
+    options = ("--filter", "ekf", "--filter", "enkf", "--filter", "low-pass", "--ensemble-size", "enkf=12")
+    code, out, _ = thruster(
+        *options, "--augment", "ambient_velocity:0.4:0.01", "--scenario", "my.toml", "--seeds", 4, "--json", "-"
+    )
+    labels = ["ekf", "ekf + U_0", "enkf 12", "enkf 12 + U_0", "low-pass"]
+    filters = json.loads(out)["scenarios"]["my.toml"]["filters"]
+    assert code == 0 and list(filters) == labels
+    assert filters["low-pass"]["nees"] is None and filters["low-pass"]["median_nees"] is None
+
+
 def test_the_command_takes_tuned_files(thruster, tmp_path):
     scenario = find_scenario("mismatch")
     choice = untuned_choice("enkf", scenario)
@@ -245,3 +284,8 @@ def test_by_default_a_filter_without_a_scaled_default_has_what_its_model_came_wi
 def test_a_users_mistake_is_one_clear_line_and_exit_code_2(arguments, line, thruster):
     code, _, errors = thruster(*arguments)
     assert code == 2 and line in errors and "Traceback" not in errors
+
+
+def test_help_teaches_by_an_example(thruster):
+    code, out, _ = thruster("--help")
+    assert code == 0 and "Example: thruster compare --filter ekf" in " ".join(out.split())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run
-from filters.consistency.nees import Interval, gaussian_crps, mean_interval, normalized_squares
+from filters.consistency.nees import Interval, gaussian_crps, mean_interval, normalized_squares, rmse_ratios
 from filters.consistency.report import (
     comparison_sentence,
     confidence,
@@ -21,9 +21,11 @@ from filters.engine.batch import Estimates
 from filters.ensembles.square_root import Members, record_members
 from tests.models import scalar_model
 from thruster_env.core.compiled import interpreted
+from thruster_env.core.files import save_figure
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
 from tuning.problems.data import held_out_seeds
+from tuning.reporting.search_figures import draw_consistency
 from tuning.thruster.scenario import find_scenario
 
 
@@ -112,6 +114,20 @@ def test_missing_measurements_lower_the_right_mean_of_no_check(scalar_truth):
         estimates = run(KalmanFilter(model=scalar()), *given)
     report = consistency_report(estimates, scalar_truth.states, measurements)
     assert report.nis.dimension == 1 and report.nis.mean.covers(1.0) and report.whiteness.p_value > 0.01
+
+
+def test_a_report_refuses_what_does_not_fit(scalar_truth):
+    with interpreted():
+        estimates = run(
+            KalmanFilter(model=scalar()), np.zeros((40, 2)), np.zeros((40, 150, 0)), scalar_truth.measurements
+        )
+    with pytest.raises(ValueError, match="states must have the shape of the estimates"):
+        consistency_report(estimates, scalar_truth.states[:, 1:])
+    one = Estimates(*(part[:1] for part in estimates))
+    with pytest.raises(ValueError, match="at least two runs"):
+        consistency_report(one, scalar_truth.states[:1])
+    with pytest.raises(ValueError, match="names must be 1, one a state"):
+        consistency_report(estimates, scalar_truth.states, names=("a", "b"))
 
 
 def test_recorded_members_are_those_of_the_run(scalar_truth):
@@ -204,3 +220,29 @@ def test_an_ensemble_s_overconfidence_shrinks_like_one_over_its_size(nominal):
     assert 0.06 < excess[1] < 0.16  # about 2.11 at N = 100
     slope = np.polyfit(np.log(sizes), np.log(excess), 1)[0]
     assert -1.5 < slope < -0.7
+
+
+@pytest.mark.parametrize("kind", ["exact", "ensemble", "without covariance"])
+def test_the_figure_is_drawn(scalar_truth, kind, tmp_path):
+    report = exchangeable(size=30, runs=20) if kind == "ensemble" else scalar_report(scalar_truth)
+    if kind == "without covariance":
+        nothing = Estimates(
+            scalar_truth.states + 1.0,
+            np.zeros((40, 151, 1, 1)),
+            np.zeros((40, 151, 1)),
+            np.zeros((40, 151, 1, 1)),
+            np.zeros((40, 151)),
+            np.zeros(40),
+        )
+        report = consistency_report(nothing, scalar_truth.states)
+        assert sentences(report) == [
+            "No NEES: the filter gives no covariance, or a singular one.",
+            "No NIS: the filter gives no covariance, or a singular one.",
+            "No test of whiteness: the filter gives no innovation covariance, or nothing was measured.",
+            "No run diverged.",
+        ]
+        with pytest.raises(ValueError, match="needs something to draw"):
+            save_figure(draw_consistency(report, "a title"), tmp_path / "none.png")
+    ratios = {"one\nover other": rmse_ratios(np.ones((40, 1)), np.full((40, 1), 2.0))}
+    path = save_figure(draw_consistency(report, "a title", ratios), tmp_path / "new" / "calibrated.png")
+    assert path.read_bytes().startswith(b"\x89PNG")

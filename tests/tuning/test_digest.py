@@ -38,6 +38,13 @@ def of_text(*changes):
     return names["problem"]
 
 
+def swing_beyond(x, u, c):
+    """Another swing where no run comes and no fixed point lies."""
+    if 60.0 < x[1] < 70.0:
+        return (0.0, 0.0)
+    return pendulum_problem.swing(x, u, c)
+
+
 def runs(sample=0.0):
     """Recorded runs of the pair's model, of which one has another sample."""
     data = pair().data(range(6))
@@ -92,6 +99,12 @@ def test_the_digest_is_of_numbers_and_not_of_how_they_are_written():
     command = "from tuning.cli.templates.env import problem; print(problem.digest)"
     done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == digests["the same"], "in another process, and compiled"
+
+
+def test_it_misses_what_neither_the_runs_nor_the_fixed_points_reach():
+    assert pendulums(model(transition=swing_beyond)).digest == pendulums(model()).digest
+    wrong = model(transition_jacobian=lambda x, u, c: ((1.0, 0.0), (0.0, 1.0)))
+    assert pendulums(wrong).digest == pendulums(model()).digest
 
 
 def test_rounding_is_no_other_number():

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from filters import EstimateState, StateSpaceModel
+from tests.pendulum_problem import model as pendulum_model
+from tests.thruster_env.core.test_streams import largest_correlation
 from thruster_env.env.model_env import ModelEnv
 from tuning.problems.env_problem import EnvProblem
 
@@ -67,6 +69,13 @@ def test_random_actions_are_not_the_noise_of_the_env():
     assert abs(np.corrcoef(u.ravel(), w.ravel())[0, 1]) < BAND / np.sqrt(ENTRIES)
     gain = np.vdot(u, u + w) / np.vdot(u, u)  # which was 2 on the same stream
     assert gain == pytest.approx(1.0, abs=BAND / np.sqrt(ENTRIES))
+
+
+def test_random_actions_are_not_the_first_state_of_a_pendulum():
+    pendulum = EnvProblem("Pendulum-v1", "random", pendulum_model(), steps=60, state_of=lambda env: env.state)
+    data = pendulum.data(range(100))
+    first = np.column_stack([data.states[:, 0], data.inputs[:, :2, 0]])
+    assert largest_correlation(first.T) < BAND / np.sqrt(len(first))
 
 
 def test_each_pair_of_streams_of_a_run_is_uncorrelated():

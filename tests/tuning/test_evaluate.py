@@ -10,6 +10,7 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.model import simulate
 from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
 from tuning.evaluation.held_out import summary
+from tuning.evaluation.runs import _means_over_steps
 from tuning.problems import data as in_parts
 from tuning.problems.data import held_out_seeds
 from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
@@ -112,6 +113,13 @@ def test_a_choice_survives_its_trial_parameters(nominal):
     assert again == choice
 
 
+def test_bad_scales_and_unequal_seeds_are_refused(nominal, data, ekf):
+    with pytest.raises(ValueError, match="scale must be positive in every state, but got"):
+        evaluate(oracle_choice("ekf", nominal).filter(nominal), data, [1.0, 0.0])
+    with pytest.raises(ValueError, match="same seeds, but got 200 and 199"):
+        score_ratio(ekf, ekf._replace(mean_squares=ekf.mean_squares[1:]))
+
+
 def test_normalized_squares_against_inverses_and_skip_singular_covariances():
     rng = np.random.default_rng(0)
     roots = rng.normal(size=(50, 3, 3))
@@ -178,6 +186,14 @@ def test_on_the_thruster_the_bound_is_the_naive_recursion_on_the_same_truths():
             np.testing.assert_allclose(bound[b, k + 1], np.linalg.inv(j), rtol=1e-8)
 
 
+def test_the_bound_starts_from_a_prior_without_spread_and_refuses_a_singular_q():
+    model = affine_model(**LINEAR, prior_cov=[0.0, 0.0])
+    bound = posterior_bound(model, np.zeros((1, 3, 1)), truths=2)[0]
+    assert (bound[0] == 0).all() and np.linalg.eigvalsh(bound[1])[0] > 0
+    with pytest.raises(ValueError, match="positive definite Q, but got"):
+        posterior_bound(model.replace(process_noise_cov=[1.0, 0.0]), np.zeros((1, 3, 1)))
+
+
 @pytest.mark.filterwarnings("error")
 def test_many_states_are_whitened_as_few_are():
     rng = np.random.default_rng(5)
@@ -194,3 +210,9 @@ def test_many_states_are_whitened_as_few_are():
     errors[2], covs[2] = 1e200, 1e300 * covs[2]
     found = normalized_squares(errors, covs)
     assert np.isnan(found[1, 2]) and np.isfinite(found[:2]).sum() == 7
+
+
+@pytest.mark.parametrize("shape", [(5, 7, 1), (5, 451, 2), (3, 40, 12), (1, 9, 2)])
+def test_means_over_steps_are_numpys_to_the_last_bit(shape):
+    values = np.random.default_rng(0).lognormal(sigma=3.0, size=shape)
+    assert np.array_equal(_means_over_steps(values), values.mean(axis=1))

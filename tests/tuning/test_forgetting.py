@@ -14,17 +14,22 @@ from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.text_tables import plain_text
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.evaluation.baselines import rule_of_thumb
+from tuning.evaluation.baselines import baselines, rule_of_thumb, same_filter
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.tuned import read_tuned
-from tuning.evaluation.worth import memory_sentence, warnings_of
+from tuning.evaluation.worth import memory_sentence, slowest_sentence, warnings_of
 from tuning.problems.assumed import augmented
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem, log_of
+from tuning.reporting.choice_words import choice_sentences
+from tuning.reporting.leaderboard import report as leaderboard_report
 from tuning.reporting.subject import _plan
 from tuning.reporting.tuning_report import as_json, report, way_out
+from tuning.search.measures import measured, over
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, forgetting, time_constants_on, untuned_choice, with_oracle_and_advice
+from tuning.search.study import open_study, run_study
+from tuning.search.validation import as_data as as_data_of_choice
 from tuning.search.validation import choice_from
 
 DT, STEPS, FORGET = 0.05, 200, 0.5
@@ -209,6 +214,33 @@ def test_all_that_is_chosen_among_forgets_in_time_and_the_plan_is_kept(studies, 
     assert choice_from(awake.result.choice._asdict()) == awake.choice
 
 
+def test_the_numbers_on_validation_seeds_are_those_of_the_filter_that_is_handed_out():
+    with interpreted():
+        problem = spring(lambda x, c: (x[0] ** 2,))
+        plan = Plan("ekf", (problem,), full_q=True, forget=0.1)
+        result = run_study(open_study("forgets", plan), plan, 3)
+        met, data = result.validation, plan.validation_data()
+        chosen, baseline = met.named(met.chosen), met.named(met.baseline)
+        assert chosen.choice == result.choice
+        exact = {entry.name: measured(entry.choice, plan, data) for entry in (chosen, baseline)}
+        for entry in (chosen, baseline):
+            assert DT * time_constants_on(entry.choice.filter(problem), problem).steps[0] <= 0.1
+            assert entry.value == exact[entry.name].value
+        assert chosen.over == over(exact[chosen.name], exact[baseline.name], ratio=True)
+        assert baseline.raised and not same_filter(baseline.choice, baselines("ekf", problem)[baseline.name])
+    said = " ".join(choice_sentences(as_data_of_choice(met), plan))
+    names = " and ".join(dict.fromkeys((baseline.name, chosen.name)))
+    assert f"Here the {names} have a larger Q, to forget within 0.1 s (--forget); those of the tables may " in said
+
+
+@pytest.mark.parametrize("options", [{"method": name} for name in ("likelihood", "gradient", "noise-estimation")])
+def test_it_holds_on_other_methods_of_tuning(options, problem):
+    found = tuning.tune(
+        problem, "kf", trials=2, space=tuning.SearchSpace(forget=FORGET), progress=False, **options
+    )
+    assert DT * found.held_out.evaluation.time_constants.steps[0] <= FORGET
+
+
 def test_what_cannot_forget_is_refused_in_one_line(problem):
     timeless = LinearProblem()
     with pytest.raises(ValueError, match="needs a sample time, but linear-3 has none"):
@@ -217,3 +249,12 @@ def test_what_cannot_forget_is_refused_in_one_line(problem):
         Plan("kf", (problem,), forget=0.01).checked()
     with pytest.raises(ValueError, match="needs a filter with a Q, but got 'low-pass'"):
         Plan("low-pass", (problem,), forget=1.0).checked()
+
+
+def test_a_table_of_filters_has_their_time_constants_and_none_of_those_without_a_gain(problem):
+    found = tuning.compare(["kf", "open-loop"], problem, seeds=4, knows="untuned", progress=False).boards[0]
+    evaluations = {row.label: row.evaluation for row in found.rows}
+    said = slowest_sentence(evaluations, problem)
+    assert said.startswith("Longest time constant of the gain: kf 6.") and said.endswith(" s, open-loop -.")
+    assert said in leaderboard_report(found)
+    assert memory_sentence(evaluations["open-loop"], problem) == "Time constants of the gain: -."

@@ -8,12 +8,14 @@ import optuna
 import pytest
 
 import thruster_env  # noqa: F401 - registers the env
+import tuning
 from filters import EstimateState
 from filters.tuned_file import read_tuned_file, sealed
 from tuning.api.verify import verify
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.reporting.tables import choice_table
+from tuning.search.among_types import RESCALED
 from tuning.search.parameters import correlation_slopes, correlations_of, full_covariance
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of, trial_parameters, untuned_choice
@@ -51,6 +53,11 @@ def test_the_last_of_three_is_the_correlation_once_the_first_state_is_known():
     cov = full_covariance((1.0, 2.0, 3.0), [0.3, -0.6, 0.7])
     known = cov[1:, 1:] - np.outer(cov[1:, 0], cov[0, 1:]) / cov[0, 0]
     assert known[0, 1] / np.sqrt(known[0, 0] * known[1, 1]) == pytest.approx(0.7)
+
+
+def test_a_state_without_noise_has_neither_variance_nor_covariances():
+    cov = full_covariance((1.0, 0.0, 4.0), [0.3, 0.5, -0.2])
+    assert (cov[1] == 0.0).all() and cov[0, 2] == pytest.approx(0.5 * 2.0)
 
 
 @pytest.mark.parametrize(
@@ -95,6 +102,23 @@ def test_a_study_of_a_full_q_ends_in_a_file_that_everything_reads(tmp_path):
     path.write_text(json.dumps(sealed(content)))
     with pytest.raises(ValueError, match="process_noise_cov must be 2 variances or a symmetric 2 x 2 matrix"):
         read_tuned(path)
+
+
+def test_a_consistent_twin_has_the_same_correlation():
+    result = run_study(open_study("s", PLAN, optuna.storages.InMemoryStorage()), PLAN, 12)
+    twins = [trial for trial in result.trials if RESCALED in trial.user_attrs and "R" in trial.params]
+    assert twins
+    for rescaled in twins:
+        trial = result.trials[rescaled.user_attrs[f"{RESCALED} of"]]
+        assert rescaled.params["correlation_12"] == trial.params["correlation_12"]
+        assert rescaled.params["R"] / trial.params["R"] == pytest.approx(
+            rescaled.params["Q11"] / trial.params["Q11"]
+        )
+
+
+def test_the_gradient_refuses_a_budget_with_one_clear_line():
+    with pytest.raises(ValueError, match="must come without a budget, but got budget"):
+        tuning.tune("mismatch", "ekf", budget=1.0, method="gradient")
 
 
 @pytest.mark.parametrize("correlations", [[0.3, -0.6, 0.7, 0.0, 0.98, -0.2], [0.0] * 6])

@@ -5,6 +5,8 @@ import pytest
 from rich.console import Console
 
 from filters import StateSpaceModel, run
+from tests.linear_problem import LinearProblem
+from tests.slow import slow_but
 from tuning.api.tune import run_tuning
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import read_tuned
@@ -130,6 +132,21 @@ def test_the_numbers_of_a_model_are_found_together_whatever_they_move():
     assert (abs(distances) < 3.5 * found.standard_errors).all() and (found.standard_errors < 0.2).all()
 
 
+@pytest.mark.slow
+def test_a_full_q_is_at_least_as_likely_as_a_diagonal_one_and_a_study_tries_it():
+    plan = Plan("ekf", (MISMATCH,), objectives=("log-score",), full_q=True)
+    data = plan.training_data()
+    some = [one.slice(0, 8) for one in data]
+    diagonal = tune_by_gradient("ekf", plan.scenarios, some, [1.0], "log-score")
+    full = tune_by_gradient("ekf", plan.scenarios, some, [1.0], "log-score", plan.options)
+    assert full.names == ("Q11", "Q22", "correlation_12", "R") and full.best.level < diagonal.best.level
+    choice = full.choice.model["process_noise_cov"]
+    assert np.shape(choice) == (2, 2) and abs(full.best.parameters[2]) > 0.01
+    result = run_study(open_study("full", plan), plan, 8)
+    best = tune_by_gradient("ekf", plan.scenarios, data, [1.0], "log-score", plan.options).best
+    assert result.best_value == pytest.approx(best.level, rel=1e-4)
+
+
 def blown(x, u, c):
     return (x[0] * x[0] * x[0] + c[0], 0.5 * x[1])
 
@@ -211,7 +228,37 @@ def test_a_full_r_that_cannot_be_is_refused(plan, rule):
         plan.checked()
 
 
+def test_of_one_channel_a_full_r_is_its_variance():
+    full = Plan("ekf", (NOMINAL,), full_q=True, full_r=True).checked()
+    assert list(full.parameters()) == list(full._replace(full_r=False).checked().parameters())
+
+
 # Objectives on the true states: their minimum is a study's objective, and lower than elsewhere.
+
+
+def value_of(objective, choice, problem, data):
+    found = evaluate(choice.filter(problem), data, problem.scale)
+    return OBJECTIVES[objective].value(found, np.nan)
+
+
+@pytest.mark.parametrize("objective", slow_but(["score", "mse", "log-score"], ["mse"]))
+def test_the_minimum_is_the_objectives_and_lower_than_other_ways_lead(objective):
+    data = MISMATCH.data(range(40))
+    found = tune_by_gradient("ekf", MISMATCH, data, objective=objective)
+    least = value_of(objective, found.choice, MISMATCH, data)
+    assert found.best.level == pytest.approx(least, rel=1e-9)
+    others = tune_by_gradient("ekf", MISMATCH, data, [1.0]).choice
+    assert least < value_of(objective, others, MISMATCH, data)
+    for name in found.names:  # a step either way is worse, unless the data do not tell
+        at = found.names.index(name)
+        for factor in (0.7, 1.4):
+            moved = found.best.parameters.copy()
+            moved[at] *= factor
+            model = dict(found.choice.model) | {
+                "process_noise_cov": tuple(moved[:2]),
+                "measurement_noise_cov": tuple(moved[2:]),
+            }
+            assert least <= value_of(objective, found.choice._replace(model=model), MISMATCH, data) * (1 + 1e-9)
 
 
 def test_a_study_of_an_objective_that_has_a_gradient_tries_where_it_leads_and_finds_nothing_much_better():
@@ -232,3 +279,20 @@ def test_objectives_on_true_states_need_them():
         ValueError, match="objective must be one of likelihood, score, mse, log-score, but got 'nees'"
     ):
         tune_by_gradient("ekf", MISMATCH, data, objective="nees")
+
+
+@pytest.mark.slow
+def test_a_study_of_the_score_follows_its_gradient_only_where_there_are_many_numbers():
+    plan = Plan("kf", (LinearProblem(n=3),), full_q=True, full_r=True)
+    result = run_study(open_study("many", plan), plan, 8)
+    (tried,) = [trial for trial in result.trials if BY_GRADIENT in trial.user_attrs]
+    best = tune_by_gradient("kf", plan.scenarios, plan.training_data(), [1.0], "score", plan.options).best
+    assert tried.user_attrs[BY_GRADIENT] == "score" and len(best.parameters) == 9
+    values = [trial.values[0] for trial in result.trials if trial.values]
+    assert best.level <= min(values) * (1 + 1e-4)
+    choice = choice_of("kf", tried.params, plan.scenarios[0])
+    (data,) = plan.training_data()
+    assert value_of("score", choice, plan.scenarios[0], data) == pytest.approx(best.level, rel=1e-4)
+    few = plan._replace(full_q=False, full_r=False)
+    result = run_study(open_study("few", few), few, 8)
+    assert not any(BY_GRADIENT in trial.user_attrs for trial in result.trials)

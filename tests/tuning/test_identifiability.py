@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from filters import KalmanFilter, affine_model, run
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
-from tuning.likelihood import family
+from tuning.api.tune import run_tuning
+from tuning.likelihood import family, identifiability
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import (
     Identifiability,
@@ -17,7 +19,9 @@ from tuning.likelihood.identifiability import (
     is_identified,
     maximum,
     sentences,
+    too_many,
 )
+from tuning.reporting.tuning_report import as_json, report
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
 from tuning.thruster.scenario import find_scenario
@@ -152,3 +156,35 @@ def test_numbers_that_are_held_are_not_told_and_baselines_have_none():
     assert identify(untuned_choice("ekf", scenario), plan.scenarios, data, plan.space()).names == ("Q11", "Q22")
     plan = Plan("low-pass", (scenario,))
     assert identify(untuned_choice("low-pass", scenario), plan.scenarios, data, plan.space()) is None
+
+
+def test_thruster_tune_says_what_the_innovations_determine(tmp_path):
+    plan = Plan("ekf", (find_scenario("nominal"),))
+    tuning = run_tuning(plan, 3, Console(quiet=True), str(tmp_path / "j"), out=tmp_path / "tuned.json")
+    assert sentences(tuning.known)[0] in report(tuning)
+    assert set(as_data(tuning.known)) == set(as_json(tuning)["innovations_alone"]) == {"Q11", "Q22", "R"}
+
+
+def test_a_number_that_is_hardly_known_goes_along_no_further_than_ten_times_its_range():
+    asked, bounds = [], np.log([(1e-3, 1e3), (1e-3, 1e3)])
+    cov = np.array([[1e-4, 1e-2 * 2.0 * 0.9], [1e-2 * 2.0 * 0.9, 4.0]])  # the second would move by e^414
+
+    def log_likelihoods(at):
+        asked.append(at)
+        return np.array([-at @ np.linalg.solve(cov, at)])
+
+    known = is_identified(log_likelihoods, np.zeros(2), cov, bounds)
+    assert known.tolist() == [True, False]
+    assert np.abs(asked).max() <= np.log(1e4) + 1e-12
+
+
+def test_of_more_numbers_than_can_be_paired_off_it_says_so():
+    nominal = find_scenario("nominal")
+    choice, plan = oracle_choice("ekf", nominal), Plan("ekf", (nominal,))
+    assert too_many(choice, plan.space()) == [] and identifiability.MOST_NUMBERS > len(plan.space())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(identifiability, "MOST_NUMBERS", 2)
+        assert identify(choice, plan.scenarios, [], plan.space()) is None
+        (said,) = too_many(choice, plan.space())
+        assert "at most 2 parameters" in said and "here are 3" in said
+        assert too_many(oracle_choice("open-loop", nominal), plan.space()) == []

@@ -4,6 +4,8 @@ import math
 import pickle
 import signal
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -62,6 +64,22 @@ def test_constants_and_noise_are_found_together_within_their_standard_errors(fou
     assert len({one.start["stiffness"] for one in found.optima}) == 3
     assert found.log_likelihood > found.start_log_likelihood + 100
     assert "determine every free parameter" in found.sentences()[0]
+
+
+@pytest.mark.slow
+def test_an_end_at_zero_is_not_to_be_widened(found):
+    first, second = found.objective.coordinates.free[:2]
+    coordinates = SimpleNamespace(free=(replace(first, low=0.0, log=False, default=None), second))
+    ends = found._replace(
+        objective=SimpleNamespace(coordinates=coordinates),
+        values={**found.values, first.name: 0.0},
+        at_end={**found.at_end, first.name: True, second.name: True},
+    )
+    assert ends._end_sentences() == [
+        f"At zero, where the range ends: {first.name}. The data require none of them.",
+        f"At an end of the range: {second.name}. A wider one may fit better.",
+    ]
+    assert found._end_sentences() == []
 
 
 @pytest.mark.slow

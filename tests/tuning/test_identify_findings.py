@@ -80,6 +80,13 @@ def test_a_constant_beside_a_gap_is_within_its_standard_error_where_the_run_is_c
     assert abs(cut.values["Q11"] - 1e-4) < 3.9 * cut.standard_errors["Q11"]
 
 
+def test_held_over_the_gap_it_is_off_by_several_and_q_much_too_large():
+    cut, held = gap(False), gap(True)
+    assert abs(held.values["cooling"] - COOLING) > 3.9 * cut.standard_errors["cooling"]
+    assert held.values["Q11"] > 10 * cut.values["Q11"]
+    assert held.standard_errors["cooling"] > 3 * cut.standard_errors["cooling"]
+
+
 def test_outliers_name_the_gate_and_with_it_the_constant_is_nearer():
     run = table(motor(SPEED), 2.0, 500, seed=3)
     loaded = np.flatnonzero(run["u"] > 0.8)  # where the tachometer's brushes spark

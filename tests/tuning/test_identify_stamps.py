@@ -1,5 +1,6 @@
 """Identification on logs' own stamps: the grid's numbers where stamps lie on it, the plant's where they do not."""
 
+import dataclasses
 import json
 import pickle
 
@@ -8,20 +9,22 @@ import pytest
 from scipy.linalg import expm
 
 import tuning
-from filters import make_filter
+from filters import Unknown, augmented_model, make_filter
 from filters.engine.batch import run
 from filters.logs.estimate import by_the_clock
 from filters.sensitivity import likelihood
 from tests.filters.test_live import A, oscillator
 from thruster_env.core.streams import filter_keys
-from thruster_env.logs.log import in_any_steps, in_steps
+from thruster_env.logs.log import Log, in_any_steps, in_steps
 from thruster_env.logs.read import read_log
 from thruster_env.model.continuous import noise_of_densities
+from tuning.evaluation.evaluate import evaluate
 from tuning.identification.objective import Objective
 from tuning.identification.profiles import validate
 from tuning.logs.problem import family_of
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Coordinates
+from tuning.search.space import untuned_choice
 
 DT = 0.1
 Q = np.array([[1e-3, 4e-4], [4e-4, 2e-3]])
@@ -188,9 +191,40 @@ def test_what_needs_a_grid_is_refused(changes, rule):
         tuning.identify(tuning.read_logs(data, **options), **{"free": FREE, "progress": False} | search)
 
 
+def test_logs_are_all_on_grids_or_none():
+    model = plant().at(DT)
+    logs = [
+        read_log(recorded(DT * np.arange(30), seed), model, grid=grid) for seed, grid in ((6, True), (7, False))
+    ]
+    logs = [dataclasses.replace(log, name=name) for log, name in zip(logs, ("even", "own"), strict=True)]
+    assert all(isinstance(log, Log) for log in logs)
+    with pytest.raises(ValueError, match="logs must all lie on grids or none, but own does not and even does"):
+        tuning.identify((plant(), logs), FREE, progress=False)
+
+
+def test_models_made_of_rates_can_be_sent_to_another_process():
+    model, x, u = smooth(), (0.3, 0.1), (1.0,)
+    for one in (model, in_any_steps(model, DT), augmented_model(model, {"stiffness": Unknown(std=0.5)})):
+        again, more = pickle.loads(pickle.dumps(one)), one.inputs - 1
+        given = (*x, 4.0)[: one.n], (*u, 0.5)[: 1 + more]
+        assert again.transition(*given, one.constants) == one.transition(*given, one.constants)
+
+
 def test_a_filter_that_knows_one_step_only_is_refused():
     with pytest.raises(ValueError, match="a filter on a log's own stamps must know .*, but 'pf' does not"):
         make_filter("pf", in_any_steps(smooth(), DT))
+
+
+def test_a_study_on_stamps_of_a_grid_has_the_numbers_of_the_grid():
+    model, logs = smooth(), [recorded(np.arange(200) * DT, seed) for seed in range(3)]
+    by_grid = [
+        LogProblem([read_log(log, model, dt=DT, name=f"{k}", **how) for k, log in enumerate(logs)], model)
+        for how in ({}, {"grid": False})
+    ]
+    choice = untuned_choice("ekf", by_grid[0])
+    found = [evaluate(choice.filter(one), one.data(one.parts.held_out), None) for one in by_grid]
+    assert found[1].log_likelihood == pytest.approx(found[0].log_likelihood, rel=1e-9)
+    assert found[1].nis.value == pytest.approx(found[0].nis.value, rel=1e-9)
 
 
 def test_a_tuned_file_from_own_stamps_is_for_the_model_of_a_step(tmp_path):

@@ -97,6 +97,13 @@ def test_runs_from_rest_and_others_are_told_apart_and_gaps_are_no_trouble():
     check(silent, NOISE)
 
 
+def test_from_rest_nothing_changes_by_the_free_starts():
+    logs = thruster_logs(speeds=(None,) * 3, steps=200)
+    found = identified(logs)
+    assert found.begun_elsewhere == () and found.objective.starts is None
+    assert not any("begin" in one for one in found.sentences())
+
+
 def displaced(by, count=6, steps=150):
     """Runs of the pendulum whose prior means are displaced."""
     model = pendulum(**TRUTH)
@@ -104,6 +111,13 @@ def displaced(by, count=6, steps=150):
     moved = model.replace(prior_mean=model.prior_mean + by)
     drawn = simulate(moved, episode_keys(range(count)), made.inputs).measurements
     return Data(made.seeds, made.inputs, drawn, filter_keys(made.seeds), 0)
+
+
+def test_a_model_of_a_user_whose_runs_begin_elsewhere():
+    found = identify(displaced(np.array([2.0, -5.0])), pendulum, FREE, starts=1, against=False)
+    assert found.begun_elsewhere == tuple(range(6))
+    for name, truth in TRUTH.items():
+        assert abs(found.values[name] - truth) < 3.9 * found.standard_errors[name], name
 
 
 def test_a_first_state_is_that_of_the_normal_equations():

@@ -41,6 +41,19 @@ def test_two_that_join_at_the_same_number_of_trials_never_propose_alike(sampler)
     assert len(set(proposed)) == len(proposed)
 
 
+def test_so_do_two_that_begin_a_study_at_once(monkeypatch):
+    storage = optuna.storages.InMemoryStorage()
+    get_trials = optuna.Study.get_trials
+    with monkeypatch.context() as patch:  # neither sees what the other has queued
+        patch.setattr(optuna.Study, "get_trials", lambda *args, **kwargs: [])
+        both = [open_study("s", PLAN, storage) for _ in range(2)]
+    assert optuna.Study.get_trials is get_trials
+    queued = [propose(study)[1] for study in both]
+    assert queued[0] == queued[1]  # the untuned filter, which does no harm
+    points = [propose(study)[1] for study in both + both]
+    assert len(set(points)) == len(points)
+
+
 def test_a_single_process_proposes_the_same_again():
     def points(storage):
         study = open_study("s", PLAN, storage)

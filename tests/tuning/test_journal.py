@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 from pathlib import Path
 
 import optuna
@@ -97,6 +98,24 @@ def test_a_trial_that_another_process_has_ended_is_an_error_once(path):
     with pytest.raises(ValueError, match="Cannot tell a FAIL trial"):
         study.optimize(ended_elsewhere, n_trials=1)
     assert [trial.state for trial in study.trials] == [TrialState.FAIL]
+
+
+def test_a_copy_of_a_study_does_not_write_what_waits_for_the_first(path):
+    study = optuna.create_study(study_name="s", storage=open_storage(path))
+    trial = study.ask()
+    trial.report(3.0, 0)
+    copied = pickle.loads(pickle.dumps(study))
+    assert len(copied.trials) == 1
+    study.tell(trial, 1.0)
+    assert Path(path).read_text().count("intermediate_value") == 1
+    assert copied.trials == study.trials
+
+
+@pytest.mark.slow
+def test_a_study_in_a_database_can_be_copied(tmp_path):
+    study = optuna.create_study(storage=open_storage(f"sqlite:///{tmp_path}/studies.db"))
+    study.add_trial(optuna.trial.create_trial(value=1.0))
+    assert len(pickle.loads(pickle.dumps(study)).trials) == 1
 
 
 @pytest.mark.parametrize("distribution", ["[" * 100_000, 7, '{"name": 3}'])

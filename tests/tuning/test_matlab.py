@@ -3,14 +3,16 @@
 import math
 import re
 from math import exp, sin
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import tuning.cli
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.find import find_problem
-from tuning.reporting.matlab import lines_of, matlab_function
+from tuning.reporting.matlab import function_name, lines_of, matlab_function
 from tuning.search.space import Choice, untuned_choice
 
 
@@ -95,6 +97,15 @@ def test_what_cannot_be_written_out_says_where():
     assert "\n" not in str(caught.value)
 
 
+def test_the_template_that_thruster_new_writes_can_be_exported():
+    names = {"__name__": "template"}
+    source = (Path(tuning.cli.__file__).parent / "templates" / "problem.py").read_text()
+    exec(compile(source, "problem.py", "exec"), names)
+    model = names["model"](4.0)
+    text = matlab_function(Choice("ekf", {}, {}), model, "mine", 0.1)
+    assert "m.f = @transition;" in text and "cannot be written out" not in text
+
+
 def test_the_function_holds_the_model_and_the_step_of_a_kalman_filter():
     problem = find_problem("outliers")
     choice = untuned_choice("ekf", problem)
@@ -131,3 +142,7 @@ def test_a_model_that_cannot_be_written_out_says_so():
     text = matlab_function(Choice("ekf", {}, {}), model, "mine", None)
     assert "%   Why: a function that is written out must" in text and "test_matlab.py, line" in text
     assert "m.f and m.h are yours to add" in text and "@transition" not in text and "m.dt" not in text
+
+
+def test_names_are_those_that_matlab_takes():
+    assert function_name("ekf", "auv:motion") == "ekf_auv_motion" and function_name("1.csv") == "f_1_csv"

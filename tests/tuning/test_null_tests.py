@@ -12,6 +12,7 @@ from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
 from tuning.identification.identify import identify
 from tuning.identification.objective import kept_variance, lost_information
+from tuning.identification.result import NullTest
 from tuning.problems.problem import Parameter
 from tuning.thruster.logs import ThrusterFamily
 
@@ -123,3 +124,7 @@ def test_what_a_gate_leaves_of_a_normal_distribution():
         assert kept_variance(gate) == pytest.approx(kept.mean(), rel=5e-3)
         assert lost_information(gate) == pytest.approx(2 / kept.var(), rel=1e-2)
     assert kept_variance(math.inf) == lost_information(math.inf) == kept_variance(60.0) == 1.0
+
+
+def test_a_probability_reads_as_a_table_has_it():
+    assert NullTest(0.0, True, -1.0, 0.4321).said == "0.43" and NullTest(0.0, True, -1.0, 1e-9).said == "< 0.001"

@@ -2,14 +2,21 @@
 
 import numpy as np
 import pytest
+from optuna.trial import create_trial
 from scipy.stats import chi2, multivariate_normal
 
+from docs.scripts.tuning_choice import by_objective
 from filters import run
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.evaluate import evaluate, variance_ratios
 from tuning.evaluation.runs import RunMetrics
+from tuning.reporting.page import of_history
+from tuning.reporting.search_figures import draw_history
+from tuning.reporting.sections import of_front, reported_about
+from tuning.reporting.tuning_report import _band_sentence
+from tuning.search.among_types import TypeResult
 from tuning.search.measures import measured
-from tuning.search.objectives import find_objective
+from tuning.search.objectives import find_objective, nees_ratio, reported, reported_name
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
@@ -18,6 +25,41 @@ from tuning.search.trials import measure
 PROBLEM = LinearProblem(scale=(0.2, np.inf, 0.4))
 DATA = PROBLEM.data(range(8))
 CHOICE = untuned_choice("kf", PROBLEM)
+
+
+@pytest.mark.parametrize(
+    ("objective", "name", "said"),
+    [
+        (
+            "likelihood",
+            "log L",
+            "costs 3 of log L on the training blocks: the best trial of all has -56, the best in",
+        ),
+        ("log-score", "log score", "costs 3 of log score on the training blocks: the best trial of all has -56, "),
+        (
+            "score",
+            "score",
+            "costs 5.4 % of score on the training blocks: the best trial of all has 56, the best in ",
+        ),
+    ],
+)
+def test_reports_have_log_l_and_not_its_negative(objective, name, said):
+    assert reported_name(objective) == name and "negative" not in reported_about(objective)
+    assert reported(objective, 59.0) == (59.0 if objective == "score" else -59.0)
+    (cost,) = _band_sentence(objective, 56.0, 59.0, "blocks")  # 59 = -log L is worse than 56
+    assert said in cost and _band_sentence(objective, 56.0, 56.0, "blocks") == []
+    trials = [create_trial(value=value) for value in (70.0, 56.0)]
+    assert f"{name} of 2 trials" in of_history(trials, objective)
+    axis = draw_history(trials, "a study", name, objective).axes[0]
+    (best,) = [line for line in axis.lines if line.get_label() == "best so far"]
+    values = [70.0, 56.0] if objective == "score" else [-70.0, -56.0]
+    assert best.get_ydata().tolist() == values and f"has {values[1]:g}." in of_history(trials, objective)
+    low, high = axis.get_ylim()
+    assert low < min(values) < max(values) < high
+    assert of_front([create_trial(values=[56.0, 2.0])], (objective, "nis")).endswith(
+        f"to {name} {values[1]:g} and nis 2."
+    )
+    assert TypeResult("ekf", 2, 0, 0, 56.0, True, None).best(objective) == f"{values[1]:g}"
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +157,14 @@ def test_runs_are_left_out_one_by_one_also_of_the_worst_problem(name):
     assert worst.value == max(part.value for part in parts) != min(part.value for part in parts)
     for left_out, part, other in zip(worst.left_out, parts, parts[::-1], strict=True):
         np.testing.assert_allclose(left_out, np.maximum(part.left_out[0], other.value), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_where_the_model_is_wrong_a_study_of_the_score_has_a_covariance_as_good_as_that_of_the_log_score():
+    by_score, by_log_score = by_objective("mismatch", seed=1, trials=16)
+    # At the end the log score decides among filters of the least error.
+    assert by_score.log_score.value == pytest.approx(by_log_score.log_score.value, abs=0.1)
+    assert max(nees_ratio(by_log_score), nees_ratio(by_score)) < 3.0
 
 
 @pytest.mark.slow

@@ -2,11 +2,14 @@
 
 import io
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
 
+import tuning
 from thruster_env.core.text_tables import verbatim
+from thruster_env.model.affine import affine_model
 from thruster_env.model.quantities import Quantity
 from tuning.api.progress import working
 from tuning.reporting.page import Table, markdown_page
@@ -24,6 +27,21 @@ ODD = [
 ]
 
 
+def model(name, unit="N"):
+    return affine_model(
+        a=[[0.9]],
+        b=[[0.5]],
+        c=[[1.0]],
+        process_noise_cov=[0.01],
+        measurement_noise_cov=[0.04],
+        prior_mean=[0.0],
+        prior_cov=[1.0],
+        states=[(name, "x", unit)],
+        input_quantities=[(name, "u", unit)],
+        measurements=[(f"{name} read", "z", unit)],
+    )
+
+
 @pytest.mark.parametrize("name", ODD)
 def test_labels_of_figures_show_a_name_as_it_is(name):
     figure = Figure()
@@ -32,6 +50,15 @@ def test_labels_of_figures_show_a_name_as_it_is(name):
     axis.set_ylabel(Quantity(name, "omega_m", name[:20]).plot_label)
     figure.savefig(io.BytesIO(), format="svg")
     assert verbatim(name).replace(r"\$", "$") == name and len(verbatim(name, most=90)) < 100
+
+
+@pytest.mark.parametrize("name", [r"$\frac$", "[/]", "n" * 400])
+def test_a_log_of_odd_names_is_drawn(name):
+    rng = np.random.default_rng(0)
+    table = {"t": 0.1 * np.arange(200), "u": rng.normal(size=200), "z": rng.normal(size=200), "x": np.zeros(200)}
+    found = tuning.estimate((model(name, unit=r"$\frac"), table))
+    for figure in (found.plot_states(), found.plot_innovations()):
+        figure.savefig(io.BytesIO(), format="png")
 
 
 @pytest.mark.parametrize("name", ODD)

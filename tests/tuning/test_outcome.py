@@ -7,8 +7,10 @@ import sys
 import optuna
 import pytest
 
+from filters.consistency.nees import Interval
 from tuning.cli.main import main
 from tuning.evaluation.baselines import SCALED
+from tuning.evaluation.sizes import SizeRow, sufficient_size
 from tuning.search.among_types import BASELINE
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
@@ -79,6 +81,13 @@ def test_a_study_without_a_consistent_trial_says_so_everywhere(thruster, tmp_pat
     code, _ = thruster("tune", "--filter", "ekf", "--trials", 1, "--no-consistency", "--json", "free.json")
     data = json.loads((tmp_path / "free.json").read_text())
     assert not code and data["any_trial_consistent"] is None and data["mean_nis"] == []
+
+
+def test_a_smaller_ensemble_of_a_consistent_trial_is_consistent_too():
+    found = (5, 1.0, 0.2), (10, 1.3, -0.1), (20, 1.0, -0.1)
+    rows = [SizeRow(n, None, Interval(ratio, ratio, ratio), outside) for n, ratio, outside in found]
+    assert sufficient_size(rows) == 5 and sufficient_size(rows, consistent=True) == 20
+    assert sufficient_size(rows[:1], consistent=True) == 5
 
 
 def test_a_study_names_its_best_trial_to_programs_that_know_no_constraints(tmp_path):

@@ -53,6 +53,27 @@ def test_it_decides_as_optunas_pruner():
     assert 10 < sum(found) < 50
 
 
+@pytest.mark.filterwarnings("ignore:.*WilcoxonPruner")
+@pytest.mark.parametrize(
+    ("best", "own"),
+    [
+        (None, [2.0] * 8),
+        (np.arange(32.0), np.arange(8.0)),  # no difference
+        (np.arange(32.0), np.arange(8.0) + 20.0),  # equal ones
+        (np.zeros(32), [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, np.inf]),
+        (np.append(np.zeros(31), np.nan), np.arange(1.0, 9.0)),
+        (np.zeros(4), np.arange(1.0, 9.0)),  # more seeds than the best trial has
+        (np.zeros(32), []),
+        (np.zeros(32), np.arange(1.0, 7.0)),  # fewer than a block
+        ([], np.arange(1.0, 9.0)),
+        (np.zeros(60), np.arange(1.0, 58.0)),
+    ],
+)
+def test_it_leaves_the_rare_cases_to_optuna(best, own):
+    mine, optunas = decisions(best, own)
+    assert mine == optunas
+
+
 def test_the_best_trial_is_a_feasible_one():
     study = optuna.create_study()
 

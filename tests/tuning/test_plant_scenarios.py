@@ -1,6 +1,7 @@
 """Scenarios of every plant by one contract: data are an env's, values are immutable, files and names find them."""
 
 import dataclasses
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -16,8 +17,10 @@ from filters.bounds import riccati_covariances
 from tests.cart_scenarios import SCENARIOS as CARTS
 from tests.slow import slow_but
 from tests.tuned_files import write_untuned
+from thruster_env.core.streams import episode_keys
 from thruster_env.thruster.model import model_of_plant
 from tuning.api.verify import verify
+from tuning.auv.scenario import SAILING
 from tuning.auv.scenario import SCENARIOS as VEHICLES
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
@@ -142,6 +145,13 @@ def test_scenarios_of_another_package_are_found_by_name_by_file_and_in_tuned_fil
         scenario_of({"plant": "ship"}, "x", "tuned.json")
 
 
+def test_a_module_that_brings_no_plant_is_left_out_with_a_warning(brought):
+    brought(none="tests.small_plant", gone="tests.nowhere", cart="tests.cart_scenarios")
+    with pytest.warns(UserWarning, match="must offer Scenario, SCENARIOS and NOMINAL, but tests") as caught:
+        assert set(plant_packages()) == {"thruster", "auv", "cart"}
+    assert len(caught) == 2
+
+
 # Files.
 
 
@@ -171,6 +181,17 @@ def test_without_base_and_scale_it_is_nominal_and_the_scale_is_computed_and_a_tu
     assert scenario.scale == tuple(scenario.computed_scale(200)) and scenario.scale[1] > NOMINAL.scale[1]
     write_untuned("tuned.json", scenario)
     assert read_tuned("tuned.json") == (untuned_choice("ekf", scenario), scenario, 0)
+
+
+@pytest.mark.slow
+def test_a_file_says_whose_scenario_it_is(file):
+    scenario = file(
+        'plant = "auv"\nbase = "auv:navigation"\nsteps = 60\nfirst_scored_step = 10\ncurrent = [0.1, 0.0, 0.0]\n'
+    )
+    assert scenario.states == "navigation"
+    assert 0.3 < scenario.scale[9] / VEHICLES["auv:navigation"].scale[9] < 1
+    with pytest.raises(ValueError, match="scenario must be one of nominal, .* but got 'auv:motion'"):
+        file('base = "auv:motion"')
 
 
 def test_a_study_and_its_file_do_without_a_bound_and_another_content_of_the_file_is_another_study(file):
@@ -351,6 +372,12 @@ def test_voltages_hold_their_level_fill_the_range_and_are_cut_off_as_the_env_doe
     assert np.abs(NOMINAL.replace(max_voltage=6.0).data(range(3)).inputs).max() == 6.0
 
 
+def test_untuned_is_one_per_cent_of_each_range_and_the_sheets_noise():
+    # 24 V: 387.515 rad/s and 7.347 m/s, so the ranges over +-24 V are twice that
+    np.testing.assert_allclose(np.sqrt(NOMINAL.untuned["process_noise_cov"]), [7.7503, 0.14694], rtol=1e-4)
+    assert NOMINAL.untuned["measurement_noise_cov"] == 0.25
+
+
 @pytest.mark.parametrize("name", ["mismatch", "published_tunnel", "deadband"])
 def test_a_model_of_another_q_and_r_is_the_one_that_is_made_of_them(name):
     scenario = SCENARIOS[name]
@@ -377,6 +404,22 @@ def test_what_one_instrument_of_a_vehicle_measures_is_lost_together():
     assert 0.4 < (lost[:, 0] != lost[:, 1]).mean() < 0.6
 
 
+def test_levels_are_held_as_long_as_is_said():
+    inputs = SAILING.inputs(episode_keys(range(40)), 1200, 0.05, 3)
+    for i, (low, high) in enumerate(zip(SAILING.low, SAILING.high, strict=True)):
+        assert low <= inputs[..., i].min() < low + 0.02 * (high - low) and inputs[..., i].max() <= high
+    spans = [np.diff(np.flatnonzero(np.diff(row, prepend=np.nan))) for row in inputs[..., 1]]
+    lengths = np.concatenate(spans)
+    assert lengths.min() >= 60 and lengths.max() <= 160 and abs(lengths.mean() - 110) < 4  # sd 29, 400 of them
+    make = type(SAILING)
+    for call, line in (
+        (partial(make, low=2.0, high=1.0), "low must be at most high, 1.0, but got 2.0"),
+        (partial(make, shortest=60, longest=30), "longest must be a whole number of at least 60, but got 30"),
+    ):
+        with pytest.raises(ValueError, match=line):
+            call()
+
+
 @pytest.mark.slow
 def test_a_tuned_file_keeps_which_states_its_model_has_and_goes_on_an_env(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -393,3 +436,17 @@ def test_a_tuned_file_keeps_which_states_its_model_has_and_goes_on_an_env(tmp_pa
             EstimateState(gym.make("SegorogeniAUV-v0", **{"sensors": "motion", **other}), tuned="tuned.json")
     with pytest.raises(ValueError, match="a plant's data must have"):
         EstimateState(gym.make("BowThruster-v0"), tuned="tuned.json")
+
+
+@pytest.mark.slow
+def test_a_filter_that_estimates_the_current_is_consistent_where_one_without_it_is_lost():
+    nees = []
+    for name in ("auv:current", "auv:estimated_current"):
+        scenario = VEHICLES[name].replace(steps=300, first_scored_step=10)
+        data, choice = scenario.data(range(8)), untuned_choice("ekf", scenario)._replace(model=scenario.true)
+        estimates = run(choice.filter(scenario), data.filter_keys, data.inputs, data.measurements)
+        error = (estimates.means - data.states)[:, 10:, :8]
+        inverse = np.linalg.inv(estimates.covs[:, 10:, :8, :8])
+        nees.append(np.einsum("bki,bkij,bkj->bk", error, inverse, error).mean())
+    assert nees[0] > 100.0
+    assert nees[1] == pytest.approx(8.0, abs=1.0)

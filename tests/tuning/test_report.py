@@ -9,13 +9,17 @@ import numpy as np
 import optuna
 import pytest
 
+from filters.consistency.nees import Interval
 from tuning.api.report import report as write_report
 from tuning.cli.main import main
-from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.tuned import write_tuned
+from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.evaluation.held_out import Comparison, evaluate_held_out
+from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.reporting.page import Code, Picture, Section, Table, Words, html_page, markdown_page
 from tuning.reporting.search_figures import FEWEST_TRIALS, counted_trials, early_trials, importances
+from tuning.reporting.sections import advice
 from tuning.search.plan import Plan
+from tuning.search.space import untuned_choice
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_study
 from tuning.thruster.scenario import find_scenario
@@ -119,6 +123,19 @@ def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder)
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
+def test_without_its_study_a_tuned_file_still_has_a_page():
+    plan = Plan("ekf", (MISMATCH,))
+    tuned(plan, 2)
+    open_study("s", plan._replace(seed=1), open_storage("other.journal"))  # of the same name
+    for storage in ("nowhere.journal", "other.journal", STORAGE):
+        page = Page(write_report("s.json", "out", storage=storage).page.read_text())
+        said = "Study 's' is not in the storage" in " ".join(page.words)
+        assert said == (storage != STORAGE)
+        assert "Error against ensemble size" not in page.headings
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
     monkeypatch.setattr("tuning.reporting.subject.HELD_OUT_SEEDS", 6)
     plan = Plan("ekf", (MISMATCH, OUTLIERS), objectives=("score", "consistency"), consistent=False)
@@ -129,6 +146,17 @@ def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
     words = " ".join(page.words)
     assert "Pareto front" in words and "scenario mismatch" in words and "scenario outliers" in words
     assert " on mismatch and " in report.advice and len(page.pictures()) == 2 + 4 + 5
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
+def test_a_baseline_has_no_covariance_to_speak_of():
+    tuned(Plan("low-pass", (MISMATCH,)), 3)
+    report = write_report("s.json", storage=STORAGE)
+    assert "covariance" not in report.advice
+    page = Page(report.page.read_text())
+    assert "Is the covariance consistent?" not in page.headings
+    assert "| tuned | " in report.markdown.read_text() and "nan" not in report.markdown.read_text()
 
 
 def test_importances_need_enough_trials_and_sum_to_one():
@@ -154,6 +182,29 @@ def test_importances_count_pruned_trials_where_few_are_complete(caplog, monkeypa
     assert caplog.text == "", "a copy of a study is nobody's study"
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
+def test_two_studies_stand_beside_each_other(folder, monkeypatch, capsys):
+    tuned(Plan("ekf", (MISMATCH,)), 2)
+    tuned(Plan("kf", (MISMATCH,)), 2, "t")
+    arguments = ["thruster", "report", "s.json", "t.json", "--storage", STORAGE]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit):
+        main()
+    assert "s-beside-t.html" in capsys.readouterr().out
+    page = Page((folder / "s-beside-t.html").read_text())
+    words, ids = " ".join(page.words), [found["id"] for _, found in page.attributes if "id" in found]
+    assert page.headings[0] == "Side by side" and len(ids) == len(set(ids)) and len(page.pictures()) == 2 * 8
+    a, b = (read_tuned(name)[0].filter(MISMATCH) for name in ("s.json", "t.json"))
+    data = MISMATCH.data(MISMATCH.held_out_seeds(0, 6))
+    ratio = score_ratio(*(evaluate(one, data, MISMATCH.scale) for one in (a, b)))
+    assert f"Score of s over that of t, paired by run: {ratio.value:.3g}" in words
+    monkeypatch.setattr(sys, "argv", [*arguments[:2], "a.json", "b.json", "c.json"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "a side-by-side report must be of two studies, but got 3" in capsys.readouterr().err
+
+
 def test_trials_that_ended_early_stand_at_the_mean_of_their_seeds():
     plan = Plan("ekf", (MISMATCH,))
     result = run_study(open_study("s", plan, optuna.storages.InMemoryStorage()), plan, 20)
@@ -161,6 +212,27 @@ def test_trials_that_ended_early_stand_at_the_mean_of_their_seeds():
     assert len(early) == result.pruned > 0
     trial, value = early[0]
     assert value == pytest.approx(np.mean(list(trial.intermediate_values.values())))
+
+
+def test_the_advice_says_when_tuning_is_worth_nothing_or_harms():
+    choice = untuned_choice("ekf", MISMATCH)
+    comparison = evaluate_held_out(choice, MISMATCH, 0, 4)
+    plan = Plan("ekf", (MISMATCH,))
+    assert advice(choice, plan, [comparison]).startswith(
+        "Tuning raises the score by 10 % [4, 21] against the scaled default, makes no significant difference "
+        "on 4 seeds against the rule of thumb and raises the score by 17 % [11, 26] against the noise estimation; "
+        "the covariance is "
+    )
+    worse = comparison.untuned._replace(mean_squares=4 * comparison.untuned.mean_squares)
+    said = advice(choice, plan, [comparison._replace(tuned=worse)])
+    assert (
+        "against the scaled default, by 100 % against the rule of thumb and by 133 % [122, 151] against " in said
+    )
+    blank = comparison.tuned._replace(nees=Interval(np.nan, np.nan, np.nan), state_nees=None)
+    said = advice(choice, plan, [Comparison(blank, blank, blank, comparison.bound, range(4))])
+    assert said.startswith(
+        "Tuning makes no significant difference on 4 seeds against the rule of thumb. The residuals"
+    )
 
 
 def test_what_is_said_is_escaped():
@@ -175,6 +247,11 @@ def test_what_is_said_is_escaped():
     assert "x & y" in page.words and 'say "1"' in page.words and page.pictures()[0]["aria-label"] == '"><b>'
     markdown = markdown_page("a_b", ["1 < 2", Table("c|d", ["", "e"], [["f|g", "h*"]])])
     assert markdown == "# a\\_b\n\n1 \\< 2\n\n**c\\|d**\n\n|  | e |\n| --- | ---: |\n| f\\|g | h\\* |\n"
+
+
+def test_an_interval_stands_below_its_value():
+    text = Table("", ["", "a", "b"], [["x", "1.2 [1.1, 1.3]", "score [-]"]]).html()
+    assert "<td>1.2<small>[1.1, 1.3]</small></td><td>score [-]</td>" in text
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,12 @@ def test_with_r_held_the_most_likely_q_is_tried_and_without_a_covariance_nothing
     assert not any(MAXIMUM_LIKELIHOOD in trial.user_attrs for trial in result.trials)
 
 
+def test_without_consistency_any_nis_will_do():
+    result = studied(PLAN._replace(consistent=False), 8)
+    assert result.free_value is None and not any(RESCALED in trial.user_attrs for trial in result.trials)
+    assert {violation(trial) for trial in result.trials} == {0.0}
+
+
 def test_a_trial_ends_early_only_if_it_is_worse_on_the_same_seeds():
     result = studied(PLAN, 40)
     data = PLAN.training_data()
@@ -116,6 +122,15 @@ def test_every_objective_falls(objective):
     assert result.best_value < result.trials[0].values[0]
 
 
+@pytest.mark.slow
+def test_two_objectives_give_a_front_that_no_trial_beats():
+    plan = Plan("enkf", (NOMINAL,), objectives=("score", "cost"))
+    result = studied(plan, 12)
+    values = np.array([trial.values for trial in result.front])
+    assert 1 <= len(values) and (np.diff(values[np.argsort(values[:, 0])][:, 1]) <= 0).all()
+    assert {len(trial.values) for trial in result.trials} == {2}
+
+
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_every_sampler_proposes_within_the_ranges(name):
     needed = {"gp": "torch", "cma-es": "cmaes"}.get(name)
@@ -128,6 +143,11 @@ def test_every_sampler_proposes_within_the_ranges(name):
     assert len({tuple(trial.params.values()) for trial in result.trials}) == 4
     for key, distribution in distributions("ekf", MISMATCH).items():
         assert all(distribution.low <= trial.params[key] <= distribution.high for trial in result.trials)
+
+
+def test_a_grid_ends_where_it_is_exhausted():
+    sampler = make_sampler("grid", 0, 0, {"N": distributions("enkf", NOMINAL)["N"]})
+    assert isinstance(sampler, optuna.samplers.GridSampler)
 
 
 @pytest.mark.parametrize(
@@ -184,6 +204,14 @@ def test_a_trial_that_there_is_already_is_not_enqueued_again():
     for r, size, count in ((0.25, 30, 1), (0.25 + 1e-7, 30, 1), (0.2501, 30, 2), (0.25, 31, 3), (0.2501, 30, 3)):
         enqueue_new(study, {"R": r, "N": size}, {})
         assert len(study.trials) == count
+
+
+def test_r_may_be_held_at_the_sensor_s_sheet():
+    result = studied(PLAN._replace(hold_r=True), 10)
+    assert set(result.trials[0].params) == {"Q11", "Q22"}
+    assert result.choice.model["measurement_noise_cov"] == MISMATCH.measurement_noise_cov
+    assert not any(RESCALED in trial.user_attrs for trial in result.trials)
+    assert result.best_value < result.trials[0].values[0]
 
 
 def test_trials_have_a_nees_where_an_objective_is_made_of_it_alone():

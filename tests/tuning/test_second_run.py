@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from tuning.problems.find import find_problem
+
 REACTOR = '''
 import math
 from typing import NamedTuple
@@ -90,3 +92,18 @@ def test_a_second_run_compiles_nothing_and_computes_no_bound_anew(reactor):
     compare = "compare --filter ekf tuned.json"
     reactor("tune --filter ekf --trials 2 --out tuned.json --seed 1", compare)
     assert reactor("report tuned.json", compare) == {"compiled": 0, "bounds": 0}
+
+
+@pytest.mark.slow
+def test_a_number_that_the_model_imports_changes_the_bound(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "reactor.py").write_text(REACTOR)
+    scales = []
+    for activation in (8750.0, 8900.0):
+        (tmp_path / "rates.py").write_text(f"ACTIVATION = {activation}\n")
+        for name in ("reactor", "rates"):
+            sys.modules.pop(name, None)
+        scales.append(find_problem("reactor:problem").scale)
+    for name in ("reactor", "rates"):
+        sys.modules.pop(name, None)
+    assert abs(scales[1][0] / scales[0][0] - 1) > 0.01

@@ -3,10 +3,28 @@
 import numpy as np
 import pytest
 
-from filters import affine_model, bounds
+import tuning
+from filters import affine_model, bounds, make_filter
 from filters.bounds import posterior_variances
+from tests.linear_problem import LinearProblem
+from tuning.evaluation.evaluate import check_consistency
 from tuning.problems.data import Data, mask_of
 from tuning.problems.model_problem import average_bound
+
+
+@pytest.mark.parametrize(("scored", "lags"), [(40, 20), (21, 20), (11, 10), (2, 1), (1, 1)])
+def test_a_consistency_report_has_as_many_lags_as_its_steps_allow(scored, lags):
+    problem = LinearProblem(steps=60, first_scored=61 - scored)
+    found = check_consistency(make_filter("kf", problem.model()), problem.data(range(6)))
+    assert len(found.whiteness.correlations) == lags and np.isnan(found.whiteness.p_value) == (scored == 1)
+
+
+@pytest.mark.slow
+def test_the_page_of_runs_of_sixty_steps_is_written(tmp_path):
+    problem = LinearProblem(steps=60, first_scored=50)
+    study = tuning.tune(problem, "kf", trials=3, progress=False)
+    page = tuning.report(study, tmp_path / "short.html").page
+    assert "Is the covariance consistent?" in page.read_text()
 
 
 def chain(n):

@@ -6,7 +6,7 @@ import pytest
 from filters.consistency.nees import Interval
 from tuning.evaluation import sizes
 from tuning.evaluation.evaluate import evaluate
-from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
+from tuning.evaluation.sizes import SizeRow, ensemble_sizes, left_out, sufficient_size
 from tuning.problems.data import held_out_seeds, size_seeds, training_seeds
 from tuning.search.plan import HELD_OUT_SEEDS, SIZE_SEEDS, TRAINING_SEEDS, Plan
 from tuning.search.space import untuned_choice
@@ -73,3 +73,13 @@ def test_where_it_has_to_be_consistent_the_best_is_that_of_the_consistent_sizes(
     assert free[2].ratio.value == 1.0 < free[1].ratio.value
     assert held[1].ratio == (1.0, 1.0, 1.0) and held[2].ratio.value < 1.0
     assert sufficient_size(held, consistent=True) == 30
+
+
+def test_sizes_left_out_by_their_nis_are_told_and_count_again_where_leaving_them_out_costs_too_much():
+    def rows(*found):
+        return [SizeRow(n, None, Interval(ratio, ratio, ratio), outside) for n, ratio, outside in found]
+
+    cheap = rows((5, 1.3, 0.1), (20, 1.0, -0.1), (200, 0.97, 0.2))
+    assert sufficient_size(cheap, consistent=True) == 20 and left_out(cheap, 20) == [5, 200]
+    dear = rows((5, 1.4, 0.1), (20, 1.066, -0.1), (200, 1.0, 0.2))
+    assert sufficient_size(dear, consistent=True) == 200 and left_out(dear, 200) == []

@@ -9,7 +9,10 @@ import optuna
 import pytest
 import sqlalchemy
 from optuna.trial import TrialState
+from rich.console import Console
 
+from tuning.api.tune import run_tuning
+from tuning.problems.find import find_problem
 from tuning.search import storage as database
 from tuning.search.plan import Plan
 from tuning.search.space import distributions
@@ -129,6 +132,21 @@ def test_a_driver_that_is_missing_is_named_with_the_extra_that_brings_it():
         ValueError, match=r"but got postgresql\+pg8000://host/s: .*: pip install '\.\[db\]' in the"
     ):
         open_storage("postgresql+pg8000://host/s")
+
+
+def test_several_workers_on_sqlite_are_warned(monkeypatch):
+    monkeypatch.setattr("tuning.api.tune.checked", lambda plan: open_storage(""))  # ends here
+    plan, console = Plan("ekf", (find_problem("nominal"),)), Console(quiet=True)
+    with (
+        pytest.warns(UserWarning, match="so 2 workers wait for each other"),
+        pytest.raises(ValueError, match="stor"),
+    ):
+        run_tuning(plan, 3, console, "sqlite:///s.db", workers=2)
+
+
+def test_a_proxy_must_have_a_host():
+    with pytest.raises(ValueError, match="got grpc://:13000: it names no host"):
+        open_storage("grpc://:13000")
 
 
 @pytest.mark.slow

@@ -17,10 +17,13 @@ from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.evaluate import values_of
 from tuning.learning.training import (
     HELD_OUT,
+    LONGER,
+    NOISIER,
     Loss,
     Settings,
     new_estimator,
     scales_of,
+    standings,
     starting_filter,
     train,
     twice_as_long,
@@ -138,6 +141,14 @@ def test_a_training_that_gets_worse_returns_the_first_weights_and_one_that_is_st
         estimator, data, validation, PROBLEM.scale, SETTINGS, on_step=steps.append, stopped=lambda: len(steps) == 3
     )
     assert steps == [1, 2, 3] and [one.step for one in checks] == [0, 2]
+
+
+def test_standings_pair_all_filters_on_the_same_runs(runs):
+    filter_, data, _ = runs
+    rows = standings({"a": filter_, "b": filter_}, PROBLEM, PROBLEM.held_out_seeds(0, 5))
+    for name in (HELD_OUT, LONGER, NOISIER):
+        assert rows[1].ratio(rows[0], name).value == 1.0
+    assert rows[0].evaluations[NOISIER].score.value > rows[0].evaluations[HELD_OUT].score.value
 
 
 def test_the_function_trains_stores_compares_and_continues(tmp_path, runs, as_python):

@@ -114,6 +114,13 @@ def test_a_model_of_one_s_own_and_a_file_of_before_are_not_compared(nominal, tmp
     assert read_tuned(path)[1] is find_scenario("nominal") and verify(path).holds
 
 
+def test_a_file_of_the_version_before_this_is_compared_by_its_plant(nominal, tmp_path):
+    path = rewrite(shutil.copy(nominal, tmp_path / "old.json"), partial(of_version, version=3))
+    assert read_tuned(path) == read_tuned(nominal) and verify(path).holds and wrapped(path).filter.name == "ekf"
+    with pytest.raises(ValueError, match=r"old.json was tuned for dt 0.01 \(here 0.02\);"):
+        wrapped(path, dt=0.02)
+
+
 def test_a_policy_a_comparison_and_an_evaluation_refuse_it_too(nominal, thruster, tmp_path):
     slow = 'base = "nominal"\nscale = [1.0, 0.05]\ndt = 0.02\n'
     (tmp_path / "slow.toml").write_text(slow)
@@ -261,3 +268,11 @@ def test_a_tuned_file_finds_its_preset_or_an_error_names_the_options_that_made_i
 )
 def test_the_options_that_made_a_file_are_those_of_the_command(content, options):
     assert made_with(content) == options
+
+
+def test_preset_of_a_scenario_must_be_the_file_s_own(nominal):
+    with pytest.raises(
+        ValueError,
+        match="must be that of the tuned file, but got t200, .* with --problem nominal, .*: leave --preset out",
+    ):
+        problems_in(nominal, preset="t200")

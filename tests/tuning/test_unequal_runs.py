@@ -9,12 +9,16 @@ from filters.consistency.report import consistency_report
 from tests.linear_problem import LinearProblem
 from thruster_env.model.affine import affine_model
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain, score_ratio
+from tuning.evaluation.sizes import close_size
 from tuning.likelihood.gradient import goal_of
+from tuning.likelihood.identifiability import identify
 from tuning.problems.check import check_data, checked_problem
 from tuning.problems.data import Data, mask_of, only, padded
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import RunsProblem, log_of
 from tuning.reporting.time_figures import one_run
+from tuning.search.plan import Plan
+from tuning.search.space import untuned_choice
 
 LENGTHS, FIRST, SCALE = (75, 40, 61, 40, 28), 10, np.array([0.3, np.inf, 0.5])
 MODEL = LinearProblem().model()
@@ -178,6 +182,23 @@ def test_logs_with_a_truth_are_not_cut_to_the_shortest():
     logs = [log_of(one, MODEL, 0.1, f"log {place}") for place, one in enumerate(gap)]
     problem = checked_problem(LogProblem(logs, MODEL, lead=10))
     assert all(problem.data([seed]).scored_counts[0] > 0 for seed in range(len(problem.parts.blocks)))
+
+
+def test_other_results_know_of_the_mask():
+    problem = RunsProblem(runs_of((30, 47, 33, 52, 26, 61)), MODEL, first_scored_step=3)
+    plan = Plan("enkf", (problem,), objectives=("likelihood",))
+    choice, data = untuned_choice("enkf", problem), plan.training_data()
+    assert close_size(choice, plan, data) in (5, 8, 10, 12, 15, 20, 30, 50, 75, 100, 150, 200)
+    kf = untuned_choice("kf", problem)
+    ends = problem.data(problem.parts.training)
+    space = Plan("kf", (problem,)).space()
+    tidy, junk = (identify(kf, (problem,), [one], space) for one in (ends, ends._replace(inputs=_late_junk(ends))))
+    np.testing.assert_array_equal(tidy.cov, junk.cov)
+
+
+def _late_junk(data):
+    past = np.arange(data.steps) + 1 >= data.rows[:, None]
+    return np.where(past[..., None], 1e9, data.inputs)
 
 
 BAD = {

@@ -3,6 +3,7 @@
 
 import copy
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -14,14 +15,22 @@ import pytest
 
 import tuning
 from filters import EstimateState
+from filters.engine.batch import run
+from filters.tuned_file import read_tuned_file
 from tests import pendulum_problem
 from tests.tuned_files import rewrite
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
+from thruster_env.core.compiled import interpreted
 from tuning.api.verify import verify
+from tuning.evaluation.baselines import SCALED
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_choice, read_tuned, write_tuned
+from tuning.likelihood.gradient import tune_by_gradient
+from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, find_same
+from tuning.search.among_types import noise_by_gradient
 from tuning.search.plan import Plan
+from tuning.search.space import choice_of, parameters
 from tuning.search.study import open_study, run_study
 from tuning.thruster.scenario import find_scenario
 
@@ -75,6 +84,40 @@ def test_by_the_command_line_a_module_of_one_s_own_is_tuned_evaluated_verified_a
         info = env.step(np.array([1.0], dtype=np.float32))[-1]
     wrong = np.array(info["estimate"]) - env.unwrapped.state
     assert abs(np.angle(np.exp(1j * wrong[0]))) < 0.1 and abs(wrong[1]) < 0.5
+
+
+@pytest.mark.slow
+def test_by_python_a_study_of_one_number_comes_near_its_most_likely_value(tuned):
+    path, result, problem = tuned
+    assert (
+        set(result.trials[0].params) == {"sigma"} and result.validation.chosen == SCALED
+    )  # whose Q sigma cannot give
+    assert read_tuned(path, [problem]) == (result.choice, problem, 0) and verify(path, problem=[problem]).holds
+    content = read_tuned_file(path)
+    assert content["problem"] == problem.name and content["digest"] == problem.digest and content["plant"] is None
+    assert content["model"]["states"][0] == ["angle", "theta", "rad", True] and content["model"]["dt"] == 0.05
+    assert content["problems"] == {problem.name: {"digest": problem.digest, "content": None}}
+    (data,) = Plan("ekf", (problem,)).training_data()
+    found = tune_by_gradient("ekf", problem, data)
+    assert found.names == ("sigma",) and found.agree and found.identified.all()
+
+    def log_likelihood(factor):
+        choice = choice_of("ekf", {"sigma": factor * found.choice.model["sigma"]}, problem)
+        return run(choice.filter(problem), data.filter_keys, data.inputs, data.measurements).log_likelihoods.sum()
+
+    assert log_likelihood(1.0) == pytest.approx(found.best.value, rel=1e-9)
+    assert log_likelihood(1.0) > max(log_likelihood(0.95), log_likelihood(1.05))
+
+
+def test_a_number_that_changes_functions_has_no_gradient():
+    def of_step(dt):
+        return pendulum_problem.model(transition=lambda x, u, c: (x[0] + dt * x[1], x[1]))
+
+    problem = pendulum_problem.problem(of_step, parameters=[pendulum_problem.Parameter("dt", 0.1, 1.0)])
+    with pytest.raises(ValueError, match="must change numbers of the model alone, but dt changes its functions"):
+        tune_by_gradient("ekf", problem, problem.data([1, 2]))
+    plan = Plan("ekf", (problem,))
+    assert noise_by_gradient(open_study("functions", plan), plan) is None
 
 
 def pendulum(dt=0.05, model=None):
@@ -203,6 +246,20 @@ def test_what_is_no_problem_is_one_clear_line(text, name, line, thruster, tmp_pa
     done = thruster("evaluate", "--filter", "ekf", "--problem", name)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and done.stderr.startswith("thruster: ")
     sys.modules.pop("my_bad", None)
+
+
+def test_the_problems_of_the_page_are_problems():
+    page = (Path(__file__).parents[2] / "docs" / "problems.md").read_text(encoding="utf-8")
+    names = {}
+    for code in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
+        exec(compile(code, "docs/problems.md", "exec"), names)
+    with interpreted():
+        assert [one.symbol for one in checked_problem(names["problem"]).quantities.states] == ["theta", "omega"]
+        assert [one.name for one in parameters("kf", checked_problem(names["pair"]))] == ["Q11", "Q22", "R"]
+        assert [one.name for one in parameters("kf", checked_problem(names["one_number"]))] == ["sigma_a"]
+        tank, level = names["tank"], (0.008 / 0.002) ** 2 / 19.62  # where as much flows out as in
+        stands = tank.transition((level, 0.008), (0.008,), tank.constants)
+        np.testing.assert_allclose(stands, (level, 0.008), rtol=1e-12)
 
 
 def test_a_file_on_an_object_of_the_users_says_how_to_give_it(tuned, tmp_path):

@@ -48,11 +48,13 @@ from tuning.search.plan import (
     range_warning,
     range_words,
 )
-from tuning.search.space import untuned_choice
+from tuning.search.space import Choice, untuned_choice
 from tuning.search.study import StudyResult, answered_by, open_study, run_study
 from tuning.search.trials import near
 from tuning.search.validation import (
+    Failure,
     Met,
+    Validation,
     _baselines_of,
     _best_of,
     _by_log_score,
@@ -61,6 +63,7 @@ from tuning.search.validation import (
     as_data,
     choice_from,
     finalists_of,
+    validate,
 )
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -207,6 +210,21 @@ def test_trials_are_rescaled_and_validated_with_the_size_that_they_end_with_and_
     assert baseline_size(untuned_choice("kf", problem)) is None
 
 
+def test_the_report_says_with_how_many_members_filters_met_and_which_a_baseline_is_taken_with():
+    def of_size(name, value, size):
+        met = _met(name, value, value - 0.01, value + 0.01)
+        return met._replace(choice=Choice("enkf", {}, {"ensemble_size": size}))
+
+    plan = Plan("enkf", (LinearProblem(),))
+    pair = of_size(GIVEN, 1.0, 200), of_size("trial 3", 1.01, 200)
+    meeting = Validation((7, 8), True, pair, GIVEN, "trial 3", GIVEN, None)
+    first, second = choice_sentences(as_data(meeting), plan)
+    assert first.startswith("The study returns the given filter with N = 200 members: on 2 validation seeds no ")
+    assert second == "Trials and baselines have N = 200 members here."
+    small = meeting._replace(met=(of_size(GIVEN, 1.0, 30), of_size("trial 3", 0.9, 14)), chosen="trial 3")
+    assert choice_sentences(as_data(small), plan)[1] == "Trials have N = 14 members here, baselines 30."
+
+
 def test_the_answer_of_a_gradient_gives_way_to_a_baseline_as_trials_do(monkeypatch):
     problem = LinearProblem(2, 1, steps=30)
     plan, result = Plan("kf", (problem,)), StudyResult(untuned_choice("kf", problem), 1.0, [], [], 0.0, False)
@@ -222,6 +240,17 @@ def test_the_answer_of_a_gradient_gives_way_to_a_baseline_as_trials_do(monkeypat
     found = answered_by(result, plan, "optimum of the likelihood", oracle("kf", problem))
     assert found.choice == oracle("kf", problem) and found.validation.chosen == "optimum of the likelihood"
     assert [one.name for one in found.validation.met] == [GIVEN, "optimum of the likelihood"]  # none is rescaled
+
+
+def test_what_the_log_score_chose_is_said_with_the_nees_of_both():
+    plan, trial = Plan("kf", (LinearProblem(),)), _met("trial 3", 0.96, 0.95, 0.97, True, -1e5)
+    trial = trial._replace(nees=54845.0, state_nees=2.5)
+    given = _met(GIVEN, 1.0, 1.0, 1.0)._replace(nees=2.35, state_nees=3.5)
+    met = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", GIVEN, None, by_error="trial 3")
+    (said,) = choice_sentences(json.loads(json.dumps(as_data(met))), plan)
+    assert met.gave_way and said.startswith("The study returns the given filter for its log score")
+    assert "1.042 times the score" in said and "that of trial 3 is 54845 times" in said
+    assert "NEES is 2.35 times its expected value (3.5 times in the farthest state)" in said
 
 
 def test_a_paired_ratio_has_the_interval_of_the_jackknife_and_covers_as_it_says():
@@ -245,6 +274,45 @@ def test_an_objective_without_a_run_is_that_of_the_other_runs():
     likely = Plan("kf", (problem,), objectives=("likelihood",))
     one, rest = (measured(choice, likely, [data.slice(0, count)]) for count in (6, 5))
     assert one.left_out[0][5] == pytest.approx(rest.value, rel=1e-12) and np.isfinite(one.proper)
+
+
+def test_no_trial_no_meeting_and_none_for_objectives_that_runs_have_not_each():
+    plan = Plan("kf", (LinearProblem(),), objectives=("nis",))
+    result = run_study(open_study("nis", plan), plan, 2)
+    assert result.validation is None and validate(plan, {}, plan.training_data()) is None
+
+
+def test_the_first_line_says_what_gave_way_and_what_consistency_would_cost():
+    plan = Plan("kf", (LinearProblem(),))
+    trial = _met("trial 3", 1.01, 0.99, 1.02)
+    meeting = Validation((7, 8), True, (_met(GIVEN, 1.0, 1.0, 1.0), trial), GIVEN, "trial 3", GIVEN, None)
+    (said,) = choice_sentences(as_data(meeting), plan)
+    assert said.startswith(
+        "The study returns the given filter: on 2 validation seeds no trial is significantly better (trial 3's "
+        "score is 1.010 [0.990, 1.020] times as large)."
+    )
+    paid = meeting._replace(met=(*meeting.met, _met("trial 4", 0.4, 0.3, 0.5, False, 5.0)), candidate="trial 4")
+    said = choice_sentences(as_data(paid._replace(chosen="trial 4", price=1.742)), plan)
+    assert (
+        "The study returns trial 4: on 2 validation seeds its score is 0.400 [0.300, 0.500] times that of"
+        in said[0]
+    )
+    assert "would cost 174 % of the score" in said[1] and "where 2 is right" in said[1]
+    assert choice_sentences(None, plan) == []
+
+
+def test_a_choice_outside_the_nis_band_is_in_the_headline_whatever_chose_it():
+    plan, baseline = Plan("kf", (LinearProblem(),)), _met(GIVEN, 1.0, 1.0, 1.0, True)
+    rescaled = _met("trial 3 rescaled", 0.5, 0.4, 0.6, False)._replace(nis=0.09)
+    met = Validation((7, 8), True, (baseline, rescaled), GIVEN, "trial 3 rescaled", "trial 3 rescaled", 0.0)
+    _, said = choice_sentences(as_data(met), plan)
+    assert said == (
+        "On 2 validation seeds the mean NIS of trial 3 rescaled is 0.18, outside its band, 1.6 to 2.5, where 2 is "
+        "right: do not rely on its innovation covariance."
+    )
+    inside = met._replace(met=(baseline, rescaled._replace(consistent=True)))
+    assert len(choice_sentences(as_data(inside), plan)) == 1
+    assert len(choice_sentences(as_data(met), plan._replace(consistent=False))) == 1
 
 
 def of_one_number(q=1.0):
@@ -272,6 +340,35 @@ def test_candidates_stay_within_own_parameters_and_a_full_q_is_an_option_that_th
         assert "] better on 100 validation seeds (--full-q)." in said
 
 
+def test_the_report_says_where_what_was_given_fails_and_why_a_trial_is_taken_or_not():
+    plan = Plan("kf", (LinearProblem(truth=False),), objectives=("likelihood",))
+    trial = _met("trial 3", -610.0, -1740.0, 523.0)._replace(chance=0.004)
+    failure = Failure("run2.csv from 12 to 13.5 s", 8.9, 1.4)
+    given = _met(GIVEN, 0.0, 0.0, 0.0)
+    meeting = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", "trial 3", None)
+    meeting = meeting._replace(tested=GIVEN, failures=(failure,), failed=1, runs=48)
+    assert choice_sentences(as_data(meeting), plan) == [
+        "The study returns trial 3: on 2 validation seeds its log-likelihood of a run is 610 [-523, 1740] above "
+        "that of the best baseline, the given filter, and it is better in most of them (Wilcoxon's signed ranks, "
+        "p = 0.004).",
+        "The given filter fails in 1 of 48 seeds, in run2.csv from 12 to 13.5 s (mean NIS 17.8; trial 3: 2.8); a "
+        "mean NIS of 2 is right.",
+    ]
+    lost = trial._replace(worse_in=("run1.csv",))
+    said = choice_sentences(as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
+    assert (
+        "no trial is significantly better without being worse in a log (trial 3's log-likelihood of a run is "
+        in said[0]
+    )
+    assert said[0].endswith("of a run is 610 [-523, 1740] higher, but it is worse in run1.csv).")
+    lost = lost._replace(over=Interval(8.9, -51.6, 69.4))
+    said = choice_sentences(as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
+    assert said[0].endswith(
+        "no trial is significantly better (trial 3's log-likelihood of a run is 8.9 [-51.6, 69.4] lower, and it "
+        "is worse in run1.csv)."
+    )
+
+
 def test_blocks_of_a_log_that_the_given_filter_cannot_follow_are_named():
     logs = logs_of(900, 900, 900)
     disturbed = logs[1].measurements.copy()
@@ -288,6 +385,24 @@ def test_blocks_of_a_log_that_the_given_filter_cannot_follow_are_named():
     assert likely and likely <= {*finalists_of(study.plan, study.trials, lambda one, _: one)}
     assert any("The given filter fails in" in sentence for sentence in study.chosen)
     assert met.met[0].name == GIVEN
+
+
+def test_where_own_numbers_give_way_to_a_noise_that_they_cannot_give_they_are_said():
+    plan, own = Plan("ekf", (altitude_problem.problem(),)), untuned_choice("ekf", altitude_problem.problem())
+    trial = _met("trial 3", 1.01, 0.99, 1.02)._replace(choice=own._replace(model={**own.model, "sigma_a": 0.25}))
+    noise, given = (
+        _met(FULL_Q, 1.0, 1.0, 1.0)._replace(choice=own._replace(model={"process_noise_cov": (1.0, 1.0, 1.0)})),
+        _met(GIVEN, 1.0, 1.0, 1.0)._replace(choice=own),
+    )
+    said = choice_sentences(
+        as_data(Validation((7, 8), True, (noise, trial), FULL_Q, "trial 3", FULL_Q, None)), plan
+    )
+    assert said[1].startswith(
+        "Your own parameters cannot express the Q and R of the noise estimation with a full Q; those of trial 3 "
+        "are sigma_a = 0.25, "
+    )
+    meeting = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", GIVEN, None)
+    assert len(choice_sentences(as_data(meeting), plan)) == 1
 
 
 def test_ranges_are_wide_hold_what_was_given_and_flag_what_ends_at_an_end():

@@ -32,6 +32,16 @@ def test_accelerations_are_the_printed_equations(k):
     np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11 * np.abs(expected).max())
 
 
+def test_models_of_any_size_move_alike():
+    c, (x, u) = derive_constants(SEGOROGENI), random_states(20)
+    x_t, u_t = tuple(x.T), tuple(u.T)
+    whole = np.array(dynamics.navigation_rates(x_t, u_t, c))
+    np.testing.assert_array_equal(dynamics.motion_rates(x_t[:8], u_t, c), whole[:8])
+    np.testing.assert_array_equal(dynamics.velocity_rates(x_t[:6], (*u_t, x_t[6], x_t[7]), c), whole[:6])
+    still = dynamics.current_rates(x_t, (*u_t, 0.0, 0.0, 0.0), c)
+    np.testing.assert_allclose(still, whole, rtol=1e-13, atol=1e-13)
+
+
 def test_a_current_carries_a_vehicle_that_moves_through_the_water_as_ever():
     c, drift = derive_constants(SEGOROGENI, 0.05), np.array([0.3, -0.2, 0.05])
     x = [1.0, 0.05, -0.02, 0.1, 0.1, 0.2, 0.1, -0.3, 0.5, 0.0, 0.0, 0.0]
@@ -47,6 +57,18 @@ def test_a_current_carries_a_vehicle_that_moves_through_the_water_as_ever():
         carried = dynamics.current_substep(carried, (*u, *drift), c)
     expected = np.array(still) + [*(9 * [0.0]), *(10.0 * drift)]
     np.testing.assert_allclose(over_ground(np.array(carried), -1.0), expected, atol=2e-5)
+
+
+MIRROR = np.array([1, -1, 1, -1, 1, -1, -1, 1, -1, 1, -1, 1])  # port for starboard
+
+
+@every_preset
+def test_port_and_starboard_are_alike_to_the_last_digit(k):
+    c, (x, u) = derive_constants(k, 0.05), random_states(50)
+    for a, b in zip(x, u, strict=True):
+        here = np.array(dynamics.navigation_substep(tuple(a.tolist()), tuple(b.tolist()), c))
+        mirrored = tuple((a * MIRROR).tolist()), tuple((b * [1, -1, 1, -1]).tolist())
+        np.testing.assert_array_equal(dynamics.navigation_substep(*mirrored, c), here * MIRROR)
 
 
 def on_floats(x, u, c):

@@ -1,6 +1,11 @@
 """The vehicle's env: its interface, its noise, its reward and its ends."""
 
+import copy
+import json
 import math
+import pickle
+import tomllib
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -9,6 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 import thruster_env.auv  # noqa: F401 - registers the envs
 from filters import EstimateState
+from thruster_env.auv.env import SegorogeniAUVVectorEnv
 from thruster_env.auv.equations import simulate as simulate_plant
 from thruster_env.auv.plant import make_plant
 from thruster_env.core.streams import draw_key
@@ -16,6 +22,7 @@ from thruster_env.model.simulate import simulate
 
 IDS = ["SegorogeniAUV-v0", "SegorogeniAUVPath-v0", "SegorogeniAUVDepth-v0"]
 every_id = pytest.mark.parametrize("name", IDS)
+CRUISE = np.array([2.845, 0.0, 0.0])
 EXACT = {"process_noise_cov": [0.0] * 12, "initial_state": {"speed": 1.0}}
 DISTURBED = {
     "sensors": {
@@ -55,6 +62,18 @@ def test_gymnasiums_checker_passes(name):
 def test_stable_baselines_checker_passes(name, recwarn):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     checker.check_env(gym.make(name).unwrapped, skip_render_check=True)
+
+
+def test_spaces_are_those_that_the_class_says():
+    env = gym.make("SegorogeniAUV-v0")
+    np.testing.assert_allclose(env.action_space.high, [4.0, math.radians(15), math.radians(15)], rtol=1e-6)
+    np.testing.assert_allclose(env.action_space.low, [0.0, -math.radians(15), -math.radians(15)], rtol=1e-6)
+    assert env.observation_space.shape == (10 + 4,) and env.unwrapped.appended_entries == 4
+    assert gym.make("SegorogeniAUVPath-v0").observation_space.shape == (14 + 6,)
+    assert gym.make("SegorogeniAUV-v0", propeller_torque=None).action_space.shape == (4,)
+    assert {gym.spec(name).max_episode_steps for name in IDS} == {1200, 600}
+    content = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())
+    assert content["project"]["entry-points"]["filters.plants"] == {"thruster_env": "thruster_env"}
 
 
 def test_truth_and_measurements_are_those_of_the_model_with_the_same_key():
@@ -149,6 +168,35 @@ def test_episodes_begin_where_they_are_told():
     assert depth[11] == 3.0
 
 
+def test_the_same_seed_gives_the_same_episode_and_the_action_leaves_the_noise_alone():
+    one, two = (infos_of(gym.make("SegorogeniAUV-v0", **DISTURBED), some_actions(5), seed=3) for _ in range(2))
+    np.testing.assert_equal(one, two)
+    other = infos_of(gym.make("SegorogeniAUV-v0", **DISTURBED), some_actions(5, 1), seed=3)
+    np.testing.assert_equal([i["current"] for i in other], [i["current"] for i in one])
+
+
+@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_copies_and_pickles_go_on_with_the_same_numbers(again):
+    for env, action in (
+        (gym.make("SegorogeniAUVPath-v0", **DISTURBED).unwrapped, CRUISE),
+        (SegorogeniAUVVectorEnv(2, **DISTURBED), np.tile(CRUISE, (2, 1))),
+    ):
+        env.reset(seed=1)
+        env.step(action)
+        other = again(env)
+        for _ in range(3):
+            np.testing.assert_equal(other.step(action), env.step(action))
+
+
+@every_id
+def test_an_env_survives_json(name):
+    env = gym.make(name, **DISTURBED)
+    content = env.spec.to_json()
+    assert json.loads(content)["kwargs"]["plane_lag"] == 0.1
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(content))
+    np.testing.assert_equal(infos_of(again, some_actions(3), seed=2), infos_of(env, some_actions(3), seed=2))
+
+
 WRONG = [
     ({"sensors": "sonar"}, "sensors must be one of default, motion"),
     ({"sensors": ["u", "u"]}, "sensors must name each channel once"),
@@ -197,6 +245,13 @@ def test_the_env_offers_the_smaller_model_that_predicts_all_channels(sensors, st
     observation, info = env.reset(seed=0)
     flags = env.unwrapped.appended_entries
     assert observation.shape == (states + flags,) and info["estimate_cov"].shape == (states, states)
+
+
+def test_six_velocities_are_a_model_of_the_papers_sensors():
+    arguments = {"states": "velocities"}
+    env = EstimateState(gym.make("SegorogeniAUV-v0", sensors="papers"), filter="ekf", model_arguments=arguments)
+    env.reset(seed=0)
+    assert env.filter.model.n == 6 and np.isfinite(env.step(CRUISE)[-1]["estimate"]).all()
 
 
 def test_a_model_that_cannot_predict_a_channel_is_refused():

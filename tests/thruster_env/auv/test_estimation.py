@@ -35,3 +35,14 @@ def test_the_extended_filter_of_eight_states_is_consistent_and_meets_the_referen
     assert 0.1 < nees.std(ddof=1) < 0.9
     ratio = rmse / riccati_reference(model, inputs[:3, :400])
     assert (np.abs(ratio - 1.0) < [0.03, 0.03, 0.03, 0.05, 0.05, 0.03, 0.05, 0.12]).all(), ratio
+
+
+@pytest.mark.usefixtures("as_python")
+def test_the_unscented_filter_agrees_with_the_extended_one(problem):
+    """Nonlinearity is weak between measurements: they differ by a hundredth of a standard deviation."""
+    model, keys, inputs, truth = problem
+    given = keys[:1], inputs[:1, :25], truth.measurements[:1, :26]
+    extended, unscented = (run(make_filter(name, model), *given) for name in ("ekf", "ukf"))
+    deviations = np.sqrt(np.diagonal(extended.covs, axis1=2, axis2=3))
+    assert (np.abs(unscented.means - extended.means) < 0.05 * deviations).all()
+    np.testing.assert_allclose(unscented.covs[:, 10:], extended.covs[:, 10:], rtol=0.05, atol=1e-9)

@@ -1,12 +1,18 @@
+import pickle
+
 import numpy as np
 import pytest
 
+from filters import FILTERS, make_filter
+from filters.registry import filter_type
 from tests.thruster_env.auv.textbook import random_states
 from thruster_env.auv import dynamics
-from thruster_env.auv.model import MODEL_ARGUMENTS, auv_model, model_of_plant
+from thruster_env.auv.model import MODEL_ARGUMENTS, MODELS, auv_model, model_of_plant
 from thruster_env.auv.parameters import SEGOROGENI, derive_constants
 from thruster_env.auv.plant import make_plant
 from thruster_env.model.affine import linearize
+
+SENSORS = {"velocities": "papers", "motion": "motion", "navigation": "usbl", "current": "usbl"}
 
 
 def given(model, seed=0):
@@ -81,6 +87,20 @@ def test_the_papers_integrate_by_euler():
     np.testing.assert_allclose(model.transition_jacobian(x, u, c), slopes, atol=1e-8)
 
 
+def test_models_name_what_they_are_made_of():
+    for states, steps in MODELS.items():
+        model, count = auv_model(states=states), steps.count
+        assert (model.n, len(model.states)) == (count, count)
+        assert [one.symbol for one in model.states if one.angle] == ["psi"] * (count >= 12)
+        assert tuple(model.outputs) == (("U",) if count == 6 else ("U", "z_dot", "psi_dot"))
+        assert (model.state_low < model.state_high).all() and model.state_low[0] == 0.0
+        np.testing.assert_array_equal(model.operating_state, np.eye(count)[0])
+        assert model.operating_input[0] == pytest.approx(2.845, abs=1e-3)
+        assert pickle.loads(pickle.dumps(model)).digest == model.digest
+    assert auv_model().m == 8 and auv_model(states="velocities").m == 6 and auv_model(states="navigation").m == 10
+    assert auv_model(propeller_torque=None).operating_input[1] == 0.0
+
+
 def test_the_smallest_closed_model_that_predicts_the_sensors_is_taken():
     assert auv_model(sensors=["u", "theta"]).n == auv_model(sensors="papers").n == 8
     assert auv_model(sensors=["u", "z"]).n == auv_model(sensors="default").n == 12
@@ -135,3 +155,30 @@ def test_what_makes_no_model_is_told_in_a_line(arguments, message):
     with pytest.raises(ValueError) as error:
         auv_model(**arguments)
     assert str(error.value).startswith(message) and "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("states", MODELS)
+def test_every_filter_runs(states):
+    """Interpreted, one step each, on other states one of each kind; fuzzy rules for speed and rates of turn."""
+    model = auv_model(states=states, sensors=SENSORS[states])
+    u, z = (
+        np.array(model.operating_input),
+        np.array(model.observe(tuple(model.prior_mean.tolist()), model.constants)),
+    )
+    for name in FILTERS if states == "motion" else ("kf", "ekf", "ukf", "vb", "enkf", "ensrf", "pf"):
+        numbers = {"ensemble_size": 10} if filter_type(name).has_ensemble else {}
+        numbers |= {"premises": [0, 4, 5]} if name == "fuzzy" else {}
+        filter_ = make_filter(name, model, **numbers)
+        belief = filter_.predict(filter_.init(), u)
+        belief, innovation = filter_.update(belief, z + 0.01)
+        assert np.isfinite(belief.mean).all(), name
+        assert abs(belief.mean[0] - 1.0) < 0.2 and belief.divergences == 0, name
+
+
+def test_the_fuzzy_filter_has_a_rule_for_each_corner_of_eight_states():
+    fuzzy = make_filter("fuzzy", auv_model(sensors="papers"))
+    assert fuzzy.premises == tuple(range(8))
+    with pytest.raises(ValueError, match="premises must name 1 to 8 different states"):
+        make_filter("fuzzy", auv_model(states="navigation"))

@@ -161,3 +161,15 @@ def test_a_controller_takes_one_observation_or_many_and_forgets_where_an_episode
     mixed, _ = controller.predict(observations, state + 1.0, np.array([True, False]))
     np.testing.assert_array_equal(mixed[0], fresh[0])
     assert not np.array_equal(mixed[1], fresh[1])
+
+
+@as_python
+def test_a_controller_needs_a_path_and_its_sensors():
+    with pytest.raises(ValueError, match="an env must observe its path, as SegorogeniAUVPath-v0 does, but got"):
+        DepthAndCourse.for_env(gym.make("SegorogeniAUV-v0"))
+    with pytest.raises(
+        ValueError, match="sensors must include u, q, r and theta for a controller without a filter"
+    ):
+        DepthAndCourse.for_env(gym.make(PATH, sensors="papers"))
+    with pytest.raises(ValueError, match="seen must be one of measurement, motion, navigation, but got 'stars'"):
+        DepthAndCourse.for_env(gym.make(PATH), "stars")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thruster_env.auv.equations import simulate
-from thruster_env.auv.plant import CHANNELS, INSTRUMENTS, SUITES, VEHICLE_SENSOR_EFFECTS, make_plant
+from thruster_env.auv.plant import CHANNELS, INSTRUMENTS, SUITES, VEHICLE_SENSOR_EFFECTS, make_current, make_plant
 from thruster_env.effects.sensors import SENSOR_EFFECTS
 
 pytestmark = pytest.mark.usefixtures("as_python")
@@ -29,6 +29,12 @@ def test_each_channel_of_a_suite_comes_at_the_rate_of_its_instrument():
         every = round(20.0 / instrument.rate)
         np.testing.assert_array_equal(valid[:, i], np.arange(81) % every == 0, err_msg=name)
     assert plant.measurement_noise_cov[0, 0] == 0.02**2 and len(plant.channels) == len(CHANNELS)
+
+
+@pytest.mark.parametrize("dt, every", [(0.05, 4), (0.01, 20), (0.2, 1), (1.0, 1)])
+def test_a_rate_is_kept_at_another_sample_time(dt, every):
+    chain = make_plant(sensors=["u"], dt=dt, substeps=1).sensors["u"]
+    assert [effect.steps for effect in chain] == ([every] if every > 1 else [])
 
 
 def test_between_samples_the_last_one_is_repeated_and_flagged():
@@ -69,6 +75,13 @@ def test_a_vehicle_adrift_takes_on_the_velocity_of_the_current():
     assert left[1599] < 0.1 * left[0] and left[1599] < left[799] < 0.2 * left[0]
 
 
+def test_adrift_from_the_start_nothing_changes():
+    still = [0.3, -0.2, 0.1] + [0.0] * 9  # at rest in the water: body axes are those of the earth
+    states = run([0.0, 0.0, 0.0], 40, current=still[:3], initial_state=still).states[0]
+    np.testing.assert_allclose(states[:, :9], np.broadcast_to(still[:9], (41, 9)), atol=1e-13)
+    np.testing.assert_allclose(states[-1, 9:], np.multiply(2.0, still[:3]), rtol=1e-12)
+
+
 def test_in_steady_water_the_motion_is_that_of_still_water_carried_along():
     """Galilean invariance: over ground minus the current's way and velocity, with the planes at work."""
     actions = np.random.default_rng(1).uniform([2.0, -0.2, -0.2], [4.0, 0.2, 0.2], (1, 60, 3))
@@ -96,3 +109,9 @@ def test_a_gauss_markov_current_is_stationary_in_the_earths_axes():
     assert east.mean() == pytest.approx(1.0, abs=0.1) and east.std() == pytest.approx(0.2, rel=0.2)
     lag = np.corrcoef(east[:-1], east[1:])[0, 1]
     assert lag == pytest.approx(math.exp(-0.1), abs=0.04)
+
+
+def test_currents_have_one_form():
+    assert make_current(None) == {} == make_current([0.0, 0, 0])
+    assert make_current({"down": 0.1}) == make_current({"down": [{"name": "constant", "value": 0.1}]})
+    assert list(make_current({"east": 0.1, "north": 0.2})) == ["north", "east"]

@@ -10,7 +10,7 @@ import thruster_env.auv  # noqa: F401 - registers the envs
 from filters import wrappers as ids
 from filters.wrappers.envs import EstimateState, EstimateStates
 from tests.thruster_env.auv.test_env import DISTURBED
-from tests.thruster_env.thruster.test_vector_env import assert_copies_are_single_envs, every_mode
+from tests.thruster_env.thruster.test_vector_env import NEXT_STEP, assert_copies_are_single_envs, every_mode
 
 # Some begin beyond 80 degrees of pitch, or come there.
 WILD = DISTURBED | {"initial_state": {"mean": [1.0] + [0.0] * 11, "cov": [0.01] * 7 + [0.7] + [0.01] * 4}}
@@ -24,6 +24,13 @@ def test_a_copy_is_the_single_env_with_its_seed(name, mode):
     given = WILD | ({"hold_time": 0.1} if "Depth" in name else {})
     ends = assert_copies_are_single_envs(name, 3, mode, 30, 7, [0, 1, 2], inputs=3, **given)
     assert ends.all()
+
+
+def test_compiled_copies_of_several_blocks_are_single_envs():
+    ends = assert_copies_are_single_envs(
+        TASKS[1], 130, NEXT_STEP, 25, 12, [0, 127, 129], exact=range(5), inputs=3, ulps=16, **WILD
+    )
+    assert ends.sum() >= 6
 
 
 @pytest.mark.usefixtures("as_python")

@@ -152,6 +152,30 @@ def compare_rotated(filter_, other, angle, find):
     return find(filter_, keys, inputs, measurements), find(other, keys, inputs, rotated(measurements, angle))
 
 
+OTHERS = [
+    ("kf", {"form": "information"}),
+    ("kf", {"form": "square-root"}),
+    ("fuzzy", {"blending": "moments"}),
+    ("fuzzy", {"blending": "output"}),
+    ("ienkf", {"ensemble_size": 12, "inflation": 1.1, "relaxation": 0.5}),
+    ("ienkf", {"ensemble_size": 12, "inflation": 1.1, "window": 2}),
+    ("etkf", {"ensemble_size": 12, "inflation": 1.1, "relaxation": 0.5}),
+    ("ensrf", {"ensemble_size": 12, "rotations": 1}),
+    ("pf", {"ensemble_size": 12, "proposal": "optimal"}),
+    ("pf", {"ensemble_size": 12, "resampling": "gaussian"}),
+    ("pf", {"ensemble_size": 12, "smoothed": [1], "regularisation": 0.5}),
+    ("sage-husa", {"process_forgetting_factor": 0.9}),
+]
+
+
+@pytest.mark.parametrize(("name", "numbers"), OTHERS)
+@pytest.mark.usefixtures("as_python")
+def test_other_forms_of_filters_err_alike_across_the_cut(name, numbers):
+    _, plain, make = makers(name)
+    filters = (make_filter(name, model, **numbers) for model in (plain, make(3.0)))
+    assert_rotated(*reversed(compare_rotated(*filters, 3.0, run)), 3.0)
+
+
 def test_slopes_are_those_of_an_angle_at_the_cut():
     """Of functions that jump there, by central differences."""
     model = turning(wraps=True)
@@ -161,6 +185,21 @@ def test_slopes_are_those_of_an_angle_at_the_cut():
     np.testing.assert_allclose(found, [[1.0, 0.0], [DT, 1.0]], atol=1e-8)
     found = observation_slopes(model.functions, model.shape)((0.0, math.pi), (1.0, 1.0), (0.0,))
     np.testing.assert_allclose(found, [[0.0, 1.0], [1.0, 0.0]], atol=1e-8)
+
+
+def test_slopes_along_a_joint_parameter_are_those_of_an_angle_at_the_cut():
+    model = turning(
+        observe=lambda x, c: (turned(x[1] + c[0]), x[0]),
+        observe_jacobian=lambda x, c: ((0.0, 1.0), (1.0, 0.0)),
+        transition=lambda x, u, c: (x[0], turned(x[1] + c[0])),
+        transition_jacobian=lambda x, u, c: ((1.0, 0.0), (0.0, 1.0)),
+    )
+    joint = augmented_model(model, {0: Unknown(0.1)})
+    x = (0.0, math.pi - 0.3, 0.3)
+    np.testing.assert_allclose(joint.observe_jacobian(x, joint.constants)[0], [0.0, 1.0, 1.0], atol=1e-8)
+    np.testing.assert_allclose(
+        joint.transition_jacobian(x, (0.0,), joint.constants)[1], [0.0, 1.0, 1.0], atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("name", ["kf", "ekf", "ukf", "ckf", "enkf", "etkf"])
@@ -200,6 +239,15 @@ def test_joint_estimation_of_a_parameter_is_alike_across_the_cut():
     np.testing.assert_allclose(
         difference(found.means, reference.means + [0.0, 3.0, 0.0], flags), 0.0, atol=1e-8, rtol=0.0
     )
+
+
+def test_compiled_and_interpreted_agree_across_the_cut():
+    keys, inputs, measurements = data_of(turntable(angles=False))
+    filter_, measurements = make_filter("ckf", turntable(3.0)), rotated(measurements, 3.0)
+    compiled_run = run(filter_, keys, inputs, measurements)
+    with interpreted():
+        as_python = run(filter_, keys, inputs, measurements)
+    assert_rotated(compiled_run, as_python, 0.0)
 
 
 def of_columns(table, size):

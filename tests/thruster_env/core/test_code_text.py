@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from thruster_env.core.compiled import function_fingerprint
+from thruster_env.core.user_functions import code_text
 
 USERS = """
 import params
@@ -55,3 +56,7 @@ def test_another_number_in_another_file_is_another_code(monkeypatch, name):
     one, same, other = (getattr(users(monkeypatch, k), name) for k in (2.0, 2.0, 3.0))
     prints = [function_fingerprint(part) for part in (one, same, other)]
     assert prints[0] == prints[1] != prints[2]
+
+
+def test_objects_tell_nothing_for_their_addresses_differ(monkeypatch):
+    assert "object at" not in code_text(users(monkeypatch, 2.0).attribute)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from filters import make_filter
+from filters.estimators.foreign import Checks
 from tests.models import plane_model, random_affine
 from thruster_env.core.checks import correlation_flaws, covariance
 from thruster_env.model.continuous import densities_of, noise_of_densities
@@ -94,6 +95,13 @@ def test_models_filters_and_beliefs_have_this_rule():
     filter_.predict(belief._replace(cov=np.diag([1e-12, 1.0, 1e16])), [0.0])
 
 
+def test_an_estimator_s_covariance_beside_a_large_one_is_refused_too():
+    checks = Checks("mine", 3, 1, True)
+    with pytest.raises(ValueError, match="must be symmetric and positive semidefinite"):
+        checks.output((np.zeros(3), beside(BLOCK, 1e12)), "step 1")
+    assert checks.output((np.zeros(3), np.diag([1e-9, 1.0, 1e9])), "step 1").cov.shape == (3, 3)
+
+
 @pytest.mark.parametrize(("n", "known"), [(2, False), (2, True), (6, False), (6, True)])
 @pytest.mark.usefixtures("as_python")
 def test_what_a_filter_itself_makes_of_a_belief_it_takes_again(n, known):
@@ -120,3 +128,10 @@ def test_densities_of_a_q_are_those_it_was_made_of(dt, unit):
     a, densities = a * units[:, None] / units, in_units(np.diag([0.0, 0.0, 2.0]), *units)
     found = densities_of(noise_of_densities(densities, a, dt), a, dt)
     np.testing.assert_allclose(found, densities, rtol=1e-9)
+
+
+def test_a_variance_far_below_zero_is_refused_where_its_correlation_is_beyond_float64():
+    filter_ = make_filter("ekf", plane_model(prior_cov=[1e-4] * len(plane_model().prior_mean)))
+    belief = filter_.init((1, 2))
+    with pytest.raises(ValueError, match="cov of a belief must be"):
+        filter_.update(belief._replace(cov=np.full_like(belief.cov, -1e308)), np.zeros(filter_.model.m))

@@ -16,6 +16,7 @@ import pytest
 from filters import make_filter, run
 from tests.models import state_space
 from thruster_env.core import equal_functions
+from thruster_env.core.derivatives import runge_kutta
 from thruster_env.core.equal_functions import first_equal
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
@@ -414,6 +415,10 @@ def test_functions_are_forgotten_with_their_last_user():
     assert (len(equal_functions._first), len(equal_functions._used)) == before
 
 
+def test_functions_of_modules_are_themselves():
+    assert first_equal(with_number) is with_number and first_equal(math.sin) is math.sin and first_equal(3) == 3
+
+
 class Numbers(NamedTuple):
     gain: float
     substep: float = 0.1
@@ -472,6 +477,14 @@ def test_models_of_a_factory_share_what_is_compiled_for_them(make):
     assert (one.functions, one.shape) == (other.functions, other.shape)
     assert all(a is None or a != b for a, b in zip(one.functions, different.functions, strict=True))
     assert different.functions.observe((1.0,), different.given_constants) == (0.25,)
+
+
+def test_makers_know_equal_rates():
+    assert runge_kutta(with_rates(), 1) is runge_kutta(with_rates(), 1)
+
+
+def with_rates():
+    return lambda x, u, c: (-x[0],)
 
 
 def test_functions_that_were_made_of_those_of_modules_can_still_be_pickled():

@@ -65,6 +65,19 @@ def test_a_link_that_leads_nowhere_makes_the_file(here):
     assert (here / "link").is_symlink() and (here / "there.json").read_text() == "new"
 
 
+def test_links_in_a_circle_and_links_to_where_nothing_can_be_are_refused(here):
+    (here / "a").symlink_to("b")
+    (here / "b").symlink_to("a")
+    (here / "c").symlink_to("/proc/no-such-place/c.json")
+    (here / "d").symlink_to(".")
+    rules = {"a": "Too many levels of symbolic links", "c": "No such file or directory", "d": "it is a folder"}
+    for name, rule in rules.items():
+        for door in (check_target, lambda path: write_whole(path, "new")):
+            with pytest.raises(ValueError, match=f"must be where it can be written, but {name} is not: {rule}$"):
+                door(name)
+    assert names(here) == ["a", "b", "c", "d"] and all((here / name).is_symlink() for name in rules)
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everything")
 def test_a_read_only_file_and_a_link_into_a_read_only_folder_are_refused(here):
     (here / "kept.json").write_text("old")
@@ -108,6 +121,22 @@ def test_a_device_is_written_to_and_stays_a_device(here, minor, full):
     else:
         write_whole("device", "new")
     assert stat.S_ISCHR((here / "device").stat().st_mode) and names(here) == ["device"]
+
+
+def test_one_s_own_standard_output_is_not_replaced(here):
+    """As in `thruster ... --json /dev/stdout > all.txt`, where the path leads to a regular file."""
+    kept = os.dup(1)
+    try:
+        with open("all.txt", "wb") as stream:
+            os.dup2(stream.fileno(), 1)
+        os.write(1, b"tables\n")
+        (here / "stdout").symlink_to("/dev/fd/1")
+        check_target("stdout")
+        write_whole("stdout", "{}\n")
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+    assert (here / "all.txt").read_bytes() == b"tables\n{}\n"
 
 
 def test_a_failure_leaves_the_old_file_and_nothing_aside(here):

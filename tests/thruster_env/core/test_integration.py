@@ -5,6 +5,8 @@ import pytest
 
 from thruster_env.core.derivatives import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
 from thruster_env.core.streams import nearest_whole
+from thruster_env.graphs.loops import Loops
+from thruster_env.model.traced import array_valued
 
 
 class Step:
@@ -36,6 +38,11 @@ def test_the_jacobian_of_a_step_is_its_slope_and_of_small_models_a_tuple(step, j
     assert type(found) is tuple and type(found[0]) is tuple
 
 
+def test_the_same_rates_give_the_same_step_so_that_a_model_made_anew_is_not_compiled_anew():
+    assert runge_kutta(oscillators, 2) is runge_kutta(oscillators, 2)
+    assert euler(oscillators, 2) is euler(oscillators, 2)
+
+
 def test_a_state_of_another_size_than_count_is_refused():
     with pytest.raises(ValueError, match=r"count of runge_kutta.* must be the number of states, but got 2"):
         runge_kutta(oscillators, 2)((1.0, 0.0, 1.0, 0.0), (0.0,), Step)
@@ -43,6 +50,23 @@ def test_a_state_of_another_size_than_count_is_refused():
 
 def test_euler_is_the_first_order_of_runge_kutta():
     assert euler(oscillators, 2)((1.0, 0.5), (0.0,), Step) == (1.05, 0.5 + 0.1 * (-1.0 - 0.25))
+
+
+def rows_of_six(x):
+    other = (0.0, 0.0, x[1], 0.0, 0.0, 0.0)
+    return (x[0], 1.0, 2, 3.0, 4.0, 5.0), other, other, other, other, other
+
+
+def test_rows_of_a_large_matrix_are_compiled_and_not_run_as_python():
+    rows = array_valued(rows_of_six, "x", 6, 6)
+
+    def evaluate(x, out):
+        out[:] = rows(x)
+
+    function, result = Loops(evaluate), np.empty((6, 6))
+    function((7.0, 8.0), result)
+    assert not function.in_python
+    np.testing.assert_array_equal(result, rows_of_six((7.0, 8.0)))
 
 
 def test_the_nearest_whole_number_is_found_on_either_side():

@@ -38,6 +38,14 @@ def test_products_are_those_of_numpy(rows, inner, columns):
 
 
 @pytest.mark.parametrize("size", SIZES)
+def test_a_symmetric_sum_is_exactly_symmetric(size):
+    a, b = random(size, size), random(size, size) + 0.1
+    total = np.array(matrices.symmetric_sum(size)(rows_of(a), rows_of(b)))
+    assert (total == total.T).all()
+    np.testing.assert_allclose(total, (a + b + (a + b).T) / 2, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("size", SIZES)
 def test_a_mask_cuts_correlations_to_missing_channels_only(size):
     r = random_covariance(size)
     for missing in range(size):
@@ -127,3 +135,9 @@ def test_the_triangular_root_is_that_of_a_qr_decomposition(rows, columns):
     root = np.array(matrices.triangular_root(rows, columns)(rows_of(a)))
     expected = np.linalg.qr(a.T, mode="r").T
     np.testing.assert_allclose(root, expected * np.sign(np.diag(expected)), rtol=1e-12, atol=1e-13)
+
+
+def test_the_triangular_root_of_a_matrix_with_zero_rows_is_finite():
+    a = np.array([[1.0, 2.0, 2.0], [0.0, 0.0, 0.0], [2.0, 4.0, 4.0]])
+    root = np.array(matrices.triangular_root(3, 3)(rows_of(a)))
+    np.testing.assert_allclose(root @ root.T, a @ a.T, rtol=1e-14)

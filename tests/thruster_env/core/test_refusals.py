@@ -9,11 +9,17 @@ import pytest
 
 from thruster_env.core import compiled
 from thruster_env.core.compiled import Instead, compiled_in_place_of
+from thruster_env.core.sources import Source
 from thruster_env.graphs import loops
 from thruster_env.graphs.loops import Loops
 from thruster_env.model.traced import called_function
 
 FAULT = "a fault of the package and not of the model: please report it"
+
+
+def broken_maker(n: int):
+    """A function with a name that it does not define."""
+    return Source("magnitude", "row", work=n).function("cov + 1.0")
 
 
 def called_by_ours(function):
@@ -57,6 +63,12 @@ def warning_of(function) -> str:
     return said
 
 
+def test_a_broken_function_of_ours_is_a_fault_to_report():
+    said = warning_of(broken_maker(3))
+    assert said.endswith(FAULT) and "\n" not in said
+    assert "magnitude" in said and "cov" in said
+
+
 @pytest.mark.parametrize("function", [of_text, Times(), functools.partial(of_text)])
 def test_a_model_that_numba_refuses_is_none(function):
     of_model = called_function(function, "x, c", (1, 0), 0, (1,))
@@ -76,6 +88,14 @@ def test_a_disk_without_room_is_neither(monkeypatch):
     monkeypatch.setattr(loops, "code_of", full)
     x = np.array([-2.0])
     with pytest.warns(UserWarning, match="machine code of it could not be made: .*No space left"):
+        Loops(called_by_ours(abs))(x)
+    assert x[0] == 3.0
+
+
+def test_what_compiles_is_quiet():
+    x = np.array([-2.0])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", ".*runs as Python")
         Loops(called_by_ours(abs))(x)
     assert x[0] == 3.0
 

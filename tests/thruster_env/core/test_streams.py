@@ -51,6 +51,13 @@ def test_philox_gives_the_known_answers_on_arrays():
     np.testing.assert_array_equal(streams.philox(tuple(counters), tuple(keys)), words)
 
 
+def test_counter_is_block_step_stream_and_zero():
+    counter = tuple(map(np.uint64, (7, 8, 3, 0)))
+    words = streams.philox(counter, (np.uint64(5), np.uint64(4294967295)))
+    uniforms = streams.uniform_block(7, 8.0, 3, 5.0, 4294967295.0)
+    assert uniforms == tuple((int(word) + 0.5) / 2**32 for word in words)
+
+
 def test_logarithm_agrees_with_the_library():
     u = np.concatenate([np.logspace(-300, 300, 20_001), np.linspace(2.0**-33, 1 - 2.0**-33, 20_000)])
     u = u[u != 1.0]
@@ -80,6 +87,16 @@ def test_normals_are_box_and_mullers():
         radius, angle = math.sqrt(-2 * math.log(a)), 2 * math.pi * (b - 0.5)
         expected += [radius * math.cos(angle), radius * math.sin(angle)]
     np.testing.assert_allclose(streams.normal_block(3, 17, streams.INITIAL, *KEY), expected, atol=1e-13)
+
+
+# The bounds below are five standard errors: a right generator fails one of them with probability 6e-7.
+def test_moments_are_those_of_a_normal(normals):
+    for z in (*normals, normals.ravel()):
+        n = z.size
+        assert abs(z.mean()) < 5 / math.sqrt(n)
+        assert abs((z**2).mean() - 1) < 5 * math.sqrt(2 / n)
+        assert abs((z**3).mean()) < 5 * math.sqrt(15 / n)
+        assert abs((z**4).mean() - 3) < 5 * math.sqrt(96 / n)
 
 
 def test_distribution_is_normal(normals):
@@ -115,6 +132,19 @@ def test_neighbours_are_independent(changes):
         assert np.abs(correlation).max() < 5.5 / math.sqrt(steps.size)
 
 
+def test_streams_are_seven_different_words():
+    names = "PROCESS MEASUREMENT INITIAL EXCITATION FILTER_PROCESS FILTER_MEASUREMENT FILTER_PRIOR".split()
+    assert len({getattr(streams, name) for name in names}) == 7
+
+
+def test_arrays_and_scalars_give_the_same_numbers():
+    steps = np.arange(20)
+    many = np.array(streams.normal_block(2, steps, streams.MEASUREMENT, *KEY))
+    for step in steps:
+        one = streams.normal_block(2, float(step), streams.MEASUREMENT, *KEY)
+        np.testing.assert_allclose(one, many[:, step], rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("step", [5, 64, 1000.0])
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 64])
 def test_channels_are_filled_in_the_order_of_the_blocks(count, step):
@@ -140,6 +170,13 @@ def test_compiled_normals_are_the_interpreted_ones():
         np.testing.assert_allclose(out, expected, rtol=0, atol=1e-12)
 
 
+def test_keys_are_pairs_of_32_bit_words():
+    keys = streams.episode_keys(range(200))
+    assert keys.shape == (200, 2) and keys.dtype == np.float64
+    assert (keys == np.floor(keys)).all() and keys.min() >= 0 and keys.max() < 2**32
+    assert len(np.unique(keys)) == 400
+
+
 def test_episode_keys_are_what_the_env_draws_at_a_seeded_reset():
     seeds = [0, 1, 12345, 2**40]
     start = simulate(make_plant(), streams.episode_keys(seeds), np.empty((len(seeds), 0)))
@@ -157,6 +194,11 @@ def test_filter_keys_are_reproducible_and_not_the_episodes():
     np.testing.assert_array_equal(keys, streams.filter_keys(seeds))
     np.testing.assert_array_equal(keys[7], streams.draw_key(streams.filter_generator(7)))
     assert len(np.unique(np.concatenate([keys, streams.episode_keys(seeds)]))) == 200
+
+
+def test_without_a_seed_two_filters_draw_different_keys():
+    first, second = (streams.draw_key(streams.filter_generator(None)) for _ in range(2))
+    assert (first != second).all()
 
 
 def largest_correlation(parts):

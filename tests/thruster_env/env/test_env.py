@@ -1,12 +1,21 @@
 """The mechanics of an env, on a plant that is no thruster: three states, two inputs, two channels."""
 
+import copy
+import inspect
+import json
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tests.small_plant import INPUTS, CartEnv, CartVectorEnv
+from filters import EstimateState
+from tests.small_plant import INPUTS, Cart, CartEnv, CartVectorEnv
 from tests.thruster_env.thruster.test_vector_env import (
+    DISABLED,
+    NEXT_STEP,
+    SAME_STEP,
     assert_copies_are_single_envs,
     every_mode,
 )
@@ -58,6 +67,25 @@ def test_a_copy_is_the_single_env_with_its_seed(mode):
     assert ends.all()  # some were terminated, some truncated
 
 
+@pytest.mark.slow
+def test_compiled_copies_of_several_blocks_are_single_envs():
+    ends = assert_copies_are_single_envs("Cart-v0", 130, NEXT_STEP, 12, 5, [0, 127, 129], inputs=2, **LOSING)
+    assert ends.any()
+
+
+@as_python
+def test_modes_differ_in_what_a_step_beyond_the_end_shows():
+    shown = {}
+    for mode in (NEXT_STEP, SAME_STEP, DISABLED):
+        env = CartVectorEnv(2, 2, mode)
+        env.reset(seed=1)
+        env.step(np.zeros((2, 2)))
+        shown[mode] = env.step(np.zeros((2, 2)))[-1]["time"][0]
+        if mode == NEXT_STEP:
+            assert env.step(np.full((2, 2), np.nan))[-1]["time"][0] == 0.0  # the actions of a reset are ignored
+    assert shown == {NEXT_STEP: pytest.approx(0.2), SAME_STEP: 0.0, DISABLED: pytest.approx(0.2)}
+
+
 @as_python
 def test_missing_measurements_are_flagged_and_repeated():
     env = CartEnv(**LOSING)
@@ -72,6 +100,31 @@ def test_missing_measurements_are_flagged_and_repeated():
 
 
 @as_python
+@pytest.mark.parametrize("other", [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_copies_and_pickles_go_on_with_the_same_numbers(other):
+    for env, action in ((CartEnv(**LOSING), ACTION), (CartVectorEnv(2, **LOSING), [ACTION] * 2)):
+        env.reset(seed=1)
+        env.step(action)
+        again = other(env)
+        for _ in range(3):
+            one, two = env.step(action), again.step(action)
+            np.testing.assert_equal(two, one)
+
+
+@as_python
+def test_the_spec_is_json():
+    env = gym.make(
+        "Cart-v0", mass=3.0, sensors={"position": CartEnv(**LOSING).plant.sensors["speed"], "speed": ()}
+    )
+    content = json.loads(env.spec.to_json())
+    assert content["kwargs"]["sensors"]["position"][0]["name"] == "dropout"
+    assert (
+        gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json())).unwrapped.plant
+        == env.unwrapped.plant
+    )
+
+
+@as_python
 @pytest.mark.parametrize("action", ["no", [1.0], 2.0, [1.0, np.nan], [[1.0, 2.0]], None])
 def test_a_wrong_action_leaves_the_env_where_it_was(action):
     env, envs = CartEnv(), CartVectorEnv(2)
@@ -83,3 +136,37 @@ def test_a_wrong_action_leaves_the_env_where_it_was(action):
         envs.step([action] * 2)
     assert env.step(ACTION)[-1]["time"] == pytest.approx(0.1)
     np.testing.assert_allclose(envs.step([ACTION] * 2)[-1]["time"], 0.1)
+
+
+@as_python
+def test_arguments_stand_in_one_place():
+    assert list(inspect.signature(CartEnv).parameters) == ["mass", "dt", "sensors", "render_mode"]
+    assert CartEnv(3.0).plant.mass == 3.0
+    with pytest.raises(TypeError, match=r"^CartEnv.__init__\(\) got an unexpected keyword argument 'weight'$"):
+        CartEnv(weight=1.0)
+    with pytest.raises(ValueError, match="mass must be positive, but got 0"):
+        CartVectorEnv(2, mass=0)
+    with pytest.raises(ValueError, match="render_mode must be None, but got 'human'"):
+        CartEnv(render_mode="human")
+    with pytest.raises(ValueError, match="of a cart's model must be among process_noise_cov, but got 'mass'"):
+        CartEnv().state_space_model(mass=1.0)
+
+
+@as_python
+def test_a_state_may_be_given():
+    for env in (CartEnv(), CartVectorEnv(2)):
+        _, info = env.reset(seed=1, options={"state": [1.0, 2.0, 3.0]})
+        np.testing.assert_array_equal(np.atleast_2d(info["state"])[-1], [1.0, 2.0, 3.0])
+        with pytest.raises(ValueError, match="the state of options must be 3 finite numbers"):
+            env.reset(options={"state": [1.0, 2.0]})
+
+
+@as_python
+def test_a_filter_finds_the_env_s_model():
+    env = EstimateState(CartEnv(), "kf")
+    env.reset(seed=2)
+    for _ in range(20):
+        *_, info = env.step(ACTION)
+    assert isinstance(env.unwrapped.plant, Cart) and info["estimate"].shape == (3,)
+    errors = np.abs(info["estimate"] - info["state"]) / np.sqrt(np.diag(info["estimate_cov"]))
+    assert (errors < 4).all()

@@ -1,8 +1,13 @@
 """A state-space model as a Gymnasium env, and filters around it."""
 
+import json
 import math
+import os
 import pickle
+import subprocess
+import sys
 import threading
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -127,6 +132,48 @@ def test_a_model_that_can_only_be_called_is_simulated_too(transition):
     np.testing.assert_allclose([info["state"] for info in found], truth.states[0], rtol=1e-13)
 
 
+def catching(x, u, c):
+    try:
+        inverse = 1.0 / u[0]
+    except ZeroDivisionError:
+        inverse = 0.0
+    return (0.9 * x[0] + 0.1 * inverse,)
+
+
+class Deciding:
+    """A model's f that is an object."""
+
+    def __call__(self, x, u, c):
+        """The next state."""
+        return deciding(x, u, c)
+
+
+def states_and_warnings(transition) -> tuple[list[float], list[str]]:
+    """States of an episode, and what is said of the model."""
+    env = ModelEnv(one_state(transition))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        infos = [env.reset(seed=7)[1], *(env.step([u])[4] for u in (0.5, 0.0, 2.0))]
+    return [float(info["state"][0]) for info in infos], [str(warning.message) for warning in caught]
+
+
+FIRST_USE = """
+import json
+from tests.thruster_env.env.test_model_env import Deciding, catching, deciding, states_and_warnings
+print(json.dumps([states_and_warnings(f) for f in (deciding, catching, Deciding())]))
+"""
+
+
+def test_an_env_is_the_first_use_of_a_model_that_can_only_be_called(tmp_path):
+    here = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_DISABLE_JIT": "0"}
+    command = [sys.executable, "-c", FIRST_USE]
+    printed = subprocess.run(command, env=here, capture_output=True, text=True, check=True).stdout
+    compiled, *as_python = json.loads(printed)
+    for (states, said), transition in zip((compiled, *as_python), (deciding, catching, Deciding()), strict=True):
+        np.testing.assert_allclose(states, states_and_warnings(transition)[0], rtol=1e-13)
+        assert len(said) == (transition is not deciding) and all("runs as Python" in text for text in said)
+
+
 def test_models_of_equal_code_have_their_own_functions():
     def of(gains):
         def transition(x, u, c):
@@ -158,6 +205,20 @@ def test_a_traced_function_takes_floats_in_a_thread_that_has_traced_nothing():
     thread.start()
     thread.join()
     assert results == [6.0]
+
+
+def reward_of_positive(x, u):
+    if x[0] > 0.0:
+        return x[0]
+    raise ValueError("a negative state")
+
+
+def test_a_reward_is_nan_where_it_raises():
+    env = ModelEnv(one_state(linear), reward=reward_of_positive)
+    env.reset(seed=1)
+    for action in (3.0, -30.0):
+        _, reward_, _, _, info = env.step([action])
+        assert reward_ == info["state"] if action > 0.0 else np.isnan(reward_)
 
 
 def test_copies_are_single_envs_with_all_disturbances_and_a_task():

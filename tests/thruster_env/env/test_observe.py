@@ -1,6 +1,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import thruster_env  # noqa: F401 - registers the envs
@@ -29,6 +30,13 @@ def test_the_state_stands_in_for_the_measurement_only(task, sensors):
         assert observation in env.observation_space
         action = env.action_space.sample()
         measured, (observation, *_, info) = plain.step(action)[0], env.step(action)
+
+
+def test_it_is_part_of_the_spec():
+    env = ObserveState(gym.make("BowThrusterTracking-v0", preset="t200"))
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert isinstance(again, ObserveState)
+    np.testing.assert_array_equal(again.reset(seed=1)[0], env.reset(seed=1)[0])
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])

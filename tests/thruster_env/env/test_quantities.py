@@ -5,8 +5,9 @@ import pickle
 import numpy as np
 import pytest
 
-from thruster_env.model.affine import affine_model
+from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.quantities import Output, Quantity
+from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.analysis import steady_state
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.parameters import PRESETS
@@ -16,6 +17,13 @@ def turntable(**names):
     noise = {"process_noise_cov": [1e-4, 1e-4], "measurement_noise_cov": [0.1]}
     return affine_model(
         a=[[1, 0.1], [0, 1]], b=[[0], [0.1]], c=[[1, 0]], prior_mean=[0, 0], prior_cov=[1, 1], **noise, **names
+    )
+
+
+def decay(**inputs):
+    noise = {"process_noise_cov": [0.1], "measurement_noise_cov": [0.1], "prior_mean": [0.0], "prior_cov": [1.0]}
+    return StateSpaceModel(
+        transition=lambda x, u, c: (0.9 * x[0],), observe=lambda x, c: (x[0],), **noise, **inputs
     )
 
 
@@ -54,6 +62,16 @@ def test_wrong_names_are_refused(names, rule):
         turntable(**names)
 
 
+@pytest.mark.parametrize("names", [["left pump", "right pump"], ["pump"], []])
+def test_there_are_as_many_inputs_as_have_names(names):
+    model = decay(input_quantities=names)
+    assert model.inputs == len(names) and [one.name for one in model.input_quantities] == names
+    assert model.replace(prior_mean=[1.0]).inputs == len(names)
+    assert decay().inputs == 0
+    with pytest.raises(ValueError, match="input_quantities must be 3 quantities or names, as inputs, or b, says"):
+        decay(inputs=3, input_quantities=names)
+
+
 def test_a_thruster_s_components_and_outputs_have_names_and_units():
     model = thruster_model(sensors=["speed", "thrust"])
     assert [one.label for one in model.states] == ["motor speed [rad/s]", "flow velocity [m/s]"]
@@ -65,6 +83,11 @@ def test_a_thruster_s_components_and_outputs_have_names_and_units():
     assert isinstance(model.outputs["T"], Output) and model.outputs["T"].quantity.unit == "N"
     with pytest.raises(ValueError, match="output must be one of T, but got 'thrust'"):
         model.output("thrust", states)
+
+
+def test_a_linearised_model_keeps_the_names():
+    model = thruster_model()
+    assert linearize(model, model.operating_state, model.operating_input).quantities == model.quantities
 
 
 @pytest.mark.parametrize("given", [3, {"T": 3}, {"T": (Quantity("thrust", "T", "N"), 3)}, {"T": ("thrust",)}])

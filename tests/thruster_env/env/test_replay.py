@@ -90,3 +90,16 @@ def test_what_is_no_model_of_the_log_is_refused(log):
         ReplayEnv(log, lambda speed: MODEL)
     with pytest.raises(ValueError, match="the model of a log must be a StateSpaceModel, but .* makes 4"):
         ReplayEnv(log, lambda: 4)
+
+
+def test_arguments_of_another_kind_are_one_line(tmp_path):
+    (tmp_path / "run.csv").write_text("t,V_s,tach\n0,1,2\n1,2,3\n2,3,4\n")
+    path = tmp_path / "run.csv"
+    for log, options, said in (
+        (5, {}, "a log must be the path of a file, a pandas.DataFrame, .* or a Log, but got 5"),
+        (path, {"columns": ["tach"]}, "columns must be a mapping from quantities, but got"),
+        (path, {"columns": {"tach": 5}}, "the column for tach must be a header, but got 5"),
+        (path, {"clock_offset": 0.1}, "clock offsets must be a mapping from quantities, but got 0.1"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            ReplayEnv(log, MODEL, **options)

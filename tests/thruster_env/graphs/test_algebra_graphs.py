@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from thruster_env.graphs.branches import along
-from thruster_env.graphs.graphs import Graph, where
+from thruster_env.graphs.graphs import Graph, TooLarge, where
 from thruster_env.graphs.loops import Loops
 from thruster_env.graphs.programs import Place, callable_of, program_of, values_of
 from thruster_env.graphs.tracing import traced
@@ -73,6 +73,13 @@ def test_what_is_equal_is_there_once_and_structure_vanishes():
     assert where(x < y, x, x) is x and along([x * x], {y.place: x}) == [None]
 
 
+def test_what_moves_of_itself_moves_with_nothing_that_it_is_made_of():
+    x, y = pair()
+    z = x * y
+    assert along([z * x], {z.place: y, x.place: None}) == [y * x]
+    assert along([z], {x.place: y, z.place: None}) == [None]
+
+
 UNTRACEABLE = {
     "if": lambda x, y: x if x > y else y,
     "while": lambda x, y: next(k for k in range(3) if k > x),
@@ -111,6 +118,19 @@ def test_functions_that_are_called_are_traced_too_and_arrays_may_be_filled():
     x, y = pair()
     assert values_of([traced(function)(x, y)], np.array([[1.3], [0.6]]))[0, 0] == pytest.approx(function(1.3, 0.6))
     assert helper(4.0) == 4.0  # the function itself is as before
+
+
+def test_a_graph_that_grows_too_large_is_given_up():
+    x = Graph(most=20).given("x")
+    with pytest.raises(TooLarge, match="at most 20 operations"):
+        sum(math.prod([x + k] * k) for k in range(10))
+
+
+def test_a_number_has_neither_truth_nor_hash():
+    x, _ = pair()
+    for ask in (bool, hash, float):
+        with pytest.raises(TypeError):
+            ask(x)
 
 
 RUN = """

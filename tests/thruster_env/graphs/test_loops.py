@@ -54,3 +54,10 @@ def test_compiled_loops_and_interpreted_ones_are_numpys(page):
         np.testing.assert_allclose(table[:N, :SIZE], expected[0], rtol=1e-11, atol=1e-13)
         np.testing.assert_allclose(table[N : 2 * N, :SIZE], expected[1], rtol=1e-11, atol=1e-13)
         np.testing.assert_allclose(rows.reshape(N, N), expected[2], rtol=1e-11, atol=1e-13)
+
+
+def test_what_an_early_loop_overwrites_is_kept_for_a_late_one():
+    parts = cut(stage_of(exchanged), 2 * N)
+    assert parts.rows > 2 * N
+    written = [{place for place, _ in body.stores} for turn in parts.turns for body in turn.bodies]
+    assert Place("table", 0) in written[-1]

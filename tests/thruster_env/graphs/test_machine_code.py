@@ -299,6 +299,15 @@ def test_other_numbers_are_refused(number):
     assert machine(divided, None, None)(np.int32(7), 3) == 2001
 
 
+def test_code_is_freed_with_its_last_user():
+    machine_code._loaded.clear()
+    call = builtin(np.zeros(3))
+    assert len(machine_code._loaded) == 1
+    del call
+    gc.collect()
+    assert not machine_code._loaded
+
+
 def test_object_code_is_kept_and_damage_is_noticed(folder, monkeypatch):
     machine_code._loaded.clear()
     assert builtin(np.zeros(2))(1) == 3
@@ -338,6 +347,16 @@ def link_to_itself(folder, tmp_path):
     return spoil
 
 
+def test_without_a_home_object_code_goes_to_the_private_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as it is where neither HOME nor a user is known
+    monkeypatch.setattr(machine_code, "private_folder", lambda: str(tmp_path))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    machine_code._folder.cache_clear()
+    assert machine_code._folder("") == tmp_path / machine_code.FOLDER
+    machine_code._folder.cache_clear()
+
+
 FORK = """
 import os, threading, time
 from thruster_env.graphs import machine_code
@@ -359,6 +378,33 @@ print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), machine_code._compilin
 def test_a_fork_while_another_thread_compiles_can_compile():
     result = subprocess.run([sys.executable, "-c", FORK], capture_output=True, text=True, check=True)
     assert result.stdout.split() == ["0", "True"]
+
+
+FIRST_USE = """
+import sys
+import numpy as np
+from filters import affine_model, make_filter, run
+model = affine_model(a=0.9 * np.eye(2), b=np.ones((2, 1)), c=np.eye(1, 2), process_noise_cov=[0.1, 0.1],
+                     measurement_noise_cov=[0.5], prior_mean=[0.0, 0.0], prior_cov=[1.0, 1.0])
+filter_ = make_filter("ekf", model)
+run(filter_, inputs=np.zeros((9, 3, 1)), measurements=np.ones((9, 4, 1)))
+filter_.update(filter_.predict(filter_.init(), [0.0]), [1.0])
+from filters.engine.batch import Beliefs
+ensembles = Beliefs(make_filter("enkf", model, ensemble_size=9), 2)
+ensembles.start(np.arange(2), np.zeros((2, 2)), np.ones((2, 1)))
+print([name for name in ("numba", "scipy", "gymnasium") if name in sys.modules])
+import gymnasium as gym
+import thruster_env
+env = gym.make_vec("BowThruster-EKF-v0", num_envs=300)
+env.reset(seed=0)
+env.step(env.action_space.sample())
+print([name for name in ("numba", "scipy") if name in sys.modules])
+"""
+
+
+def test_filters_and_envs_need_no_numba():
+    result = subprocess.run([sys.executable, "-c", FIRST_USE], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["[]", "[]"]
 
 
 # Memory above six gigabytes is full but for a page: a module's parts cannot lie together there.

@@ -9,14 +9,16 @@ import threading
 import time
 from array import array
 from contextlib import contextmanager
+from queue import SimpleQueue
 
 import numpy as np
 import pytest
 
 from thruster_env.core.compiled import interpreted
+from thruster_env.core.threads import waiting
 from thruster_env.graphs.loops import machine_code_of
 from thruster_env.graphs.machine_code import words_of
-from thruster_env.graphs.workers import CALLER, InParts, WorkerThreads, worker_threads
+from thruster_env.graphs.workers import BEHIND, CALLER, SPIN_ROUNDS, InParts, WorkerThreads, worker_threads
 
 COUNT = 1000
 
@@ -48,6 +50,13 @@ def test_work_is_done_in_parts(few):
         assert np.array_equal(values, 2.0 * np.arange(COUNT)) and np.array_equal(result, np.arange(COUNT))
 
 
+def test_a_single_one_has_quick_calls():
+    single, values = InParts(add_index, [(None,)], single=True), np.full(1, 3.0)
+    single.on(1, (), values.shape)(values)
+    single.on_result((), values)()
+    assert values == [3.0]
+
+
 @pytest.mark.parametrize("helpers", [0, 1, 3])
 @pytest.mark.parametrize("pause", [0.0, 0.003])
 def test_every_call_covers_everything_once(ask, helpers, pause):
@@ -56,6 +65,12 @@ def test_every_call_covers_everything_once(ask, helpers, pause):
         ask(workers, values)
         time.sleep(pause)  # in the longer one the helpers go to sleep
     assert np.array_equal(values, 20.0 * np.arange(COUNT))
+
+
+def test_fewer_tasks_than_threads(ask):
+    values = np.zeros(2)
+    ask(WorkerThreads(3), values, 2)
+    assert np.array_equal(values, [0.0, 1.0])
 
 
 def test_many_threads_may_ask_at_once(ask):
@@ -98,6 +113,17 @@ def test_after_a_failure_the_next_call_is_right(ask):
     rehearsed.fails, values[:] = False, 0.0
     ask(workers, values)
     assert np.array_equal(values, np.arange(COUNT))
+
+
+def test_the_wait_policy_reaches_the_helpers_and_changes_no_number(ask):
+    for policy, rounds in (("passive", 0), ("active", SPIN_ROUNDS)):
+        workers, values = WorkerThreads(2), np.zeros(COUNT)
+        rehearsed = Rehearsed(workers, 2)
+        with waiting(policy):
+            for _ in range(5):
+                ask(workers, values)
+        assert rehearsed.rounds == {rounds}
+        assert np.array_equal(values, 5.0 * np.arange(COUNT))
 
 
 @contextmanager
@@ -145,6 +171,15 @@ def test_ctrl_c_at_any_moment_leaves_workers_that_help(ask):
         if passed() < moment:
             break
     assert moment > 80
+
+
+def test_a_helper_that_never_comes_is_not_waited_for(ask):
+    workers, values = WorkerThreads(2), np.zeros(COUNT)
+    workers._jobs[1] = SimpleQueue()  # nobody spins into this one
+    for _ in range(5):
+        ask(workers, values)
+    assert np.array_equal(values, 5.0 * np.arange(COUNT))
+    assert workers._jobs[1].qsize() == BEHIND
 
 
 def _ask_in_child(ask, results):

@@ -89,6 +89,16 @@ def test_numbers_are_those_of_other_languages_too(tmp_path):
             read_log({"t": [0, 1, 2], "voltage": ["1", text, "4"], "tach": [1, 2, 4]}, MODEL)
 
 
+@pytest.mark.parametrize("first", ["t voltage tach", "# t   voltage tach", "#t voltage\xa0 tach"])
+def test_spaces_may_part_the_cells(tmp_path, first):
+    (tmp_path / "a.csv").write_text(f"{first}\n 0.0  1 2\n0.1 2 nan \n\n0.2   3 5\n", encoding="utf-8")
+    log = read_log(tmp_path / "a.csv", MODEL)
+    assert log.dt == pytest.approx(0.1) and log.inputs[:, 0].tolist() == [1, 2]
+    np.testing.assert_array_equal(log.measurements[:, 0], [2, np.nan, 5])
+    (tmp_path / "a.csv").write_text("t voltage tach\n0 1 2\n1 2\n")
+    refused(tmp_path / "a.csv", "as many cells as the header, 3, but got 2 in line 3")
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux limits what a process takes")
 def test_a_parquet_file_that_lies_of_its_size_ends_in_one_line(tmp_path, monkeypatch):
     """A dictionary of one long text for many rows; the process may grow by little."""
@@ -134,6 +144,15 @@ def test_pages_of_a_parquet_file_are_compared_with_their_check_sums(tmp_path):
     bad[bad.index(np.float64(9.0).tobytes()) + 5] ^= 1
     path.write_bytes(bad)
     refused(path, "a Parquet file must be one, but .* is not: .*(CRC|checksum)")
+
+
+def test_arrays_of_other_lengths_are_named(tmp_path):
+    for other in (0.1, np.arange(3.0), COLUMNS["voltage"][:, None], "text"):
+        np.savez(tmp_path / "a.npz", **COLUMNS, gains=other)
+        refused(
+            tmp_path / "a.npz",
+            r"equal length with some rows, but .* has 'gains' of shape \(.* beside 't' of \(40,\)",
+        )
 
 
 @pytest.mark.parametrize(

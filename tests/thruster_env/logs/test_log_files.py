@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from tests.thruster_env.logs.test_logs import MODEL, log_of
+from thruster_env.logs import columns as columns_module
+from thruster_env.logs import table
+from thruster_env.logs.columns import parted
 from thruster_env.logs.read import read_log
 from thruster_env.logs.write import write_columns, write_log
 from thruster_env.thruster.model import thruster_model
@@ -90,6 +93,34 @@ def test_a_measurement_goes_before_what_only_has_its_name(tmp_path):
     assert log.measurements[:, 0].tolist() == [4.0, 5.0, 7.0] and log.references["output:T"].tolist() == [2, 3, 5]
 
 
+class Names(list):
+    """Names that are counted where one after the other is looked at."""
+
+    looked = 0
+
+    def __contains__(self, one):
+        Names.looked += len(self)
+        return super().__contains__(one)
+
+    def __getitem__(self, place):
+        Names.looked += len(self) if isinstance(place, slice) else 1
+        return super().__getitem__(place)
+
+
+def test_the_columns_of_a_wide_table_are_looked_at_a_few_times_only(monkeypatch):
+    calls = []
+    monkeypatch.setattr(columns_module, "parted", lambda header: calls.append(0) or parted(header))
+    names = Names(f"column_{place}_V" for place in range(2000))
+    Names.looked = 0
+    table._check_header(names, 1, "run.csv")
+    headers = ["time_s", "voltage_V", "tach", *names]
+    found = columns_module.find_columns(columns_module.quantities_of(MODEL), headers, {}, {}, "run.csv")
+    assert len(found) == 3 and len(calls) < 2 * len(headers) and Names.looked < 2 * len(names)
+    with pytest.raises(ValueError, match="column_6_V and 1993 more") as error:
+        columns_module.find_columns(columns_module.quantities_of(MODEL), headers[2:], {}, {}, "run.csv")
+    assert len(str(error.value)) < 600
+
+
 @pytest.mark.parametrize("name", [r"$\frac$", "[/]", "a,b", 'say "V"', "x;y", "n" * 400, "two\nlines", " spaces"])
 def test_names_of_columns_are_quoted_where_they_have_to_be(tmp_path, name):
     columns = {"t": np.arange(4.0), name: np.ones(4), "tach": np.arange(4.0)}
@@ -172,6 +203,20 @@ def test_what_is_wrong_is_one_line_with_its_place(tmp_path, text, said):
     with pytest.raises(ValueError, match=said) as error:
         log_of(tmp_path / "run.csv", text)
     assert "\n" not in str(error.value)
+
+
+def test_an_unnamed_index_is_left_out(tmp_path):
+    lines = GOOD.splitlines()
+    indexed = [f",{lines[0]}", *(f"{i},{line}" for i, line in enumerate(lines[1:]))]
+    log = log_of(tmp_path / "run.csv", "\n".join(indexed))
+    np.testing.assert_array_equal(log.measurements[:, 0], [2, 3, 4])
+
+
+def test_a_file_of_another_kind_is_refused_in_one_line(tmp_path):
+    for name, said in (("a.npz", "an npz file must hold arrays of numbers by name"), ("b.csv", "text in UTF-8")):
+        (tmp_path / name).write_bytes(b"\xff\xfe\x00PK")
+        with pytest.raises(ValueError, match=f"must .*{said}|{said}"):
+            read_log(tmp_path / name, MODEL)
 
 
 def test_columns_that_are_told_have_to_be_there(tmp_path):

@@ -141,6 +141,16 @@ def test_time_in_minutes_is_understood_or_refused(tmp_path):
         log_of(tmp_path / "run.csv", f"t [fortnights and more],voltage,tach{rows}")
 
 
+def test_a_header_may_be_named_without_its_unit(tmp_path):
+    text = "t,U_mot [mV],n_mot (rpm)\n0,1000,60\n0.1,2000,120\n0.2,0,180\n"
+    log = log_of(tmp_path / "run.csv", text, columns={"V_s": "U_mot", "tach": "n_mot"})
+    np.testing.assert_allclose(log.inputs[:, 0], [1.0, 2.0])
+    np.testing.assert_allclose(log.measurements[:, 0], 2 * np.pi * np.array([1, 2, 3]))
+    two = text.replace("n_mot (rpm)", "U_mot [V]")
+    with pytest.raises(ValueError, match="the column for V_s must be one of t, U_mot"):
+        log_of(tmp_path / "run.csv", two, columns={"V_s": "U_mot"})
+
+
 def test_brackets_without_a_unit_say_none():
     rows = np.arange(9.0)
     model = MODEL.replace(measurements=[("duty", "z", "")])

@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 
 from filters import affine_model, make_filter, run
-from thruster_env.core.angles import on_one_branch, wrapped
+from filters.logs.estimate import estimate
+from filters.logs.findings import draw_log
+from thruster_env.core.angles import on_one_branch, with_breaks, wrapped
+from thruster_env.core.files import MOST_POINTS, thinned
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs.grid import Series, mean_held, sampled
 from thruster_env.logs.log import Log, at_offset
+from thruster_env.logs.read import read_log
+from tuning.identification.profiles import validation_of
+from tuning.problems.data import Data
 from tuning.problems.log_problem import LogProblem
+from tuning.problems.model_problem import ModelProblem
+from tuning.reporting.time_figures import draw_estimates, draw_signal
 
 DT, COUNT = 0.1, 401
 
@@ -66,6 +74,15 @@ def test_a_clock_offset_goes_the_short_way_round(heading):
     assert nis[1] == pytest.approx(nis[0], rel=1e-6)
 
 
+def test_a_file_with_a_clock_offset_is_read_the_same_way(tmp_path):
+    psi = 3.0 + 0.05 * np.arange(8)
+    path = tmp_path / "run.csv"
+    rows = [f"{DT * k:g},0,{wrapped(v):.17g}" for k, v in enumerate(psi)]
+    path.write_text("\n".join(["t,d,z", *rows]), encoding="utf-8")
+    found = read_log(path, model(), clock_offset={"z": 0.05}).measurements[:-1, 0]
+    np.testing.assert_allclose(wrapped(found - psi[:-1] - 0.025), 0.0, atol=1e-12)
+
+
 def test_samples_and_inputs_between_two_ends_are_at_the_cut():
     series = Series(np.array([0.05, 0.15, 0.25]), np.array([3.0, -3.0, 3.1]))
     gap = 2 * math.pi - 6.0
@@ -95,3 +112,56 @@ def test_on_one_branch_far_from_the_cut_nothing_changes_and_missing_ones_do_not_
     found = on_one_branch(turned, (True, False))
     assert np.nanstd(found[:, 0]) == pytest.approx(np.delete(rows[:, 0], 3).std(), rel=1e-12)
     assert np.isnan(found[3, 0]) and np.nanstd(turned[:, 0]) > 2.0
+
+
+@pytest.mark.usefixtures("as_python")
+def test_the_fit_of_a_simulation_has_the_spread_of_an_angle():
+    fits = []
+    for heading in (0.0, math.pi):
+        log, one = recorded(heading), model(heading=heading)
+        data = Data((0,), log.inputs[None], log.measurements[None], filter_keys([0]), 0)
+        fits.append(validation_of(one, data).fit["z"])
+    assert fits[1] == pytest.approx(fits[0], abs=0.1)
+
+
+def upright(axis):
+    """The longest step of a line of an axis, up or down."""
+    steps = [np.abs(np.diff(line.get_ydata().astype(float))) for line in axis.lines]
+    return max(np.nanmax(step) for step in steps if len(step) > 1 and np.isfinite(step).any())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("as_python")
+def test_no_figure_has_a_line_from_one_end_to_the_other():
+    log, one = recorded(math.pi), model(heading=math.pi)
+    figures = [draw_log(estimate(log, "kf", one), "a log")]
+    turned = Log(
+        "turns",
+        DT,
+        log.inputs,
+        log.measurements,
+        one.input_quantities,
+        one.measurements,
+        {**log.references, "state:psi": log.references["state:psi"] + 6.0 * math.pi},
+        log.referred,
+    )
+    figures.append(draw_log(estimate(turned, "kf", one), "a log whose truth has turns"))
+    problem = ModelProblem(one, steps=60, inputs=[[0.0]] * 60, first_scored_step=50)
+    data = problem.data([3])
+    figures += [draw_signal(make_filter("kf", one), data, 0, DT)]
+    figures += [draw_estimates({"kf": make_filter("kf", one)}, data, 0, DT)]
+    for figure in figures:
+        for axis in figure.axes:
+            assert not axis.lines or upright(axis) < math.pi, axis.get_ylabel()
+
+
+def test_lines_break_at_the_cut_also_where_they_are_thinned():
+    x, y = np.arange(4.0), np.array([3.0, -3.0, -2.9, 3.1])
+    times, line, band = with_breaks(x, y, y + 1.0)
+    np.testing.assert_array_equal(line, [3.0, np.nan, -3.0, -2.9, np.nan, 3.1])
+    np.testing.assert_array_equal(np.isnan(band), np.isnan(line))
+    np.testing.assert_array_equal(times, [0.0, 1.0, 1.0, 2.0, 3.0, 3.0])
+    long = np.arange(4.0 * MOST_POINTS)
+    values = np.where(long < 1000.0, 3.0, -3.0)
+    _, line = thinned(*with_breaks(long, values))
+    assert np.isnan(line).sum() == 1

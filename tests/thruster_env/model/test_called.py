@@ -17,6 +17,8 @@ from thruster_env.graphs.tracing import traced
 from thruster_env.model.simulate import seconds_as_python
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.traced import TABLES, _machine_code, called_function
+from tuning.problems import check
+from tuning.problems.model_problem import ModelProblem
 
 GAINS = {"pull": 0.3, "names": ("a", "b")}
 LOGGER = logging.getLogger(__name__)
@@ -204,6 +206,17 @@ def test_the_time_of_python_is_that_of_models_which_are_no_machine_code():
         assert 0.0 < seconds_as_python(model_of(lambda x, u, c: catching(x, c))) < 0.1
 
 
+def test_a_problem_says_what_python_will_take(monkeypatch):
+    monkeypatch.setattr(check, "seconds_as_python", lambda model: 1e-3)
+    problem = ModelProblem(model_of(newton_step), inputs=np.zeros((400, 1)), scale=(1.0,))
+    with pytest.warns(UserWarning, match="may take 2 min for 100 runs of 400 steps"):
+        check.checked_problem(problem)
+
+
+def newton_step(x, u, c):
+    return newton(x, c)
+
+
 def test_what_fails_otherwise_than_by_a_raise_of_its_own_has_no_outcome():
     def calling(x):
         if x[0] > 0.0:
@@ -233,6 +246,16 @@ def test_a_table_ends_where_python_says_so():
         with pytest.warns(filters.RestartWarning, match=r"first at step 2 \(x_1\): f\(x, u\) is NaN"):
             estimates = filters.run(filter_, inputs=u, measurements=z)
         assert estimates.divergences == 1 and np.isfinite(estimates.means).all()
+
+
+def never_so_low(x, u, c):
+    if x[0] < -5.0:
+        raise LookupError("so low")
+    return (x[0] * c[0],)
+
+
+def test_a_function_is_traced_though_it_raises_at_a_point_of_the_check():
+    assert not machine_code(never_so_low, "x, u, c", (1, 1, 1), 1, (1,)).reason
 
 
 def counted(x, u, c):

@@ -80,6 +80,17 @@ def test_the_applied_voltage_is_the_naive_one_and_moves_the_motor(chain, preset)
         np.testing.assert_allclose(states[k + 1], moved, rtol=1e-10, atol=1e-12)
 
 
+def test_without_effects_the_voltage_is_the_command():
+    commanded, applied, _, _ = trace(None, commands())
+    np.testing.assert_array_equal(applied, commanded)
+
+
+def test_a_slew_limit_counts_volts_a_second():
+    for dt, change in ((0.01, 3.0), (0.001, 0.3)):
+        applied = trace([SLEW], np.full(8, 24.0), dt=dt)[1]
+        np.testing.assert_allclose(applied, np.minimum(change * np.arange(1, 9), 24.0), rtol=1e-12)
+
+
 def test_a_slew_limit_starts_at_zero_in_every_episode():
     copies = copies_of(make_plant(amplifier=[SLEW]), Task(), 1)
     for _ in range(3):
@@ -87,6 +98,12 @@ def test_a_slew_limit_starts_at_zero_in_every_episode():
         for k in range(1, 5):
             report = copies.step(np.array([-24.0]))
             assert report[copies.report_rows["voltage"], 0] == pytest.approx(-3.0 * k)
+
+
+def test_effects_do_not_commute():
+    jump = np.full(10, 24.0)
+    assert trace([DEAD_BAND, SLEW], jump)[1][0] == pytest.approx(3.0)
+    assert trace([SLEW, DEAD_BAND], jump)[1][0] == pytest.approx(1.5)
 
 
 def test_sag_slows_the_motor_down_to_where_the_torques_balance():
@@ -109,6 +126,11 @@ def test_a_current_is_that_of_the_applied_voltage():
     assert info["measurement"][0] == pytest.approx(current / (p.load_gain * p.motor_damping), rel=1e-12)
 
 
+def test_a_thruster_without_load_has_no_current():
+    with pytest.raises(ValueError, match="load_gain must be positive for a motor current"):
+        make_plant(TUNNEL_PHYSICAL._replace(load_gain=0.0), sensors=["current"])
+
+
 @pytest.mark.parametrize("amplifier", [None, EFFECTS], ids=["none", "all"])
 def test_the_reward_is_told_of_the_commanded_clipped_voltage(amplifier):
     weights = {"tracking_weight": 0.0, "energy_weight": 0.7, "voltage_rate_weight": 0.3}
@@ -121,6 +143,22 @@ def test_the_reward_is_told_of_the_commanded_clipped_voltage(amplifier):
             expected = -0.7 * (clipped / 12) ** 2 - 0.3 * ((clipped - before) / 12) ** 2
             assert env.step([voltage])[1] == pytest.approx(expected, rel=1e-12, abs=1e-15)
             before = clipped
+
+
+def test_noise_of_a_seed_stays_as_it_is():
+    def noise(amplifier):
+        env = gym.make("BowThruster-v0", amplifier=amplifier)
+        env.reset(seed=3)
+        infos = [env.step([9.0])[4] for _ in range(20)]
+        return [float(info["measurement"][0]) - info["thrust"] for info in infos]
+
+    np.testing.assert_allclose(noise(EFFECTS), noise(None), rtol=0, atol=1e-12)
+
+
+def test_no_amplifier_changes_anything_where_it_does_not_reach():
+    mild = [{"name": "dead-band", "width": 0.0}, {"name": "slew-limit", "rate": 1e9}]
+    mild += [{"name": "saturation", "limit": 24.0}, {"name": "sag", "fraction": 0.0}]
+    np.testing.assert_allclose(trace(mild, commands())[2], trace(None, commands())[2], rtol=1e-12, atol=1e-12)
 
 
 WRONG = [

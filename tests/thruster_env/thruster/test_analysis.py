@@ -15,14 +15,16 @@ from thruster_env.thruster.analysis import (
     frequency_response,
     jacobians,
     linear_model,
+    response_grids,
     state_range,
     steady_state,
     step_response,
     transfer_function,
 )
 from thruster_env.thruster.dynamics import rates, thrust_and_torque_tangent
-from thruster_env.thruster.linear import PUBLISHED, SAMPLE_TIME
+from thruster_env.thruster.linear import PUBLISHED, SAMPLE_TIME, published_for
 from thruster_env.thruster.parameters import ANGLES, PRESETS, TUNNEL, derive_constants
+from tuning.cli.inspect import response_figure
 
 every_preset = pytest.mark.parametrize("p", PRESETS.values(), ids=PRESETS.keys())
 every_print = pytest.mark.parametrize("name", PUBLISHED)
@@ -141,6 +143,28 @@ def test_a_step_response_is_the_sampled_model_run():
     np.testing.assert_allclose(step_response(model, 0.01 * np.arange(30)), expected, rtol=1e-9, atol=1e-12)
 
 
+def test_nothing_settles_unless_it_is_stable():
+    assert np.isnan(dc_gain(at_voltage(TUNNEL, 0.0))).all()
+    assert np.isnan(dc_gain(matrices("open_bladed"))).all()
+
+
+@every_preset
+def test_grids_reach_beyond_all_eigenvalues(p):
+    for voltage in (0.0, 12.0):
+        model = at_voltage(p, voltage)
+        speeds = np.abs(np.linalg.eigvals(model.a))
+        frequencies, times = response_grids(model, 50)
+        assert frequencies.shape == times.shape == (50,)
+        assert frequencies[0] < speeds[speeds > 0].min() and frequencies[-1] > speeds.max()
+        assert times[0] == 0 and times[-1] == pytest.approx(5 / speeds[speeds > 0].min())
+
+
+@pytest.mark.parametrize("function", [transfer_function, lambda m, name: step_response(m, [0.0, 1.0], name)])
+def test_an_unknown_input_is_refused(function):
+    with pytest.raises(ValueError, match="input_name must be one of V_s, U_0, but got 'T'"):
+        function(at_voltage(TUNNEL), "T")
+
+
 @every_print
 def test_zero_order_hold_gives_the_printed_matrices_to_every_digit(name):
     model, system = matrices(name), PUBLISHED[name]
@@ -182,3 +206,18 @@ def test_in_every_state_a_slope_of_the_forces_has_another_sign_than_in_print(nam
         x = (math.cos(angle) / c.blade_speed, math.sin(angle))
         slopes = np.array([thrust_and_torque_tangent(x, dx, c) for dx in ((1.0, 0.0), (0.0, 1.0))])  # dT, dQ
         assert (slopes.T.ravel() * printed <= 0).any()
+
+
+def test_published_models_belong_to_presets():
+    named = [preset for system in PUBLISHED.values() for preset in system.presets]
+    assert set(named) <= set(PRESETS) and len(named) == len(set(named))
+    assert published_for("tunnel_physical") == ("tunnel", PUBLISHED["tunnel"])
+    assert published_for("t200") is None
+
+
+def test_responses_are_drawn_into_a_whole_file(tmp_path):
+    path = response_figure(tmp_path / "new" / "responses.png", at_voltage(TUNNEL), 0.01, "tunnel")
+    assert path.read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(ValueError, match=r"the thrust must move with the voltage .* but got C = \[0.0, 0.0\]"):
+        response_figure(tmp_path / "rest.png", at_voltage(TUNNEL, 0.0), 0.01, "rest")
+    assert not (tmp_path / "rest.png").exists()

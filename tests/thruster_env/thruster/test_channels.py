@@ -40,6 +40,16 @@ def other_channels():
 
 
 ALL = ["thrust", "speed", "speed-magnitude", "current"]
+UNCERTAIN = {"load_gain": {"name": "log-normal", "std": 0.3}}
+
+
+@pytest.mark.parametrize("uncertainty", [None, UNCERTAIN])
+def test_order_and_number_of_the_known_channels_change_no_number(uncertainty):
+    before = measured(ALL, uncertainty=uncertainty).measurements
+    with other_channels():
+        after = measured(ALL, uncertainty=uncertainty).measurements
+    np.testing.assert_array_equal(after, before)
+    assert list(CHANNELS) == ALL
 
 
 def test_a_further_channel_is_measured_and_predicted():

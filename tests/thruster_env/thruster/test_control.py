@@ -13,6 +13,7 @@ from thruster_env.thruster.controllers import (
     LQRController,
     PIController,
     PredictiveController,
+    lambda_gains,
     quadratic_gain,
 )
 from thruster_env.thruster.plant import make_task, thrust_scale
@@ -104,6 +105,14 @@ def test_the_integral_makes_up_for_a_wrong_feed_forward(preset):
     assert thrusts[-1, 0] == pytest.approx(reference, rel=1e-3)
 
 
+def test_a_step_of_the_reference_is_no_error_yet():
+    pi = made(PIController, "tunnel")
+    _, state = pi.predict([12.0, 12.0])
+    action, state = pi.predict([12.0, 20.0], state)
+    np.testing.assert_allclose(action, pi.points.interpolate(pi.points.voltage, 20.0), rtol=1e-6)
+    np.testing.assert_array_equal(state, [0.0, 20.0])
+
+
 @pytest.mark.parametrize("preset", ["tunnel", "tunnel_physical"])
 def test_the_true_state_lets_thrust_rise_without_overshoot(preset):
     env = envs("", 1, preset=preset, **NOISE_FREE)
@@ -113,6 +122,18 @@ def test_the_true_state_lets_thrust_rise_without_overshoot(preset):
     _, thrusts, _ = closed_loop(ObserveStateVector(env), lqr, 200)
     assert alone.max() > 2 * lqr.reference  # the motor is faster than the flow
     assert thrusts.max() < 1.05 * lqr.reference
+
+
+@turning_preset
+def test_lqr_undoes_a_disturbance_better_than_a_constant_voltage(preset):
+    there = steady_state(PRESETS[preset], 12.0)
+    env = envs("Tracking", 1, preset=preset, **NOISE_FREE | {"initial_state": (there.omega_m, 0.7 * there.U_a)})
+    feed_forward = replace(made(PIController, preset), proportional_gain=0.0, integral_gain=0.0)
+    costs = []
+    for policy, observed in ((made(LQRController, preset), ObserveStateVector(env)), (feed_forward, env)):
+        _, thrusts, _ = closed_loop(observed, policy, 300, np.full(300, there.thrust))
+        costs.append(((thrusts - there.thrust) ** 2).sum())
+    assert costs[0] < 0.7 * costs[1]
 
 
 def without_clamping(pi, observation, state):
@@ -144,6 +165,21 @@ def test_the_integral_does_not_wind_up(preset):
     gentle = scale * np.repeat([0.999, 0.5], [200, 150])
     _, never_cut_off, _ = closed_loop(env, pi, 350, gentle)
     assert thrusts[200:].min() > never_cut_off[200:].min() - 0.1 * scale
+
+
+@pytest.mark.parametrize("preset", ["tunnel", "tunnel_physical", "open_bladed_corrected"])
+@every
+def test_symmetric_thrusters_are_driven_symmetrically(preset, controller):
+    policy, scale = made(controller, preset), thrust_scale(made(PIController, preset).plant)
+    generator = np.random.default_rng(1)
+    observations = generator.normal(size=(40, 3)) * [100.0, 2.0, 0.5 * scale]
+    if controller is PIController:
+        observations = observations[:, ::2]
+    state = other = None
+    for _ in range(3):
+        actions, state = policy.predict(observations, state)
+        opposite, other = policy.predict(-observations, other)
+        np.testing.assert_allclose(actions, -opposite, rtol=1e-6, atol=1e-9)
 
 
 @turning_preset
@@ -203,6 +239,53 @@ def test_an_episode_start_forgets(controller):
     np.testing.assert_array_equal(one, fresh[1])
 
 
+def test_episodes_that_follow_one_another_start_afresh():
+    env = envs("Tracking", 2, max_episode_steps=20)  # resets on the next step
+    pi = PIController.for_env(env)
+    observation, _ = env.reset(seed=0)
+    state, done, starts = None, np.zeros(2, dtype=bool), np.ones(2, dtype=bool)
+    for k in range(60):
+        action, state = pi.predict(observation, state, starts)
+        if k in (21, 42):
+            np.testing.assert_array_equal(action, pi.predict(observation)[0])
+        starts = done
+        observation, _, terminated, truncated, _ = env.step(action)
+        done = terminated | truncated
+        assert done.all() == (k in (19, 40))
+
+
+def test_further_channels_and_flags_do_not_disturb():
+    sensors = {"speed": [], "thrust": [{"name": "dropout", "probability": 0.5}]}
+    env = gym.make("BowThrusterTracking-v0", sensors=sensors)
+    plain = PIController.for_env(gym.make("BowThrusterTracking-v0"))
+    action, _ = PIController.for_env(env).predict([180.0, 9.0, 1.0, 12.0])
+    np.testing.assert_array_equal(action, plain.predict([9.0, 12.0])[0])
+
+
+@every
+def test_voltages_stay_within_the_range(controller):
+    policy = controller.for_env(gym.make("BowThrusterTracking-v0", max_voltage=10.0))
+    observations = np.random.default_rng(0).normal(size=(200, 3)) * [100.0, 3.0, 20.0]
+    actions, _ = policy.predict(observations[:, 1:] if controller is PIController else observations)
+    assert actions.min() == -10.0 and actions.max() == 10.0
+
+
+def test_gains_may_be_given():
+    env = gym.make("BowThruster-v0")
+    found = lambda_gains(env.unwrapped.plant, 6.0, 0.1)
+    pi = PIController.for_env(env, proportional_gain=0.3, operating_voltage=6.0, time_constant=0.1)
+    assert (pi.proportional_gain, pi.integral_gain) == (0.3, found[1])
+    with pytest.raises(ValueError, match="integral_gain must be a finite number"):
+        PIController.for_env(gym.make("BowThruster-v0"), integral_gain="large")
+    with pytest.raises(ValueError, match="sensors must include the thrust, but the env has speed"):
+        PIController.for_env(gym.make("BowThruster-v0", sensors=["speed"]))
+
+
+def test_lqr_wants_the_state():
+    with pytest.raises(ValueError, match="an observation must begin with the state, but has 2 entries"):
+        made(LQRController, "tunnel").predict([1.0, 2.0])
+
+
 @pytest.mark.parametrize("task", ["", "Tracking"])
 @every
 def test_stable_baselines_evaluates_the_controllers(task, controller):
@@ -227,3 +310,34 @@ def test_feedback_pays(task, preset):
     assert better(got["PI"], got["nothing"])
     assert better(got["PI"], got["feed-forward"])
     assert better(got["LQR"], got["PI"]) and better(got["MPC"], got["LQR"])
+
+
+def test_feed_forward_may_be_worse_than_nothing():
+    """About zero thrust a flow that lags behind turns what a steady voltage gives."""
+    got = returns("Reversal", preset="tunnel_physical")
+    assert better(got["nothing"], got["feed-forward"])
+
+
+@pytest.mark.parametrize("task", ["", "Tracking", "Reversal"])
+def test_where_thrust_follows_at_once_there_is_little_to_feed_back(task):
+    """The t200 settles within two samples. What PI then integrates at each start is over when it acts."""
+    got = returns(task, preset="t200")
+    assert better(got["LQR"], got["feed-forward"])
+    assert (got["feed-forward"] - got["PI"]).mean() < 0.02  # of hundreds that doing nothing costs
+    assert better(got["PI"], got["nothing"] + 10)
+
+
+def test_a_thruster_that_is_not_the_nominal_one_needs_an_integral():
+    spread = {name: {"name": "log-normal", "std": 0.2} for name in ("load_gain", "voltage_gain")}
+    env = envs("Tracking", 20, uncertainty=spread)
+    pi = closed_loop(env, PIController.for_env(env))[0]
+    assert better(pi, closed_loop(env, PIController.for_env(env, 0.0, 0.0))[0])
+    assert better(pi, closed_loop(ObserveStateVector(env), LQRController.for_env(env))[0])
+
+
+def test_the_published_linear_tunnel_is_driven_too():
+    env = envs("Linear", 20)
+    feed_forward = closed_loop(env, PIController.for_env(env, 0.0, 0.0))[0]
+    pi = closed_loop(env, PIController.for_env(env))[0]
+    lqr = closed_loop(ObserveStateVector(env), LQRController.for_env(env))[0]
+    assert better(lqr, pi) and better(pi, feed_forward)

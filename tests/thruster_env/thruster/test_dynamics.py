@@ -16,7 +16,7 @@ from thruster_env.thruster.dynamics import (
     thrust_and_torque_tangent,
     variational_substep,
 )
-from thruster_env.thruster.parameters import ANGLES, PRESETS, TUNNEL, derive_constants
+from thruster_env.thruster.parameters import ANGLES, PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
 
 CASES = {
     f"{name}, {angles}": preset._replace(angles=angles) for name, preset in PRESETS.items() for angles in ANGLES
@@ -120,6 +120,12 @@ def test_runge_kutta_is_the_exponential_series_to_fourth_order():
     assert step((1.0,), (), c)[0] == pytest.approx(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24, rel=1e-14)
 
 
+def test_blades_that_turn_ahead_push_ahead_and_are_braked():
+    for p in PRESETS.values():
+        thrust, torque = thrust_and_torque((100.0, 0.0), derive_constants(p))
+        assert thrust > 0 and torque > 0
+
+
 numbers = st.floats(-1e6, 1e6)
 
 
@@ -136,6 +142,22 @@ def test_asymmetric_thrust_is_stronger_ahead_than_astern_and_the_torque_is_not()
     for x, factor in (((90.0, 0.0), 1.2), ((-90.0, 0.0), 0.8), ((0.0, 2.0), 1.0)):
         thrust, torque = thrust_and_torque(x, plain)
         np.testing.assert_allclose(thrust_and_torque(x, uneven), (factor * thrust, torque), rtol=1e-14)
+
+
+@given(st.sampled_from(SYMMETRIC), st.floats(-300, 300), st.floats(-6, 6), st.floats(-24, 24))
+def test_a_substep_is_exactly_odd(case, omega, flow, voltage):
+    c = derive_constants(CASES[case], substep=1e-3)
+    ahead = substep((omega, flow), (voltage, 0.5), c)
+    assert substep((-omega, -flow), (-voltage, -0.5), c) == tuple(-y for y in ahead)
+
+
+@every_case
+def test_thrust_and_torque_are_homogeneous_of_degree_two(p):
+    omega, flow = random_states(100)
+    c = derive_constants(p)
+    once = np.array(thrust_and_torque((omega, flow), c))
+    np.testing.assert_array_equal(thrust_and_torque((8 * omega, 8 * flow), c), 64 * once)
+    assert_close(thrust_and_torque((0.3 * omega, 0.3 * flow), c), 0.09 * once)
 
 
 def on_floats(x, u, c):
@@ -176,6 +198,24 @@ def test_one_source_gives_the_same_numbers_every_way(p, way):
     result = np.asarray(way(x, u, c))
     assert result.dtype == np.float64
     assert_close(result.T, np.transpose(expected))
+
+
+@pytest.mark.parametrize("way", [on_floats, on_arrays, on_tensors, in_machine_code])
+def test_nothing_moves_at_rest_and_nothing_warns(way):
+    c = derive_constants(TUNNEL_PHYSICAL, substep=1e-3)
+    with np.errstate(divide="raise", invalid="raise", over="raise"):
+        np.testing.assert_array_equal(way(np.zeros((3, 2)), np.zeros((3, 2)), c), 0.0)
+
+
+@every_case
+def test_thrust_is_flat_at_rest(p):
+    c = derive_constants(p)
+    with np.errstate(all="raise"):
+        for dx in ((1.0, 0.0), (0.0, 1.0), (-300.0, 5.0)):
+            assert thrust_and_torque_tangent((0.0, 0.0), dx, c) == (0.0, 0.0)
+    for size in (1e-300, 1e-160, 1e-100, 1e-60, 1e-9):
+        forces = thrust_and_torque((300 * size, -5 * size), c)
+        assert np.abs(forces).max() <= 1e4 * size**1.9
 
 
 def central_difference(f, x, dx, h):

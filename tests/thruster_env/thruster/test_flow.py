@@ -38,10 +38,18 @@ def middles(steps=100, dt=DT):
     return (np.arange(steps) + 0.5) * dt
 
 
+def test_without_signals_the_flow_is_constant():
+    np.testing.assert_array_equal(flows(None, ambient_velocity=-0.3), np.full((3, 100), -0.3))
+
+
 @pytest.mark.parametrize("dt", [0.01, 0.02])
 def test_a_sinusoid_is_taken_in_the_middle_of_a_step(dt):
     expected = 0.5 * np.sin(2 * np.pi * middles(dt=dt) / 0.7 + 1.0)
     np.testing.assert_allclose(flows(SIGNALS[0], dt=dt), np.tile(expected, (3, 1)), rtol=0, atol=1e-12)
+
+
+def test_a_sinusoid_of_zero_phase_begins_upwards():
+    assert flows({"name": "sinusoid", "amplitude": 1.0})[0, 0] > 0
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.03])
@@ -84,6 +92,18 @@ def test_gusts_have_their_shape_heights_and_rate():
             k += steps
     assert stats.kstest(heights, stats.norm.cdf).pvalue > SURELY
     assert stats.binomtest(begun, calm, 1 - math.exp(-3.0 * DT)).pvalue > SURELY
+
+
+def test_without_a_rate_there_are_no_gusts():
+    assert not flows({"name": "gusts", "std": 1.0, "rate": 0.0}, copies=50).any()
+
+
+def test_random_flows_differ_between_copies_and_not_with_the_action():
+    for signal in SIGNALS[1:3]:
+        first, second, again = flows(signal, seed=0), flows(signal, seed=1), flows(signal, seed=0)
+        np.testing.assert_array_equal(first, again)
+        np.testing.assert_array_equal(first[1:], second[:-1])
+        assert (first[0] != first[1]).any()
 
 
 @pytest.mark.parametrize("sample_time", [0.04, 0.01, 0.003])
@@ -164,6 +184,28 @@ def test_a_flow_signal_is_followed_as_exactly_as_a_constant_flow(preset):
         assert (np.abs(one - other) <= limit).all()
 
 
+def test_flow_leaves_the_noise_of_a_seed_as_it_is():
+    def noise(flow):
+        env = gym.make("BowThruster-v0", flow=flow)
+        infos = [env.reset(seed=3)[1]] + [env.step([9.0])[4] for _ in range(20)]
+        return [float(info["measurement"][0]) - info["thrust"] for info in infos]
+
+    np.testing.assert_allclose(noise(SIGNALS), noise(None), rtol=0, atol=1e-12)
+
+
+def test_the_flow_of_an_episode_is_forgotten_at_the_next():
+    env = gym.make("BowThruster-v0", flow=SIGNALS)
+
+    def episode(seed):
+        return [env.reset(seed=seed)[1]["ambient_velocity"]] + [
+            env.step([0.0])[4]["ambient_velocity"] for _ in range(30)
+        ]
+
+    first, second = episode(4), episode(None)
+    assert first[5:] != second[5:]
+    assert episode(4) == first
+
+
 WRONG = [
     (3.0, "flow must be a list of mappings with a name, but got 3.0"),
     ("gusts", "flow must be a list of mappings with a name, but got 'gusts'"),
@@ -211,3 +253,12 @@ def test_a_file_that_holds_no_such_column_of_numbers_is_refused(tmp_path, text, 
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
         RecordedSeries(file=str(path), column="u")
+
+
+def test_spare_copies_of_a_block_change_nothing():
+    plant = make_plant(flow=SIGNALS)
+    many = copies_of(plant, Task(), 130)
+    many.begin(episode_keys(range(130)))
+    last = [many.step(np.zeros(130)) for _ in range(10)][-1][many.report_rows["ambient_velocity"], 127:]
+    np.testing.assert_array_equal(last, flows(SIGNALS, 130, 10)[127:, -1])
+    np.testing.assert_allclose(last, flows(SIGNALS, 3, 10, 127)[:, -1], atol=1e-12)

@@ -32,6 +32,11 @@ def test_a_thrust_is_found_among_the_steady_states(preset, ambient):
         assert flow == pytest.approx(there.U_a, abs=0.01 * abs(points.flow).max())
 
 
+def test_beyond_the_range_the_last_steady_state_counts():
+    points = operating_points(make_plant("t200"))
+    assert points.interpolate(points.voltage, np.array([-1e3, 1e3])).tolist() == [-24.0, 24.0]
+
+
 @pytest.mark.parametrize("system", ["tunnel", "open_bladed"])
 def test_a_linear_system_has_operating_points(system):
     plant = make_linear_plant(system)
@@ -82,6 +87,15 @@ def test_steady_gain_and_slow_time_constant_would_make_an_unstable_loop():
     assert proportional > 5 * lambda_gains(plant)[0]
 
 
+def test_no_gains_are_made_up():
+    with pytest.raises(ValueError, match="operating_voltage must be such that .* a slope, but got 0.0"):
+        lambda_gains(make_plant("tunnel"), operating_voltage=0.0)
+    with pytest.raises(ValueError, match="operating_voltage must be such that the plant is stable"):
+        lambda_gains(make_linear_plant("open_bladed"))
+    with pytest.raises(ValueError, match="time_constant must be positive, but got -1"):
+        lambda_gains(make_plant("tunnel"), time_constant=-1)
+
+
 # The gain of the LQR
 
 
@@ -114,6 +128,27 @@ def cost_of(gain, problem, start):
         return np.inf
     weight = q - s @ k - (s @ k).T + k.T @ r @ k
     return start @ solve_discrete_lyapunov((a - b @ k).T, weight) @ start
+
+
+@turning_preset
+def test_no_other_gain_costs_less(preset, weights=(1.0, 0.1, 0.02)):
+    plant, task = make_plant(preset), make_task([{"name": "constant", "level": 0.5}], *weights)
+    problem, gain = quadratic_problem(plant, task, 12.0), quadratic_gain(plant, task, 12.0)
+    generator = np.random.default_rng(0)
+    start = np.array([20.0, 0.3, 2.0])
+    least = cost_of(gain, problem, start)
+    for _ in range(50):
+        other = gain * generator.uniform(0.8, 1.2, 3)
+        assert cost_of(other, problem, start) > least
+    assert cost_of(np.zeros(3), problem, start) > least  # the voltage is left at that of the steady state
+
+
+def test_a_gain_needs_something_to_act_on():
+    plant = make_plant("tunnel")
+    with pytest.raises(ValueError, match="tracking_weight must be positive, but got 0.0"):
+        quadratic_gain(plant, TASK._replace(weights=(0.0, 0.0, 0.01)), 12.0)
+    with pytest.raises(ValueError, match="voltage must be such that feedback has an effect, but got 0 V"):
+        quadratic_gain(plant, TASK._replace(weights=(1.0, 0.0, 0.0)), 0.0)
 
 
 def test_without_a_price_on_the_voltage_thrust_comes_at_once():

@@ -134,11 +134,37 @@ def test_a_steady_state_is_an_equilibrium_of_the_stepper(p, voltage, ambient):
     assert (np.abs(np.subtract(after, x)) <= 1e-8 * np.maximum(state_range(p, 24.0), np.abs(x))).all()
 
 
+@every_preset
+@pytest.mark.parametrize("ambient", [0.0, 0.3])
+def test_steady_states_are_odd(p, ambient):
+    p = p._replace(thrust_asymmetry=0.0)  # the one thing that is not odd
+    ahead, astern = steady_state(p, 11.0, ambient), steady_state(p, -11.0, -ambient)
+    assert astern == pytest.approx([-y for y in ahead], rel=1e-9)
+
+
+@every_preset
+def test_nothing_turns_without_voltage_and_flow(p):
+    assert steady_state(p, 0.0) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("p", [OPEN_BLADED_CORRECTED], ids=["open_bladed_corrected"])
+@pytest.mark.parametrize(("voltage", "ambient"), [(-1.0, 0.5), (-12.0, 2.0), (-1.5, 1.0), (-12.0, 5.0)])
+def test_a_voltage_against_the_flow_settles_to_its_steady_state(p, voltage, ambient):
+    x = steady_state(p, voltage, ambient)[:2]
+    assert settled(p, voltage, ambient) == pytest.approx(x, rel=1e-5, abs=1e-6)
+
+
 @pytest.mark.parametrize("p", [TUNNEL, TUNNEL_PHYSICAL, OPEN_BLADED], ids=lambda p: f"K_h {p.load_gain}")
 @pytest.mark.parametrize(("voltage", "ambient"), [(-12.0, 1.0), (-1.0, 0.5), (0.0, 2.0), (12.0, -2.0)])
 def test_a_voltage_in_a_flow_settles_to_its_steady_state(p, voltage, ambient):
     x = steady_state(p, voltage, ambient)[:2]
     assert settled(p, voltage, ambient) == pytest.approx(x, rel=1e-5, abs=1e-6)
+
+
+@every_preset
+def test_the_range_spans_both_directions(p):
+    top, bottom = steady_state(p, 24.0), steady_state(p, -24.0)
+    np.testing.assert_allclose(state_range(p, 24.0), np.subtract(top, bottom)[:2], rtol=1e-9)
 
 
 def states_and_voltages(p, max_voltage):
@@ -164,6 +190,15 @@ def test_the_one_step_map_is_accurate_to_a_ten_thousandth_of_the_range(p, dt, ma
         run_substeps(x, (voltages, ambient), p, dt, substeps) - exact_step(x, (voltages, ambient), p, dt)
     )
     assert (error.max(axis=1) <= 1e-4 * state_range(p, max_voltage)).all()
+
+
+@pytest.mark.parametrize(
+    "p", [TUNNEL, TUNNEL_PHYSICAL, OPEN_BLADED_CORRECTED], ids=lambda p: f"K2 {p.voltage_gain}"
+)
+def test_a_single_runge_kutta_step_would_not_do(p):
+    x, voltages = states_and_voltages(p, 24.0)
+    error = np.abs(run_substeps(x, (voltages, 0.0), p, 0.01, 1) - exact_step(x, (voltages, 0.0), p, 0.01))
+    assert (error.max(axis=1) > 1e-4 * state_range(p, 24.0)).any()
 
 
 @pytest.mark.parametrize("dt", [10.0, 1e300])

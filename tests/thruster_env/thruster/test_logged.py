@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the env
+from filters import ExtendedKalmanFilter, run
+from thruster_env.core.streams import episode_keys
+from thruster_env.model.simulate import simulate
 from thruster_env.thruster.model import (
     Recorder,
     lag_weights,
@@ -94,6 +97,22 @@ def test_a_lag_is_exact_where_its_input_is_a_straight_line():
         np.testing.assert_allclose(lag_weights(small, step), (0.0, 1.0 - small / step), atol=1e-15)
 
 
+@pytest.mark.slow
+def test_a_lag_that_goes_to_zero_leaves_the_likelihood_of_the_model_without():
+    base, plant = thruster_model(**PLANT), make_plant(**PLANT)
+    inputs = np.repeat(np.random.default_rng(0).uniform(-9, 9, (4, 20, 1)), 10, axis=1)
+    runs = simulate(base, episode_keys(range(4)), inputs).measurements
+
+    def likelihood(model):
+        found = run(ExtendedKalmanFilter(model=model), inputs=inputs, measurements=runs)
+        return found.log_likelihoods.sum()
+
+    whole = likelihood(base)
+    for lag in (0.0, 1e-9, 1e-6):
+        lagging = with_recorder(base, plant, Recorder(lag=(("speed", lag), ("thrust", lag))))
+        assert likelihood(lagging) == pytest.approx(whole, abs=1e-6 + 1e5 * lag)
+
+
 def test_the_process_noise_of_a_preset_file_is_that_of_the_sample_time(tmp_path):
     recorder = {"dt": 0.01, "sensors": ["speed"], "process_noise_cov": [2.0, 0.003]}
     write_preset(tmp_path / "mine.toml", PresetFile(PRESETS["tunnel_physical"], (0.0, 0.0), recorder))
@@ -101,6 +120,15 @@ def test_the_process_noise_of_a_preset_file_is_that_of_the_sample_time(tmp_path)
         given = {} if dt is None else {"dt": dt}
         model = logged_model(preset=tmp_path / "mine.toml", **given)
         np.testing.assert_allclose(np.diag(model.process_noise_cov), [2.0 * factor, 0.003 * factor], rtol=1e-12)
+
+
+def test_a_preset_file_does_not_become_the_description_of_a_log(tmp_path):
+    (tmp_path / "run.csv").write_text("t_s\n0\n")
+    with pytest.raises(
+        ValueError, match="must not take the name of the description of a log, but got .*run.toml beside"
+    ):
+        write_preset(tmp_path / "run.toml", PresetFile(T200, (0.0, 0.0)))
+    assert not (tmp_path / "run.toml").exists()
 
 
 def test_a_preset_file_comes_back_as_it_was_written(tmp_path):

@@ -9,9 +9,9 @@ from thruster_env.core.checks import at_least, covariance, covariance_root, fini
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import draw_key, episode_keys
 from thruster_env.thruster.analysis import run_substeps, steady_state
-from thruster_env.thruster.equations import simulate
-from thruster_env.thruster.parameters import PRESETS, TUNNEL
-from thruster_env.thruster.plant import make_plant
+from thruster_env.thruster.equations import copies_of, simulate
+from thruster_env.thruster.parameters import PRESETS, TUNNEL, checked
+from thruster_env.thruster.plant import Task, make_plant
 
 MAPPING = TUNNEL._asdict()
 Q, R = [[1.0, 0.012], [0.012, 4e-4]], 0.25
@@ -98,6 +98,22 @@ def test_checks_name_the_argument(call):
         call()
 
 
+def test_checks_return_plain_values():
+    assert positive("n", 0, zero_allowed=True) == 0.0
+    assert (at_least("n", 30.0, 2), type(at_least("n", np.int64(30), 2))) == (30, int)
+    np.testing.assert_array_equal(vector("n", 3, 1), [3.0])
+    np.testing.assert_array_equal(covariance("n", 0.25, 1), [[0.25]])
+    np.testing.assert_array_equal(covariance("n", [1, 0], 2), [[1.0, 0.0], [0.0, 0.0]])
+
+
+def test_checked_arrays_are_copies():
+    given = np.eye(2)
+    taken = covariance("n", given, 2), vector("n", given[0], 2)
+    given[:] = 7.0
+    np.testing.assert_array_equal(taken[0], np.eye(2))
+    np.testing.assert_array_equal(taken[1], [1.0, 0.0])
+
+
 @pytest.mark.parametrize(
     "cov",
     [Q, np.zeros((2, 2)), np.diag([0.0, 3.0]), np.diag([3.0, 0.0]), np.ones((2, 2)), [[4.0, -1.9], [-1.9, 1.0]]],
@@ -125,6 +141,11 @@ def test_a_preset_may_be_a_name_a_mapping_or_parameters(preset):
     assert type(make_plant(preset).parameters.gear_ratio) is float
 
 
+@pytest.mark.parametrize("p", PRESETS.values(), ids=PRESETS.keys())
+def test_presets_pass_their_own_check(p):
+    assert checked(p) == p
+
+
 def random_voltages(copies, steps, top=24.0, seed=5):
     return np.random.default_rng(seed).uniform(-top, top, (copies, steps))
 
@@ -139,6 +160,13 @@ def test_without_noise_the_plant_is_the_stepper(preset):
         np.testing.assert_allclose(run.states[:, k], np.transpose(x), rtol=1e-9, atol=1e-12)
         x = run_substeps(x, (voltages[:, k], 0.0), plant.parameters, plant.dt, plant.substeps)
     np.testing.assert_array_equal(run.measurements[..., 0], run.thrusts)
+
+
+def test_ambient_flow_drags_the_water_along():
+    plant = make_plant(ambient_velocity=-2.0, process_noise_cov=[0, 0], initial_state=[0, 0])
+    run = simulate(plant, episode_keys([0]), np.zeros((1, 1000)))
+    assert run.states[0, -1] == pytest.approx(steady_state(TUNNEL, 0.0, -2.0)[:2], rel=1e-6)
+    assert run.states[0, -1, 1] < -0.5
 
 
 def test_a_plant_that_starts_at_a_steady_state_stays_there():
@@ -156,6 +184,35 @@ def test_voltages_are_clipped():
     for run in runs[5:]:
         np.testing.assert_array_equal(run, runs[4])
     assert (runs[0][0, 1:, 0] > runs[4][0, 1:, 0]).all()
+
+
+def single_run(plant, key, voltages):
+    copies = copies_of(plant, Task(), 1)
+    reports = [copies.begin(key[None])]
+    reports += [copies.step(voltages[k : k + 1]) for k in range(len(voltages))]
+    rows = np.r_[*(copies.report_rows[name] for name in ("state", "thrust", "measurement"))]
+    return np.array(reports)[:, rows, 0]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_batch_is_a_loop_over_single_plants(preset):
+    plant = make_plant(preset, process_noise_cov=Q, measurement_noise_cov=R, ambient_velocity=0.2)
+    keys, voltages = episode_keys(range(3)), random_voltages(3, 500, top=30.0)
+    run = simulate(plant, keys, voltages)
+    for b in range(3):
+        rows = single_run(plant, keys[b], voltages[b])
+        np.testing.assert_allclose(run.states[b], rows[:, :2], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(run.thrusts[b], rows[:, 2], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(run.measurements[b, :, 0], rows[:, 3], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 4, 128, 300, 1100])
+def test_a_voltage_beyond_the_range_is_clipped_in_every_copy(count):
+    copies = copies_of(make_plant(), Task(), count)
+    copies.begin(np.zeros((count, 2)))
+    voltages = np.linspace(-40.0, 40.0, count)
+    report = copies.step(voltages)
+    np.testing.assert_array_equal(report[copies.report_rows["voltage"]], np.clip(voltages, -24, 24))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -199,6 +256,12 @@ def test_python_and_machine_code_agree():
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
+def test_nothing_of_the_plant_is_compiled_within_interpreted():
+    with interpreted():
+        assert copies_of(make_plant(), Task(), 1).advance.in_python
+    assert not copies_of(make_plant(), Task(), 1).advance.in_python
+
+
 @pytest.mark.parametrize(
     "voltages", [np.zeros((2, 4)), np.zeros(4), np.full((3, 4), np.nan)], ids=["rows", "flat", "nan"]
 )
@@ -239,3 +302,10 @@ def test_the_initial_state_has_its_distribution():
     assert_standard_normal((x - mean) @ np.linalg.inv(np.linalg.cholesky(cov)).T)
     x = simulate(make_plant(), episode_keys(range(5000)), np.empty((5000, 0))).states
     assert_standard_normal(x / [1.0, 0.1])
+
+
+def test_noise_does_not_depend_on_the_voltages():
+    keys = episode_keys(range(3))
+    runs = [simulate(make_plant(), keys, random_voltages(3, 50, seed=seed)) for seed in (1, 2)]
+    noise = [run.measurements[..., 0] - run.thrusts for run in runs]
+    np.testing.assert_allclose(*noise, rtol=0, atol=1e-12)

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.compiled import interpreted
 from thruster_env.thruster import controllers
-from thruster_env.thruster.controllers import PredictiveController, improve_plans
+from thruster_env.thruster.controllers import HORIZONS, PredictiveController, Problem, best_voltages, improve_plans
 from thruster_env.thruster.parameters import preset_parameters
 from thruster_env.thruster.plant import make_plant
 
@@ -95,6 +95,19 @@ def test_an_improved_plan_never_costs_more_and_stays_in_range():
     assert abs(plans).max() <= 24.0
 
 
+def test_compiled_and_interpreted_give_the_same():
+    problem = controller(1).problem
+    found = best_voltages(STATES, LAST, REFERENCES, problem)
+    plans = np.repeat(found[:, None], 3, axis=1)
+    others = plans[:5].copy()
+    improve_plans(STATES, LAST, REFERENCES, plans, problem)
+    with interpreted():
+        same = best_voltages(STATES[:5], LAST[:5], REFERENCES[:5], problem)
+        improve_plans(STATES[:5], LAST[:5], REFERENCES[:5], others, problem)
+    np.testing.assert_allclose(same, found[:5], rtol=1e-9)
+    np.testing.assert_allclose(others, plans[:5], rtol=1e-6, atol=1e-6)
+
+
 def test_it_believes_in_the_thruster_that_it_is_told():
     """With a weaker motor than there is, it asks for more voltage."""
     env = gym.make("BowThrusterTracking-v0", **WEIGHTS)
@@ -103,3 +116,14 @@ def test_it_believes_in_the_thruster_that_it_is_told():
     seen = [100.0, 2.0, 12.0]
     told, nominal = (PredictiveController.for_env(env, 1, c).predict(seen)[0] for c in (weaker, None))
     assert told[0] > nominal[0] > 0
+
+
+def test_the_names_and_what_is_refused():
+    assert list(HORIZONS) == ["one-step", "mpc"] and HORIZONS["one-step"] == 1
+    assert isinstance(controller(1).problem, Problem)
+    with pytest.raises(ValueError, match="horizon must be"):
+        PredictiveController.for_env(gym.make("BowThruster-v0"), 0)
+    with pytest.raises(ValueError, match="must have a thruster's equations, but the env is linear"):
+        PredictiveController.for_env(gym.make("BowThrusterLinear-v0"))
+    with pytest.raises(ValueError, match="an observation must begin with the state, but has 2 entries"):
+        controller(1).predict([1.0, 2.0])

@@ -16,7 +16,7 @@ from thruster_env.thruster.effects import REFERENCE_SIGNALS
 from thruster_env.thruster.env import BowThrusterReversalEnv, BowThrusterTrackingEnv
 from thruster_env.thruster.equations import copies_of
 from thruster_env.thruster.parameters import PRESETS, TUNNEL
-from thruster_env.thruster.plant import Task, make_plant
+from thruster_env.thruster.plant import Task, make_plant, make_task
 
 T_MAX = steady_state(TUNNEL, 24.0).thrust
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds
@@ -58,6 +58,11 @@ def assert_uniform(values, low=-0.2, high=0.6):
 
 def assert_uncorrelated(one, other):
     assert abs(np.corrcoef(np.ravel(one), np.ravel(other))[0, 1]) < 4 / math.sqrt(np.size(one))
+
+
+def test_a_constant_is_a_level_or_a_thrust():
+    np.testing.assert_allclose(references({"name": "constant", "level": -0.4}), -0.4, rtol=1e-12)
+    np.testing.assert_allclose(references({"name": "constant", "thrust": 7.0}), 7.0 / T_MAX, rtol=1e-12)
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.02])
@@ -155,6 +160,13 @@ def test_a_recorded_reference_is_interpolated_at_the_sample_times(tmp_path, repe
         np.testing.assert_allclose(references(given), np.tile(expected, (3, 1)), rtol=0, atol=1e-12)
 
 
+def test_signals_are_added():
+    zero = {"name": "constant", "level": 0.0}  # keeps the others in their places, by which they draw
+    alone = [references([zero] * i + [SIGNALS[i]]) for i in range(7)]
+    np.testing.assert_allclose(references(SIGNALS), sum(alone), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(references([]), np.zeros((3, 101)))
+
+
 @pytest.mark.parametrize("given", RANDOM, ids=lambda given: given["name"])
 def test_what_is_random_follows_from_the_seed_alone(given):
     first, shifted = references(given, seed=0), references(given, seed=1)
@@ -166,6 +178,19 @@ def test_what_is_random_follows_from_the_seed_alone(given):
     np.testing.assert_array_equal(disturbed, first)
     twice = references([given, given], copies=200) - references(given, copies=200)
     assert abs(np.corrcoef(twice[:, 7], references(given, copies=200)[:, 7])[0, 1]) < 4 / math.sqrt(200)
+
+
+@pytest.mark.parametrize("given", RANDOM, ids=lambda given: given["name"])
+def test_every_episode_draws_anew(given):
+    env = gym.make("BowThrusterTracking-v0", reference=[given])
+
+    def episode(seed):
+        env.reset(seed=seed)
+        return [env.step([0.0])[4]["reference"] for _ in range(60)]
+
+    first, second = episode(4), episode(None)
+    assert len(set(first)) > 1 and first != second
+    assert (episode(4), episode(None)) == (first, second)
 
 
 @pytest.mark.parametrize("task", ["Tracking", "Reversal"])
@@ -248,3 +273,10 @@ def test_wrong_references_are_refused_with_the_rule(reference, message):
     with pytest.raises(ValueError, match=message) as error:
         BowThrusterTrackingEnv(reference=reference)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["tracking", "energy", "voltage_rate"])
+def test_wrong_weights_are_refused(name):
+    weights = {"tracking_weight": 1.0, "energy_weight": 0.0, "voltage_rate_weight": 0.0}
+    with pytest.raises(ValueError, match=f"{name}_weight must be zero or positive, but got -1.0"):
+        make_task(None, **weights | {f"{name}_weight": -1.0})

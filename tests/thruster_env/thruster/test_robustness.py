@@ -15,7 +15,7 @@ import thruster_env
 from tests.thruster_env.thruster.test_sensors import EVERY_EFFECT as SENSORS
 from thruster_env.core.compiled import interpreted
 from thruster_env.thruster.effects import UNCERTAIN
-from thruster_env.thruster.env import BowThrusterTrackingVectorEnv
+from thruster_env.thruster.env import BowThrusterTrackingVectorEnv, BowThrusterVectorEnv
 from thruster_env.thruster.parameters import PRESETS
 
 IDS = ["BowThruster-v0", "BowThrusterTracking-v0", "BowThrusterReversal-v0", "BowThrusterLinear-v0"]
@@ -245,6 +245,26 @@ def test_python_and_machine_code_agree_with_everything_that_disturbs():
             np.testing.assert_allclose(a, b, rtol=1e-6 if a.dtype == np.float32 else 1e-11, atol=1e-11)
 
 
+def test_copies_may_start_where_options_say():
+    state, mask = [30.0, -0.5], np.array([False, True, True])
+    vector, alone = BowThrusterVectorEnv(3, autoreset_mode="Disabled"), thruster_env.BowThrusterEnv()
+    observation, info = vector.reset(seed=5, options={"state": state})
+    np.testing.assert_array_equal(info["state"], [state] * 3)
+    np.testing.assert_allclose(observation[1], alone.reset(seed=6, options={"state": state})[0], rtol=1e-6)
+    moved, _ = vector.step(np.ones(3))[4]["state"], alone.step(1.0)
+    info = vector.reset(options={"state": state, "reset_mask": mask})[1]
+    np.testing.assert_array_equal(info["state"], [moved[0], state, state])
+    alone.reset(options={"state": state})
+    moved, expected = vector.step(np.ones(3))[4]["state"], alone.step(1.0)[4]["state"]
+    np.testing.assert_allclose(moved[1], expected, rtol=1e-12, atol=1e-12)
+
+
+def test_what_is_not_finite_is_observed_alike_by_both():
+    envs = [make(initial_state=[1e50, 0.0]) for make in (BowThrusterVectorEnv, thruster_env.BowThrusterEnv)]
+    vector, alone = (env.reset(seed=0)[0] for env in envs)
+    np.testing.assert_array_equal(vector[0], alone)
+
+
 @pytest.mark.parametrize("single", [True, False], ids=["single", "vector"])
 def test_memory_does_not_grow(single):
     arguments = {"sensors": {"thrust": SENSORS}, "flow": FLOW, "reference": REFERENCE}
@@ -269,6 +289,23 @@ def test_memory_does_not_grow(single):
         tracemalloc.stop()
 
 
+def test_the_reward_stays_finite_when_the_state_does_not():
+    noise = [[71.0, 120.0], [120.0, 716.0]]
+    env = gym.make(
+        "BowThruster-v0", preset="open_bladed_corrected", dt=0.02, max_voltage=6.0, process_noise_cov=noise
+    )
+    ends = []
+    for seed in range(30):
+        env.reset(seed=seed)
+        for voltage in np.random.default_rng(seed).uniform(-6, 6, 200):
+            _, reward, terminated, _, info = env.step([voltage])
+            assert np.isfinite(reward)
+            if terminated:
+                ends.append(info["state"])
+                break
+    assert not np.isfinite(ends).all()  # the case is met
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -279,3 +316,8 @@ def test_memory_does_not_grow(single):
 def test_what_no_memory_and_no_number_could_hold_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         gym.make("BowThruster-v0", **arguments)
+
+
+def test_a_vector_env_asks_for_a_reset_first():
+    with pytest.raises(gym.error.ResetNeeded):
+        BowThrusterVectorEnv(2).step(np.zeros((2, 1)))

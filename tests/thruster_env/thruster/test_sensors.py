@@ -13,7 +13,7 @@ import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.effects.effects import Effect
-from thruster_env.effects.sensors import SENSOR_EFFECTS
+from thruster_env.effects.sensors import SENSOR_EFFECTS, Bias, Quantisation
 from thruster_env.thruster.dynamics import thrust_and_torque
 from thruster_env.thruster.equations import simulate
 from thruster_env.thruster.parameters import CHANNELS, PRESETS, TUNNEL_PHYSICAL, derive_constants
@@ -72,6 +72,13 @@ def test_heavy_tails_are_those_of_student(degrees):
     assert_white(noise)
 
 
+def test_heavy_tails_come_beside_the_gaussian_noise():
+    both = added({"name": "student-t", "scale": 0.3, "degrees": 5.0}, r=0.25)
+    alone = added({"name": "student-t", "scale": 0.3, "degrees": 5.0})
+    assert_drawn_from((both - alone) / 0.5, stats.norm)
+    assert abs((np.sign(both - alone) * np.sign(alone)).mean()) < 4 / math.sqrt(both.size)
+
+
 @pytest.mark.parametrize("probability", [0.0, 0.05, 0.5, 1.0])
 def test_outliers_are_a_share_of_normal_variates(probability):
     noise = added({"name": "outliers", "std": 5.0, "probability": probability})
@@ -105,11 +112,20 @@ def test_a_bias_starts_about_its_value_and_walks():
     assert abs(bias[:, -1].var() / expected - 1) < 4 * math.sqrt(2 / 1000)
 
 
+def test_a_bias_without_spread_is_a_constant_and_is_forgotten_at_the_next_episode():
+    np.testing.assert_allclose(added({"name": "bias", "value": 0.7}), 0.7, rtol=0, atol=1e-12)
+    env = gym.make("BowThruster-v0", sensors={"thrust": [Bias(std=3.0, drift=1.0)]}, measurement_noise_cov=0)
+    starts = []
+    for seed in (3, None, 3):
+        info = env.reset(seed=seed)[1]
+        starts.append(float(info["measurement"][0]) - info["thrust"])
+        env.step([1.0])
+    assert starts[0] == starts[2] != starts[1]
+
+
 @pytest.mark.parametrize("step", [0.05, 3.0, 1e-20])
 def test_quantised_readings_are_the_nearest_multiples(step):
-    raw, rounded = (
-        read([effect], r=0.25, copies=20) for effect in (NOTHING, {"name": "quantisation", "step": step})
-    )
+    raw, rounded = read([NOTHING], r=0.25), read([{"name": "quantisation", "step": step}], r=0.25)
     assert (np.abs(rounded - raw) <= step / 2 + 1e-12).all()
     if step > 1e-3:
         np.testing.assert_allclose(rounded / step, np.round(rounded / step), rtol=0, atol=1e-9)
@@ -147,6 +163,13 @@ def test_dropout_has_its_share_its_lengths_and_holds_the_last_valid_reading(prob
     assert abs(share - probability) <= 4.5 * math.sqrt(spread)
 
 
+def test_the_first_readings_are_zero_while_they_are_missing():
+    run = run_of([{"name": "dropout", "probability": 0.5, "mean_length": 20.0}], r=0.25, initial_state=[50.0, 1.0])
+    missing = ~np.logical_or.accumulate(run.valid[..., 0], axis=1)
+    assert missing[:, 0].any() and (run.thrusts[missing] != 0).any()
+    assert (run.measurements[..., 0][missing] == 0).all()
+
+
 def test_validity_is_told_in_the_observation_and_in_info():
     often, seldom = ({"name": "dropout", "probability": share} for share in (0.5, 0.2))
     env = gym.make("BowThruster-v0", sensors={"speed": [], "thrust": [often], "speed-magnitude": [seldom]})
@@ -166,31 +189,29 @@ def test_validity_is_told_in_the_observation_and_in_info():
 
 @pytest.mark.parametrize("steps", [1, 2, 7])
 def test_a_delay_is_exactly_so_many_steps_late_and_repeats_the_first(steps):
-    raw, late = (read([effect], r=0.25, copies=20) for effect in (NOTHING, {"name": "delay", "steps": steps}))
+    raw, late = read([NOTHING], r=0.25), read([{"name": "delay", "steps": steps}], r=0.25)
     np.testing.assert_array_equal(late[:, steps:], raw[:, :-steps])
     np.testing.assert_array_equal(late[:, :steps], np.repeat(raw[:, :1], steps, axis=1))
 
 
 def test_a_delay_after_dropout_delays_the_flag_too_and_one_before_it_does_not():
     dropout, delay = {"name": "dropout", "probability": 0.3, "mean_length": 3.0}, {"name": "delay", "steps": 4}
-    lost, both = run_of([dropout], r=0.25, copies=20), run_of([dropout, delay], r=0.25, copies=20)
+    lost, both = run_of([dropout], r=0.25), run_of([dropout, delay], r=0.25)
     for late, now in ((both.measurements, lost.measurements), (both.valid, lost.valid)):
         np.testing.assert_array_equal(late[:, 4:], now[:, :-4])
         np.testing.assert_array_equal(late[:, :4], np.repeat(now[:, :1], 4, axis=1))
-    late, lost = read([delay], r=0.25, copies=20), run_of([delay, dropout], r=0.25, copies=20)
+    late, lost = read([delay], r=0.25), run_of([delay, dropout], r=0.25)
     np.testing.assert_array_equal(lost.measurements[..., 0], held(late, lost.valid[..., 0]))
 
 
 def test_effects_act_in_the_order_of_the_list():
     clip, shift = {"name": "saturation", "low": -5.0, "high": 5.0}, {"name": "bias", "value": 2.0}
-    rounding, raw = {"name": "quantisation", "step": 0.7}, read([NOTHING], copies=20)
-    np.testing.assert_array_equal(read([clip], copies=20), np.clip(raw, -5, 5))
-    np.testing.assert_allclose(read([clip, shift], copies=20), np.clip(raw, -5, 5) + 2.0, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(read([shift, clip], copies=20), np.clip(raw + 2.0, -5, 5), rtol=0, atol=1e-12)
+    rounding, raw = {"name": "quantisation", "step": 0.7}, read([NOTHING])
+    np.testing.assert_array_equal(read([clip]), np.clip(raw, -5, 5))
+    np.testing.assert_allclose(read([clip, shift]), np.clip(raw, -5, 5) + 2.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(read([shift, clip]), np.clip(raw + 2.0, -5, 5), rtol=0, atol=1e-12)
     rounded = np.floor((raw + 2.0) / 0.7 + 0.5) * 0.7
-    np.testing.assert_allclose(
-        read([shift, rounding, clip], copies=20), np.clip(rounded, -5, 5), rtol=0, atol=1e-12
-    )
+    np.testing.assert_allclose(read([shift, rounding, clip]), np.clip(rounded, -5, 5), rtol=0, atol=1e-12)
 
 
 def test_two_equal_effects_draw_different_numbers():
@@ -344,3 +365,8 @@ def test_wrong_sensors_are_refused_with_the_rule(sensors, message):
     with pytest.raises(ValueError, match=message) as error:
         make_plant(sensors={"thrust": [sensors]} if isinstance(sensors, dict) else sensors)
     assert "\n" not in str(error.value)
+
+
+def test_effects_may_be_objects_or_one_mapping():
+    for given in (Quantisation(0.5), [Quantisation(0.5)], {"name": "quantisation", "step": 0.5}):
+        assert make_plant(sensors={"thrust": given}).sensors == {"thrust": (Quantisation(0.5),)}

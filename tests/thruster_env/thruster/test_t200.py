@@ -4,9 +4,9 @@ import math
 import numpy as np
 import pytest
 
-from thruster_env.thruster.analysis import steady_state
+from thruster_env.thruster.analysis import jacobians, required_substeps, steady_state
 from thruster_env.thruster.dynamics import thrust_and_torque
-from thruster_env.thruster.parameters import T200, derive_constants
+from thruster_env.thruster.parameters import PRESETS, T200, checked, derive_constants
 from tuning.thruster.bollard import (
     FITTED,
     T200_PULSE_WIDTHS,
@@ -119,6 +119,13 @@ def test_time_constants_do_not_show_in_a_static_table(table_path):
         np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
+def test_the_preset_is_a_preset():
+    assert PRESETS["t200"] == T200 == checked(T200)
+    assert T200.momentum_drag == pytest.approx(1.5 * T200.density * T200.area, rel=1e-4)
+    length = 0.05 + 1.22 * T200.diameter / 2
+    assert T200.added_mass == pytest.approx(T200.density * T200.area * length, rel=1e-4)
+
+
 def test_the_preset_has_the_measured_coefficients_and_its_asymmetry_hardly_shows_in_torque():
     unit = T200.density * T200.diameter**4 / (2 * math.pi) ** 2  # thrust over K_T omega_m^2
     (thrust_astern, torque_astern), (thrust, torque) = bollard_forces(T200)
@@ -141,6 +148,32 @@ def test_the_preset_agrees_with_the_public_table():
     assert np.abs(from_pulse_width).max() < 0.1
     assert np.median(np.abs(from_pulse_width)) < 0.05
     assert np.abs(speeds).max() < 0.06
+
+
+def test_the_shaft_gives_more_power_than_the_jet_takes():
+    for voltage in (13.0, -13.0):
+        state = steady_state(T200, voltage)
+        thrust, torque = thrust_and_torque((state.omega_m, state.U_a), derive_constants(T200))
+        assert 0.45 < thrust * state.U_a / (torque * state.omega_m) < 0.8
+
+
+def test_few_substeps_and_stable_real_poles():
+    assert required_substeps(T200, 0.01, 13.0) <= 4
+    assert required_substeps(T200, 0.01, 24.0) <= 6
+    for voltage in (8.3, 13.3, -8.4, -13.4):
+        poles = np.linalg.eigvals(jacobians(T200, steady_state(T200, voltage)[:2], voltage)[0])
+        assert np.isreal(poles).all()
+        assert (poles < -60).all() and (poles > -180).all()
+
+
+def test_an_env_of_24_volts_runs():
+    from thruster_env import BowThrusterEnv
+
+    env = BowThrusterEnv(preset="t200")
+    observation, _ = env.reset(seed=1)
+    for action in (1.0, -1.0, 0.5):
+        observation, reward, *_ = env.step(np.full(env.action_space.shape, action, env.action_space.dtype))
+        assert np.isfinite(observation).all() and np.isfinite(reward)
 
 
 def test_pulse_widths_become_voltages():
@@ -183,3 +216,9 @@ def test_a_bad_file_is_refused(tmp_path, content, rule):
         path.write_bytes(content.encode("latin-1"))
     with pytest.raises(ValueError, match=rule):
         identify(read_table(path), (14.0, 18.0), T200)
+
+
+@pytest.mark.parametrize("held_out", [(13.0,), (10.0, 12.0, 14.0, 16.0, 18.0), ()])
+def test_held_out_voltages_are_checked(table_path, held_out):
+    with pytest.raises(ValueError, match="held-out voltages must be some of 10, 12, 14, 16, 18, 20 V"):
+        identify(read_table(table_path), held_out, T200)

@@ -1,5 +1,6 @@
 """The registered tasks: the published linear systems against print and theory, and what all of them share."""
 
+import itertools
 import json
 import math
 
@@ -78,6 +79,25 @@ def test_noise_of_a_linear_system_has_covariances_q_and_r(system, q, r):
         assert abs(np.corrcoef(one, other)[0, 1]) < 4 / math.sqrt(len(one))
 
 
+def test_published_noise_is_a_half_everywhere():
+    env = BowThrusterLinearEnv(sensors=["thrust", "speed"])
+    np.testing.assert_array_equal(env.plant.process_noise_cov, 0.5 * np.eye(2))
+    np.testing.assert_array_equal(env.plant.measurement_noise_cov, 0.5 * np.eye(2))
+    given = BowThrusterLinearEnv(sensors=["thrust", "speed"], measurement_noise_cov=[2.0, 3.0])
+    np.testing.assert_array_equal(given.plant.measurement_noise_cov, np.diag([2.0, 3.0]))
+
+
+def test_a_linear_env_is_the_simulated_plant():
+    noise = {"process_noise_cov": [0.1, 0.2], "measurement_noise_cov": 2.0}
+    result, voltages = trajectories("tunnel", copies=2, **noise)
+    env = gym.make("BowThrusterLinear-v0", **noise)
+    for b in range(2):
+        infos = [env.reset(seed=b)[1]] + [env.step([voltage])[4] for voltage in voltages[b]]
+        np.testing.assert_allclose([info["state"] for info in infos], result.states[b], rtol=1e-12, atol=1e-12)
+        found = [info["measurement"] for info in infos]
+        np.testing.assert_allclose(found, result.measurements[b], rtol=1e-12, atol=1e-12)
+
+
 @every_system
 @pytest.mark.parametrize("sensors", [["thrust"], ["speed", "thrust"]], ids=", ".join)
 def test_on_a_linear_env_the_kalman_filter_is_consistent(system, sensors):
@@ -113,6 +133,34 @@ def test_scales_are_those_of_the_equilibrium(system):
     assert reward == pytest.approx(-(((info["thrust"] - 12 * gain) / (24 * gain)) ** 2), rel=1e-12)
 
 
+def lengths(system, count=20, top=24.0):
+    env = gym.make("BowThrusterLinear-v0", system=system)
+    voltages, found = np.random.default_rng(0), []
+    for seed in range(count):
+        env.reset(seed=seed)
+        ends = (any(env.step([voltages.uniform(-top, top)])[2:4]) for _ in itertools.count())
+        found.append(next(k for k, end in enumerate(ends, 1) if end))
+    return found
+
+
+def test_the_stable_linear_system_runs_to_the_time_limit():
+    assert lengths("tunnel") == [500] * 20
+
+
+def test_the_unstable_linear_system_runs_on_until_it_has_grown():
+    """Its mode grows by exp(0.0319) a step, from the noise's size a hundredfold in 145 steps."""
+    assert np.median(lengths("open_bladed")) > 100
+
+
+def test_linear_systems_lack_a_current_and_other_systems():
+    with pytest.raises(ValueError, match="linear systems must be measured by other channels than the current"):
+        BowThrusterLinearEnv(sensors=["current"])
+    with pytest.raises(ValueError, match="system must be one of tunnel, open_bladed, but got 'canoe'"):
+        BowThrusterLinearEnv("canoe")
+    with pytest.raises(ValueError, match="measurement_noise_cov must be 1 variances"):
+        BowThrusterLinearEnv(measurement_noise_cov=[1.0, 2.0])
+
+
 OBJECTS = {
     "sensors": {"thrust": [Dropout(0.2)], "speed": []},
     "flow": Sinusoid(0.1),
@@ -137,3 +185,25 @@ def test_every_id_has_a_time_limit_and_survives_json_with_all_disturbances(name)
         np.testing.assert_array_equal(one[0], other[0])
         assert one[1:4] == other[1:4]
     assert one[2:4] == (False, True)
+
+
+@pytest.mark.parametrize("name", IDS[1:3])
+def test_observation_spaces_end_with_flags_and_reference(name):
+    env = gym.make(name, sensors={"speed": [Dropout(0.2)], "thrust": []})
+    assert env.observation_space.shape == (4,) and env.unwrapped.appended_entries == 2
+    assert gym.make(name).observation_space.shape == (2,)
+    assert gym.make("BowThruster-v0", sensors=["speed", "thrust"]).observation_space.shape == (2,)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_an_episode_may_start_where_options_say(name):
+    env = gym.make(name)
+    info = env.reset(seed=3, options={"state": [30.0, -0.5]})[1]
+    assert tuple(info["state"]) == (30.0, -0.5)
+    for wrong in ([1.0], [1.0, math.nan], "rest"):
+        with pytest.raises(ValueError, match="the state of options must be 2 finite numbers"):
+            env.reset(options={"state": wrong})
+    plain = gym.make(name)
+    for seed, options in ((3, {}), (None, None), (None, {"state": None})):
+        found, expected = env.reset(seed=seed, options=options)[1], plain.reset(seed=seed)[1]
+        np.testing.assert_array_equal(found["state"], expected["state"])

@@ -12,16 +12,18 @@ import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.streams import episode_keys
 from thruster_env.graphs.draws import Draws
 from thruster_env.thruster.analysis import (
+    required_substeps,
+    required_substeps_of_all,
     run_substeps,
     state_range,
     steady_state,
 )
 from thruster_env.thruster.dynamics import rates, thrust_and_torque
-from thruster_env.thruster.effects import UNCERTAIN, Uniform, drawn_parameters
+from thruster_env.thruster.effects import UNCERTAIN, LogNormal, Uniform, drawn_parameters
 from thruster_env.thruster.env import BowThrusterVectorEnv
-from thruster_env.thruster.equations import copies_of
+from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
-from thruster_env.thruster.plant import Task, extreme_parameters, make_plant
+from thruster_env.thruster.plant import Task, extreme_parameters, make_plant, make_uncertainty
 
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds
 UNIFORM, LOG_NORMAL = {"name": "uniform", "low": 0.8, "high": 1.3}, {"name": "log-normal", "std": 0.1}
@@ -40,6 +42,10 @@ def factors(parameter, uncertainty, count=4000):
     return getattr(drawn, parameter) / getattr(TUNNEL_PHYSICAL, parameter)
 
 
+def test_every_number_but_the_asymmetry_may_be_uncertain():
+    assert set(UNCERTAIN) == set(TUNNEL._fields) - {"angles", "thrust_asymmetry"}
+
+
 def test_uniform_factors_are_uniform():
     found = factors("motor_damping", {"motor_damping": UNIFORM})
     assert stats.kstest(found, stats.uniform(0.8, 0.5).cdf).pvalue > SURELY
@@ -55,6 +61,20 @@ def test_factors_of_different_parameters_are_independent():
     logs = [np.log(factors(name, {name: LOG_NORMAL})) for name in ("load_gain", "motor_damping", "area")]
     correlations = np.corrcoef(logs)[np.triu_indices(3, 1)]
     assert np.abs(correlations).max() < 4 / math.sqrt(4000)
+
+
+def test_a_draw_does_not_depend_on_what_else_is_uncertain():
+    alone = factors("load_gain", {"load_gain": LOG_NORMAL}, count=20)
+    np.testing.assert_array_equal(factors("load_gain", {"area": UNIFORM, **SOME}, count=20), alone)
+
+
+def test_what_is_uncertain_does_not_move_noise_nor_reference():
+    def told(uncertainty):
+        env = gym.make("BowThrusterTracking-v0", uncertainty=uncertainty)
+        infos = [env.reset(seed=3)[1]] + [env.step([9.0])[4] for _ in range(20)]
+        return [(float(info["measurement"][0]) - info["thrust"], info["reference"]) for info in infos]
+
+    np.testing.assert_allclose(told(SOME), told(None), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("flow", [None, [{"name": "sinusoid", "amplitude": 0.5}]], ids=["still", "flow"])
@@ -77,6 +97,13 @@ def test_an_episode_moves_by_its_own_parameters(preset, flow):
             assert info["thrust"] == pytest.approx(thrust, rel=1e-10, abs=1e-12)
             x = info["state"]
     assert len(seen) == 3 and PRESETS[preset] not in seen
+
+
+def test_substeps_suffice_for_every_extreme():
+    corners = extreme_parameters(PRESETS["open_bladed_corrected"], make_uncertainty(SOME))
+    cases = [(p, u_0) for p in corners for u_0 in (0.0, 0.5)]
+    each = [required_substeps(p, 0.02, 24.0, u_0) for p, u_0 in cases]
+    assert min(each) < max(each) == required_substeps_of_all(tuple(cases), 0.02, 24.0)
 
 
 def test_the_constants_in_memory_are_those_of_the_drawn_parameters():
@@ -120,6 +147,21 @@ def test_scales_of_reward_and_reference_stay_nominal():
     assert reward == pytest.approx(-(error**2), rel=1e-12)
 
 
+def test_the_measured_current_follows_from_the_own_parameters():
+    env = gym.make("BowThruster-v0", preset="tunnel_physical", sensors=["current"], uncertainty=SOME, **EXACT)
+    env.reset(seed=2)
+    info, p = env.step([10.0])[4], env.unwrapped.parameters
+    back_emf = p.motor_damping * info["state"][0]
+    current = p.voltage_gain * (p.voltage_gain * 10.0 - back_emf) / (p.load_gain * p.motor_damping)
+    assert info["measurement"][0] == pytest.approx(current, rel=1e-12)
+
+
+def test_without_uncertainty_the_parameters_are_nominal():
+    env = gym.make("BowThruster-v0", preset="t200")
+    env.reset(seed=0)
+    assert env.unwrapped.parameters == PRESETS["t200"]
+
+
 @pytest.mark.parametrize("preset", ["tunnel_physical", "t200"])
 def test_one_step_maps_are_accurate_at_the_corners_of_the_drawn_region(preset):
     wide = {
@@ -154,6 +196,15 @@ def test_of_many_uncertain_parameters_corners_are_single_and_common_extremes():
     assert (np.sum(np.abs(ratios[3:] - 1) > 0.05, axis=1) == 1).all()
 
 
+def test_a_run_depends_on_its_own_key_only():
+    plant, keys = make_plant(uncertainty=SOME), episode_keys(range(140))
+    voltages = np.random.default_rng(1).uniform(-24, 24, (140, 30))
+    run = simulate(plant, keys, voltages)
+    for i in (0, 131):
+        alone = simulate(plant, keys[i : i + 1], voltages[i : i + 1])
+        np.testing.assert_allclose(run.measurements[i], alone.measurements[0], rtol=1e-12, atol=1e-12)
+
+
 WRONG = [
     ("load_gain", "uncertainty must be a mapping from parameters to distributions, but got 'load_gain'"),
     ({"angles": LOG_NORMAL}, "a name in uncertainty must be one of lift_coefficient, .*, but got 'angles'"),
@@ -174,3 +225,9 @@ def test_wrong_uncertainties_are_refused_with_the_rule(uncertainty, message):
     with pytest.raises(ValueError, match=message) as error:
         make_plant(uncertainty=uncertainty)
     assert "\n" not in str(error.value)
+
+
+def test_distributions_may_be_objects():
+    given = {"load_gain": LogNormal(0.1), "area": Uniform(0.8, 1.3)}
+    assert make_plant(uncertainty=given).uncertainty == given
+    assert make_plant(uncertainty={"load_gain": LOG_NORMAL, "area": UNIFORM}).uncertainty == given

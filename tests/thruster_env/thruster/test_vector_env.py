@@ -1,6 +1,7 @@
 """The native vector env: copy by copy the single env, and in its ways Gymnasium's own vector env."""
 
 import copy
+import json
 
 import gymnasium as gym
 import numpy as np
@@ -150,11 +151,26 @@ def test_a_copy_is_the_single_env_with_its_seed_over_many_episodes(name, mode, c
     assert ends.sum() >= 4 * len(watched) and (ends.all() or count < 130)
 
 
+# With all effects this is a kernel of fifteen seconds; the test above has them, in two blocks on one thread.
+@every_mode
+@pytest.mark.parametrize("given", [{}, pytest.param(wild(IDS[1]), marks=pytest.mark.slow)], ids=["plain", "wild"])
+def test_copies_of_many_blocks_on_two_threads_are_single_envs(mode, given):
+    name, watched = IDS[1] if given else IDS[0], [0, 127, 128, 600, 1023, 1024, 1099]
+    ends = assert_copies_are_single_envs(name, 1100, mode, 25, 11, watched, **given)
+    assert ends.all() if given else ends[1] > 0
+
+
 @every_id
 def test_copies_stay_single_envs_over_500_steps_and_quantisers_agree_to_the_bit(name):
     given = arguments(name, max_voltage=24.0)
     ends = assert_copies_are_single_envs(name, 5, NEXT_STEP, 501, 500, [0, 4], exact=[1], **given)
     np.testing.assert_array_equal(ends, [0, 2])
+
+
+@every_mode
+def test_a_plain_env_and_more_episodes_than_keys_are_drawn_ahead(mode):
+    ends = assert_copies_are_single_envs(IDS[0], 3, mode, 90, 2, [0, 1, 2])
+    assert ends[1] >= 3 * 30
 
 
 def assert_same_info(found, expected):
@@ -253,6 +269,26 @@ def test_wrong_actions_are_refused_and_change_nothing(mode):
             vector.step(actions)
     actions = np.array([[np.inf], [-np.inf], [30.0], [0.0]])
     np.testing.assert_array_equal(vector.step(actions)[0], expected.step(np.clip(actions, -24, 24))[0])
+
+
+def test_a_copy_about_to_begin_anew_ignores_even_nan():
+    vector = make_vec(IDS[0], 2, NEXT_STEP, 1)
+    vector.reset(seed=0), vector.step(np.zeros(2))
+    observation, reward, _, _, info = vector.step(np.full(2, np.nan))
+    assert np.isfinite(observation).all() and (reward == 0).all() and (info["time"] == 0).all()
+    assert np.isfinite(vector.step(np.zeros(2))[1]).all()
+
+
+@every_id
+def test_make_vec_takes_json(name):
+    given = json.loads(json.dumps(arguments(name)))
+    vector = gym.make_vec(name, num_envs=2, autoreset_mode="SameStep", **given)
+    assert isinstance(vector.unwrapped, BowThrusterVectorEnv) and vector.num_envs == 2
+    assert vector.metadata["autoreset_mode"] == SAME_STEP
+    observation, _ = vector.reset(seed=3)
+    np.testing.assert_array_equal(observation[1], gym.make(name, **given).reset(seed=4)[0])
+    ends = [vector.step(np.zeros(2))[3].all() for _ in range(500)]
+    assert ends == [False] * 499 + [True]  # the id's own time limit
 
 
 @pytest.mark.parametrize("given", [{"num_envs": 0}, {"autoreset_mode": "Never"}, {"max_episode_steps": 0}])

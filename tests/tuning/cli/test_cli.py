@@ -1,5 +1,6 @@
 import csv
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -12,7 +13,9 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
-from thruster_env.thruster.parameters import TUNNEL, derive_constants
+from tests.slow import slow_but
+from thruster_env.core.text_tables import console
+from thruster_env.thruster.parameters import PRESETS, TUNNEL, derive_constants
 from tuning.cli.main import main
 
 
@@ -87,6 +90,24 @@ def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):
     np.testing.assert_allclose(env.filter.model.constants, expected, rtol=1e-12)
 
 
+def test_evaluate_says_and_draws_whether_a_filter_is_consistent(thruster, as_json, tmp_path):
+    options = "evaluate", "--filter", "ekf", "--seeds", 30, "--consistency"
+    done = thruster(*options, "new/calibrated.png")
+    words = " ".join(done.stdout.split())
+    for part in (
+        "Underconfident: mean NEES",
+        "Innovations are not white",
+        "To try: lower Q",
+        "rule of thumb over oracle",
+    ):
+        assert part in words
+    assert (tmp_path / "new" / "calibrated.png").read_bytes().startswith(b"\x89PNG")
+    found = as_json(*options, "again.png")["consistency"]
+    assert found["nees"]["mean"][0] < found["nees"]["right"] == 2.0
+    assert found["picture"] == "again.png" and len(found["sentences"]) == 13
+    assert thruster("evaluate", "--help").stdout.count("calibrated.png") == 1
+
+
 def test_simulate_writes_what_the_env_does_with_units_in_the_header(thruster, tmp_path):
     done = thruster("simulate", "--out", "run.csv", "--seed", 4, "--voltage", 9, "--steps", 20)
     assert done.returncode == 0, done.stderr
@@ -106,6 +127,14 @@ def test_simulate_writes_what_the_env_does_with_units_in_the_header(thruster, tm
     assert set(columns) == set(rows[0]) and len(np.unique(columns["voltage_V"][:-1])) == 1
 
 
+def test_inspect_prints_units_and_the_number_of_substeps(thruster, as_json):
+    done = thruster("inspect", "--preset", "tunnel", "--voltage", 12)
+    assert done.returncode == 0 and "[rad/s]" in done.stdout
+    assert re.search(r"Runge-Kutta substeps a sample time +2", done.stdout)
+    data = as_json("inspect")
+    assert data["steady_state"]["omega_m [rad/s]"] == pytest.approx(193.803, abs=1e-3)
+
+
 def test_inspect_shows_the_published_model_beside_ours(thruster, as_json, tmp_path):
     done = thruster("inspect", "--preset", "open_bladed_corrected")
     words = " ".join(done.stdout.split())
@@ -122,6 +151,41 @@ def test_inspect_shows_the_published_model_beside_ours(thruster, as_json, tmp_pa
     assert len(data["step"]["V_s"]["T [N]"]) == len(data["step"]["time [s]"])
     assert as_json("inspect", "--preset", "t200")["published"] is None
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.slow
+def test_inspect_draws(thruster, as_json, tmp_path):
+    done = thruster("inspect", "--voltage", 12, "--out", "new/tunnel.png")
+    assert done.returncode == 0 and "new/tunnel.png" in done.stdout
+    assert (tmp_path / "new" / "tunnel.png").read_bytes().startswith(b"\x89PNG")
+    assert as_json("inspect", "--out", "again.png")["picture"] == "again.png"
+    assert as_json("inspect", "--voltage", 0)["picture"] is None
+
+
+@pytest.mark.parametrize("preset", slow_but(PRESETS, ["tunnel", "t200"]))
+@pytest.mark.parametrize(("width", "voltages"), [(80, (-12, 0)), (115, (13,))])
+def test_inspect_fits_the_terminal(thruster, preset, width, voltages, monkeypatch):
+    monkeypatch.setattr(console, "width", width)
+    for voltage in voltages:
+        done = thruster("inspect", "--preset", preset, "--voltage", voltage)
+        assert done.returncode == 0 and "…" not in done.stdout
+        lines = done.stdout.splitlines()
+        assert max(map(len, lines)) <= width
+        assert any(line.split()[:4] == ["A", "=", "d", "rates/d(omega_m,"] and "U_a)" in line for line in lines)
+
+
+@pytest.mark.parametrize("command", ["inspect", "simulate"])
+def test_help_lists_every_preset(command, thruster):
+    words = thruster(command, "--help").stdout.replace("│", " ").split()
+    assert set(PRESETS) <= {word.strip(",.") for word in words}
+
+
+@pytest.mark.parametrize(
+    "command", ["", "inspect", "simulate", "tune", "evaluate", "verify", "report", "reproduce", "demo"]
+)
+def test_help_teaches(command, thruster):
+    done = thruster(*filter(None, [command, "--help"]))
+    assert done.returncode == 0 and "Usage" in done.stdout
 
 
 BAD = [

@@ -1,6 +1,9 @@
 """Logs at the command line: estimate, tune --log, and what follows; one line for what is wrong."""
 
 import json
+import shlex
+import subprocess
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +14,25 @@ from filters import EstimateState, thruster_model
 from filters.logs.estimate import estimate
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.logs.read import read_log
+from thruster_env.thruster.parameters import PRESETS, PresetFile, write_preset
+
+TWO_STATES = """
+from thruster_env.model.affine import affine_model
+
+def model(dt):
+    return affine_model(
+        a=[[1.0, dt], [-dt, 1.0 - dt]],
+        b=[[0.0], [dt]],
+        c=[[1.0, 0.0]],
+        process_noise_cov=[1e-5, 1e-3],
+        measurement_noise_cov=[1e-2],
+        prior_mean=[0.0, 0.0],
+        prior_cov=[1.0, 1.0],
+        states=[("angle", "phi", "rad"), ("rate", "omega", "rad/s")],
+        input_quantities=[("torque", "tau", "N*m")],
+        measurements=[("encoder", "enc", "rad")],
+    )
+"""
 
 
 def objectives_of(path):
@@ -64,6 +86,50 @@ def test_a_simulated_log_goes_through_estimate(simulated, as_json, thruster, tmp
     assert as_json("estimate", "again.npz")["log_likelihood"] == pytest.approx(data["log_likelihood"], rel=1e-6)
 
 
+def test_estimating_imports_no_optimiser_and_draws_nothing_that_is_not_asked_for():
+    heavy = ["optuna", "matplotlib", "pint", "pyarrow"]
+    modules = "tuning.cli.app, tuning.cli.verbs, tuning.api.estimate"
+    code = f"import sys, {modules}; print([n for n in {heavy} if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_what_is_simulated_has_the_sensors_that_are_asked_for(thruster, as_json):  # noqa: F811
+    options = "--steps", 100, "--sensor", "thrust", "--sensor", "speed"
+    data = as_json("simulate", "--out", "run.csv", *options)
+    assert data["columns"][-2:] == ["measured_thrust_N", "measured_speed_rad_per_s"]
+    table = np.genfromtxt("run.csv", delimiter=",", names=True)
+    errors = table["measured_speed_rad_per_s"] - table["omega_m_rad_per_s"]
+    assert abs(errors.mean()) < 0.8 and 1.5 < errors.std() < 2.5  # of 2 rad/s
+    as_json("simulate", "--out", "alone.csv", *options[:2])
+    alone = np.genfromtxt("alone.csv", delimiter=",", names=True)
+    np.testing.assert_array_equal(alone["measured_thrust_N"], table["measured_thrust_N"])
+    assert set(as_json("estimate", "run.csv", *options[2:])["one_step_ahead"]) == {"thrust", "speed"}
+
+
+def test_a_simulated_log_may_be_without_truth(thruster, as_json):  # noqa: F811
+    options = "--steps", 60, "--seed", 3, "--sensor", "thrust", "--sensor", "speed"
+    as_json("simulate", "--out", "whole.csv", *options)
+    data = as_json("simulate", "--out", "run.csv", *options, "--measured-only")
+    measured = ["time_s", "voltage_V", "measured_thrust_N", "measured_speed_rad_per_s"]
+    table, whole = (np.genfromtxt(name, delimiter=",", names=True) for name in ("run.csv", "whole.csv"))
+    assert data["columns"] == list(table.dtype.names) == measured
+    for name in measured:
+        np.testing.assert_array_equal(table[name], whole[name])
+    told = as_json("estimate", "run.csv", "--skip", 9)
+    assert (
+        not told["references"]
+        and told["log_likelihood"] == as_json("estimate", "whole.csv", "--skip", 9)["log_likelihood"]
+    )
+
+
+def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_json):  # noqa: F811
+    simulated("run.csv")
+    columns = "--column", "speed=omega_m_rad_per_s", "--column", "thrust=thrust_N"
+    data = as_json("estimate", "run.csv", "--sensor", "speed", *columns)
+    assert list(data["one_step_ahead"]) == ["speed"] and "T" in data["references"]
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_filter_tuned_on_logs_is_verified_reported_and_used(simulated, as_json, thruster, tmp_path):  # noqa: F811
@@ -92,6 +158,34 @@ def test_a_filter_tuned_on_logs_is_verified_reported_and_used(simulated, as_json
     done = thruster("estimate", "b.csv", "--tuned", "tuned.json", "--dt", "0.02", "--out", "est.csv")
     assert done.returncode == 2 and "was tuned for dt 0.01 (here 0.02)" in done.stderr
     assert not (tmp_path / "est.csv").exists()
+
+
+@pytest.mark.slow
+def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "pendulum_of_a_user.py").write_text(TWO_STATES)
+    draws = np.random.default_rng(0)
+    phi, omega, rows = 0.0, 0.0, ["t_s,torque,encoder_deg"]
+    for k in range(400):
+        tau = np.sign(np.sin(0.05 * k))
+        rows.append(f"{0.05 * k:.4f},{tau},{np.degrees(phi + 0.1 * draws.normal()):.6f}")
+        phi, omega = phi + 0.05 * omega, omega + 0.05 * (tau - phi - omega) + 0.03 * draws.normal()
+    (tmp_path / "run.csv").write_text("\n".join(rows) + "\n")
+    pytest.importorskip("pint")
+    model = "--model", "pendulum_of_a_user:model"
+    data = as_json("tune", "--log", "run.csv", *model, "--filter", "kf", "--trials", 3, "--out", "tuned.json")
+    assert data["file"] == "tuned.json" and objectives_of(tmp_path / "tuned.json") == ["likelihood"]
+    logged = "--log", "run.csv", *model, "--filter", "kf", "--trials", "3", "--out", "a tuned.json"
+    said = [line for line in thruster("tune", *logged).stdout.splitlines() if line.startswith("Next: thruster ")]
+    assert said == ["Next: thruster report 'a tuned.json' --model pendulum_of_a_user:model"]
+    assert thruster(*shlex.split(said[0])[2:]).returncode == 0
+    told = as_json("estimate", "run.csv", *model, "--tuned", "tuned.json", "--smoother")
+    assert told["smoothed"] and told["dt"] == 0.05
+    done = thruster("verify", "tuned.json")
+    assert done.returncode == 2 and done.stderr.rstrip().endswith(
+        "use --model pendulum_of_a_user:model (model='pendulum_of_a_user:model' in Python), if you trust it"
+    )
+    assert as_json("verify", "tuned.json", *model)["holds"]
 
 
 @pytest.mark.parametrize(
@@ -147,3 +241,25 @@ def test_a_mistake_with_a_log_is_one_line_and_nothing_is_written(arguments, line
     assert done.returncode == 2 and line in done.stderr and done.stderr.count("thruster:") == 1
     assert (tmp_path / "run.csv").read_text().startswith("time_s,voltage_V,measured_thrust_N")
     assert {path.name for path in tmp_path.iterdir()} <= {"run.csv", "out"}
+
+
+def test_rows_in_which_nothing_was_measured_tell_nothing(thruster, tmp_path):  # noqa: F811
+    rows = [f"{0.01 * k:.2f},{k % 7},{k * 0.1 if k < 30 else ''}" for k in range(200)]
+    (tmp_path / "run.csv").write_text("time_s,voltage_V,measured_thrust_N\n" + "\n".join(rows) + "\n")
+    assert "Nothing was measured in the rows that count, from 50 on" in " ".join(
+        thruster("estimate", "run.csv").stdout.split()
+    )
+
+
+def test_clock_offsets_of_a_preset_file_are_taken_off(thruster, as_json, tmp_path):  # noqa: F811
+    thruster("simulate", "--out", "run.csv", "--steps", 200)
+    table = (tmp_path / "run.csv").read_text().splitlines()
+    rows = [line.split(",") for line in table]
+    late = [row[:5] + [rows[max(k - 4, 1)][5]] for k, row in enumerate(rows[1:], start=1)]  # by 40 ms
+    (tmp_path / "late.csv").write_text("\n".join(",".join(row[:2] + row[5:]) for row in [rows[0], *late]) + "\n")
+    recorder = {"sensors": ["thrust"], "clock_offset": {"thrust": 0.04}}
+    write_preset(tmp_path / "mine.toml", PresetFile(PRESETS["tunnel"], recorder=recorder))
+    told = as_json("estimate", "late.csv", "--preset", "mine.toml")
+    assert told["mean_nis"] == pytest.approx(as_json("estimate", "run.csv")["mean_nis"], rel=0.05)
+    assert told == as_json("estimate", "late.csv", "--clock-offset", "thrust=0.04")
+    assert as_json("estimate", "late.csv", "--preset", "mine.toml", "--clock-offset", "thrust=0")["mean_nis"] > 2

@@ -69,3 +69,15 @@ def test_a_demo_whose_search_was_interrupted_says_so_and_exits_with_130(run_demo
     monkeypatch.setattr(demo, "write_report", lambda *_, **options: Report(page, page, "Tuning lowers the score."))
     code, lines = run_demo()
     assert code == 130 and "3 trials, interrupted, on 32 runs" in " ".join(lines)
+
+
+def test_a_demo_that_is_interrupted_later_exits_with_130(run_demo, monkeypatch):
+    monkeypatch.setattr(demo, "run_tuning", failing(KeyboardInterrupt))
+    assert run_demo() == (130, [])
+
+
+def failing(error):
+    def function(*arguments, **options):
+        raise error
+
+    return function

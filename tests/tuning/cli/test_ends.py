@@ -15,6 +15,7 @@ import pytest
 
 import tuning.cli.app
 from tests.slow import slow_but
+from thruster_env.core.text_tables import showable
 from tuning.cli.main import main
 
 INTERRUPTED = "thruster: interrupted\n"
@@ -52,6 +53,24 @@ class Moment(type(sys.stdout)):
             os.kill(os.getpid(), signal.SIGINT)
         return count + super().write(text[half:])
 sys.stdout = Moment(sys.stdout.buffer, encoding="utf-8", write_through=True)
+"""
+AFTER_HANDLERS = """
+import os, signal, sys, types
+class Moment:
+    def __del__(self, kill=os.kill, process=os.getpid(), number=signal.SIGINT): kill(process, number)
+sys.modules["moment"] = types.ModuleType("moment")
+sys.modules["moment"].last = Moment()
+"""
+TWICE = """
+import os, tuning.cli.app, tuning.cli.main
+def slow_to_end(standalone_mode):
+    try:
+        os.kill(os.getpid(), 2)
+    finally:
+        os.kill(os.getpid(), 2)
+        print("not reached")
+tuning.cli.app.app = slow_to_end
+tuning.cli.main.run()
 """
 
 
@@ -105,6 +124,11 @@ def test_ctrl_c_while_results_are_printed_leaves_them_whole(arguments):
     done = process(AT_FIRST_OUTPUT, "thruster", arguments, stdout=subprocess.PIPE)
     assert (done.returncode, done.stderr, done.stdout.rstrip()) == (130, INTERRUPTED, whole.stdout.rstrip())
     assert whole.returncode == 0 and len(whole.stdout) > 200
+
+
+def test_ctrl_c_after_python_has_put_its_handlers_away_changes_nothing():
+    done = process(AFTER_HANDLERS, "thruster", "--version", stdout=subprocess.PIPE)
+    assert (done.returncode, done.stderr, done.stdout.split()[0]) == (0, "", "thruster-env")
 
 
 def test_a_second_ctrl_c_ends_a_command_whose_output_nobody_reads():
@@ -168,6 +192,11 @@ def test_no_ctrl_c_is_lost(ends, function):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def test_a_second_ctrl_c_ends_the_process_at_once():
+    done = subprocess.run([sys.executable, "-c", TWICE], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", INTERRUPTED)
+
+
 def failing(error):
     def function():
         raise error
@@ -225,3 +254,9 @@ def test_a_table_is_whole_in_every_encoding(monkeypatch, encoding):
     assert stop.value.code == 0 and "--preset" in shown and "?" not in shown
     options = shown.splitlines()[shown[: shown.index("- Options -")].count("\n") :]
     assert {line[0] + line[-1] for line in options if line.strip()} == {"++", "||"}
+
+
+def test_what_an_encoding_lacks_is_written_in_other_characters():
+    assert showable("5.2 ±0.1 µs, ω_m, Cramér, … ┏━┓┃", "ascii") == "5.2 +-0.1 us, w_m, Cramer, ... +-+|"
+    assert showable("5.2 ±0.1", "iso8859-1") == showable("5.2 ±0.1", "utf-8") == "5.2 ±0.1"
+    assert showable("船", "ascii") == "?"

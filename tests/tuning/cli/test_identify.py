@@ -1,12 +1,14 @@
 """`thruster identify`: tables, files that every preset takes, and one clear line for a mistake."""
 
 import re
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the env
+from tests.models import scalar_model
 from tests.thruster_env.thruster.test_t200 import OTHER, recorded_rows, write_table
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.streams import episode_keys
@@ -14,8 +16,11 @@ from thruster_env.logs.log import Log
 from thruster_env.logs.write import write_log
 from thruster_env.model.simulate import simulate
 from thruster_env.thruster.model import logged_model, thruster_model
-from thruster_env.thruster.parameters import TUNNEL_PHYSICAL, read_preset
+from thruster_env.thruster.parameters import TUNNEL_PHYSICAL, PresetFile, read_preset, write_preset
 from tuning.experiments.identification import TRUTH, record
+from tuning.identification.result import with_values
+from tuning.problems.find import find_problem, scenario_of
+from tuning.thruster.logs import of_preset
 
 FREE = ",".join(name for name in TRUTH if not name.startswith(("Q", "R")))
 WHOSE = "--preset tunnel_physical --sensor thrust --sensor speed"
@@ -59,6 +64,14 @@ def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_
     assert env.state_space_model().constants.dead_band_high == kept.dead_band[1]
 
 
+@pytest.mark.slow
+def test_a_load_cell_that_will_not_be_there_is_predicted(as_json, logs):  # noqa: F811
+    free = "--free", "motor_damping,voltage_gain,lift_coefficient", "--hold-noise", "--starts", 1
+    found = as_json("identify", *logs, *OF_LOGS, *free, "--predicted", "thrust", "--degrees", 20)
+    checked = {name: found["validation"][name]["one_step"]["thrust"] for name in ("start", "identified")}
+    assert checked["identified"] < 0.9 * checked["start"]
+
+
 WITHOUT_LOG = [
     ((), "Missing argument 'LOG...'"),
 ]
@@ -97,6 +110,17 @@ def test_a_mistake_is_one_line_and_nothing_is_written(thruster, logs, tmp_path, 
 
 
 @pytest.mark.slow
+def test_logs_without_excitation_say_what_they_do_not_determine(thruster, tmp_path):  # noqa: F811
+    (log,) = record(0, 1, 100)
+    write_log("flat.csv", replace(log, inputs=np.full_like(log.inputs, 6.0)))
+    done = thruster("identify", "flat.csv", *OF_LOGS, "--free", f"{FREE},Q11")
+    assert done.returncode == 2
+    said = done.stderr.splitlines()[-1]  # before it there may be a line on compilation
+    assert "constant inputs do not determine" in said and "voltage_gain, dead_band_low" in said
+    assert not list(tmp_path.rglob("*.toml"))
+
+
+@pytest.mark.slow
 def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tmp_path):  # noqa: F811
     truth = OTHER.thruster._replace(
         **{name: 1.5 * getattr(OTHER.thruster, name) for name in ("motor_damping", "voltage_gain", "load_gain")},
@@ -125,6 +149,22 @@ def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tm
     write_log("flat.csv", Log("step", 0.01, inputs, drawn[:61], model.input_quantities, model.measurements))
     done = thruster("bollard", "table.csv", "--step", "flat.csv")
     assert done.returncode == 2 and "a step response must have a step of the voltage" in done.stderr
+
+
+def test_scenarios_are_of_another_thruster_by_its_preset_file(thruster, tmp_path):  # noqa: F811
+    path = tmp_path / "mine.toml"
+    write_preset(path, PresetFile(TUNNEL_PHYSICAL._replace(voltage_gain=1300.0), (-0.5, 0.7)))
+    made = of_preset(find_problem("nominal"), str(path), sequences=4)
+    path.unlink()  # the scenario holds what it said
+    assert made.plant.parameters.voltage_gain == 1300.0 and made.model().constants.dead_band_high == 0.7
+    assert np.isfinite(made.scale).all() and made.scale != find_problem("nominal").scale
+    again = scenario_of(made.as_mapping(), made.name, "t.json")
+    assert again.digest == made.digest != find_problem("nominal").digest
+    assert of_preset(made, None) is made
+    done = thruster("compare", "--filter", "ekf", "--scenario", "published_tunnel", "--preset", "t200")
+    assert (
+        done.returncode == 2 and "(--preset) must come with scenarios of the thruster's equations" in done.stderr
+    )
 
 
 def test_no_command_writes_over_a_log_or_its_description(thruster, logs, tmp_path):  # noqa: F811
@@ -156,3 +196,71 @@ def test_no_command_writes_over_a_log_or_its_description(thruster, logs, tmp_pat
         assert done.returncode == 2 and message in done.stderr, line
         assert done.stderr.count("thruster:") == 1 and "Traceback" not in done.stderr, line
         assert files() == before, line
+
+
+MOTOR = """
+from typing import NamedTuple
+
+from thruster_env.model.continuous import ContinuousModel
+
+
+class Constants(NamedTuple):
+    substep: float
+    gain: float = 60.0
+    friction: float = 3.0
+
+
+def rates(x, u, c):
+    return (c.gain * u[0] - c.friction * x[0],)
+
+
+def speed(x, c):
+    return (x[0],)
+
+
+motor = ContinuousModel(
+    rates=rates,
+    observe=speed,
+    densities=[4.0],
+    constants=Constants(0.05),
+    arguments={"prior_mean": [0.0], "prior_cov": [1.0], "measurement_noise_cov": [0.01], "inputs": 1,
+               "measurements": ["speed"]},
+)
+"""
+
+
+@pytest.mark.slow
+def test_a_log_on_its_own_stamps(as_json, thruster, tmp_path):  # noqa: F811
+    rng, speed, rows = np.random.default_rng(1), 0.0, []
+    (tmp_path / "plant.py").write_text(MOTOR)
+    stamps, volts = np.cumsum(rng.uniform(0.01, 0.09, size=400)), 0.0
+    for k, length in enumerate(np.diff(stamps, append=stamps[-1] + 0.05)):
+        volts = rng.choice([-1.0, 1.0]) if k % 10 == 0 else volts
+        rows.append(f"{stamps[k]:.6f},{volts:g},{speed + 0.1 * rng.normal():.6f}")
+        decay = np.exp(-2.0 * length)  # exact from stamp to stamp: gain 40, friction 2
+        speed = decay * speed + 20.0 * volts * (1 - decay) + np.sqrt((1 - decay**2) / 4) * rng.normal()
+    (tmp_path / "run.csv").write_text("\n".join(["time_s,u_1,speed", *rows]))
+    given = ("run.csv", "--model", "plant:motor", "--no-grid", "--dt", "0.05")
+    found = as_json("identify", *given, "--free", "gain,friction", "--starts", "1", "--out", "found.toml")
+    for name, truth in {"gain": 40.0, "friction": 2.0, "R": 0.01}.items():
+        assert abs(found["values"][name] - truth) < 4 * found["standard_errors"][name], name
+    again = as_json("estimate", *given, "--preset", "found.toml", "--skip", "0")
+    assert again["grid"] is False
+    assert again["log_likelihood"] == pytest.approx(found["validation"]["identified"]["log_likelihood"], rel=1e-9)
+    tuned = as_json("tune", "--filter", "ekf", "--log", *given, "--trials", "4", "--out", "tuned.json")
+    assert tuned["held_out"] and as_json("verify", "tuned.json", "--model", "plant:motor")
+    on_stamps = as_json("estimate", *given, "--tuned", "tuned.json")
+    assert on_stamps["grid"] is False and np.isfinite(on_stamps["log_likelihood"])
+    done = thruster("identify", *given, "--free", "gain", "--filter", "kf")
+    assert done.returncode == 2 and "must be identified with the ekf, but got filter kf" in done.stderr
+
+
+def test_values_of_a_model_belong_to_a_sample_time(tmp_path):
+    (tmp_path / "mine.toml").write_text("[values]\nQ11 = 0.5\nR = 2.0\n[identified]\ndt = 0.01\n")
+    alone = with_values(scalar_model, tmp_path / "mine.toml")
+    assert alone(0.01).process_noise_cov.item() == pytest.approx(0.5, rel=1e-12)
+    with pytest.raises(ValueError, match=r"the dt of a log must be that of .*mine.toml, 0.01 s, .* but is 0.02 s"):
+        alone(0.02)
+    made = with_values(lambda dt=0.01: scalar_model(), tmp_path / "mine.toml")(0.02)
+    assert made.process_noise_cov.item() == pytest.approx(1.0, rel=1e-12)
+    assert made.measurement_noise_cov.item() == pytest.approx(2.0, rel=1e-12)

@@ -9,15 +9,20 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import tuning
 from filters import EstimateState, make_filter, run
 from filters.registry import filter_type
 from filters.sensitivity import likelihood
-from tests.models import simulated
+from tests.filters.test_differentiated import swing_if
+from tests.models import pendulum, simulated, swing
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.compiled import interpreted
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.parameters import TUNNEL_PHYSICAL, read_preset
+from tuning.evaluation.baselines import rule_of_thumb
+from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.find import find_problem
+from tuning.search.parameters import filter_parameters
 
 
 @pytest.fixture
@@ -37,6 +42,14 @@ def new(thruster, monkeypatch, tmp_path):  # noqa: F811
     for name in set(sys.modules) - known:
         if name.startswith("a_new_"):
             del sys.modules[name]
+
+
+@pytest.mark.slow
+def test_a_problem_can_be_tuned(new, as_json):  # noqa: F811
+    name = new("problem", "a_new_problem")
+    found = as_json("tune", "--problem", f"{name}:problem", "--filter", "ekf", "--trials", 2)
+    held_out = found["held_out"][f"{name}:problem"]
+    assert held_out["tuned"]["score"][0] < 2 and found["trials"] == 2
 
 
 def naive_correntropy(model, bandwidth, iterations, inputs, measurements):
@@ -104,6 +117,23 @@ def test_a_filter_is_differentiated_and_stands_around_an_env(new):
     assert np.isfinite(info["estimate"]).all()
 
 
+def test_a_filter_runs_on_a_model_that_cannot_be_traced(new):
+    kind = importlib.import_module(new("filter", "a_new_call")).ANewCall
+    inputs, z = simulated(pendulum(), 10, count=2, missing=0.2)
+    with interpreted():
+        one, other = (run(kind(model=pendulum(transition=f)), None, inputs, z) for f in (swing, swing_if))
+    np.testing.assert_allclose(one.means, other.means, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(one.covs, other.covs, rtol=1e-7, atol=1e-9)
+
+
+def test_studies_search_the_range_of_a_filters_parameter(new):
+    new("filter", "a_new_range")
+    (found,) = filter_parameters(filter_type("a_new_range:ANewRange"), True)
+    assert (found.name, found.low, found.high, found.default, found.log) == ("bandwidth", 1.0, 20.0, 3.0, True)
+    choice = rule_of_thumb("a_new_range:ANewRange", find_problem("outliers"))
+    assert choice.numbers == {"bandwidth": 3.0} and choice.filter(find_problem("outliers")).bandwidth == 3.0
+
+
 def test_an_env_is_estimated_and_is_a_problem(new):
     module = importlib.import_module(new("env", "a_new_env"))
     with interpreted():
@@ -158,3 +188,13 @@ def test_what_cannot_be_new_is_refused(thruster, tmp_path, arguments, line):  # 
     assert done.returncode == 2 and line in done.stderr
     assert {path.name for path in tmp_path.iterdir()} == {"there.py", "none"}
     assert (tmp_path / "there.py").read_text() == "mine\n"
+
+
+@pytest.mark.slow
+def test_gradients_and_methods_tune_a_users_filter(new):
+    name = f"{new('filter', 'a_new_way')}:ANewWay"
+    study = tuning.tune("nominal", name, method="likelihood", progress=False)
+    evaluated = study.held_out
+    assert evaluated is not None and study.choice.numbers["bandwidth"] == 3.0
+    found = tune_by_gradient(name, find_problem("nominal"), find_problem("nominal").data(range(8)))
+    assert found.agree and found.best.converged

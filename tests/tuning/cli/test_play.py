@@ -1,9 +1,14 @@
 """`thruster play` without a policy: PI, voltages, a log, with an estimate beside the truth, and without torch."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.render import renderer
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.rendering import ChartEntry, Overlay
 from tuning.cli import play
@@ -24,6 +29,11 @@ def test_pi_follows_a_reference_under_an_estimate(as_json, frames):  # noqa: F81
     assert path.name == "x.gif" and rate == 25 and len(pictures) == 4 and pictures[0].shape[2] == 3
 
 
+def test_alone_it_plays_pi(as_json, frames):  # noqa: F811
+    alone = as_json("play", "--steps", 8, "--out", "x.gif")
+    assert alone == as_json("play", "--policy", "pi", "--steps", 8, "--out", "x.gif") and alone["steps"] == 8
+
+
 @pytest.mark.parametrize("option", [("--voltage", 8), ("--excitation", "prbs")])
 def test_voltages_drive_the_thruster(as_json, frames, monkeypatch, option):  # noqa: F811
     seen = []
@@ -33,6 +43,13 @@ def test_voltages_drive_the_thruster(as_json, frames, monkeypatch, option):  # n
     env = seen[0]
     assert env.unwrapped.plant.parameters.gear_ratio == 1.0  # a T200
     assert env.unwrapped.moment_of([0.0] * 40).reference is None
+
+
+def test_a_picture_has_the_size_that_is_asked_for(thruster, as_json, frames):  # noqa: F811
+    as_json("play", "--steps", 4, "--size", "160X90", "--out", "x.mp4")
+    thruster("simulate", "--out", "run.csv", "--steps", 3)
+    as_json("play", "--log", "run.csv", "--size", "99x81", "--out", "x.gif")
+    assert [pictures[0].shape for _, pictures, _ in frames] == [(90, 160, 3), (81, 99, 3)]
 
 
 def spy(function, seen):
@@ -60,6 +77,19 @@ def test_a_log_is_shown_as_it_was_recorded(thruster, as_json, frames, monkeypatc
     )
 
 
+def test_where_a_log_has_no_truth_the_estimate_moves_the_propeller(thruster, tmp_path):  # noqa: F811
+    times = 0.01 * np.arange(40)
+    rows = [f"{t:.2f},9,{10 * (1 - np.exp(-20 * t)):.4f}" for t in times]
+    (tmp_path / "bare.csv").write_text("time_s,voltage_V,measured_thrust_N\n" + "\n".join(rows) + "\n")
+    done = thruster("play", "--log", "bare.csv", "--out", "bare.gif")
+    assert done.returncode == 0 and "Video: bare.gif" in done.stdout
+    with Image.open("bare.gif") as picture:
+        assert picture.n_frames == 10
+        first = np.asarray(picture.convert("RGB"), dtype=int)
+        picture.seek(9)
+        assert np.abs(np.asarray(picture.convert("RGB"), dtype=int) - first).sum() > 1e5
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -81,3 +111,15 @@ def test_a_log_is_shown_as_it_was_recorded(thruster, as_json, frames, monkeypatc
 def test_a_mistake_is_one_line(thruster, tmp_path, arguments, line):  # noqa: F811
     done = thruster("play", *arguments)
     assert done.returncode == 2 and line in done.stderr and not list(tmp_path.glob("*.gif"))
+
+
+def test_a_video_that_cannot_be_drawn_is_said(monkeypatch):
+    monkeypatch.setattr(renderer.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="drawing needs pygame, which is not installed"):
+        renderer.check_drawing(None)
+
+
+def test_torch_is_not_imported():
+    code = "import sys, tuning.cli.play, tuning.cli.play; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "False\n", done.stderr

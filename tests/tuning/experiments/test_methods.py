@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -12,9 +13,14 @@ from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.experiments.methods import runs
 from tuning.experiments.methods.problems import (
     CASES,
+    ENTRIES,
     FAST,
+    GROUPS,
+    PREDICTIONS,
     QUICK,
     REFERENCE,
+    Protocol,
+    ring,
 )
 from tuning.experiments.methods.runs import (
     Result,
@@ -23,6 +29,7 @@ from tuning.experiments.methods.runs import (
     data_set,
     file_of,
     jobs_of,
+    reference,
     regrets,
     run_method,
     run_protocol,
@@ -77,6 +84,17 @@ def test_all_methods_have_equal_data_and_starts_and_held_out_runs_are_others():
     assert start_of(WALK, 2).model["measurement_noise_cov"] == pytest.approx(400.0)
 
 
+def test_a_method_that_lacks_something_is_no_failure_and_one_that_breaks_is():
+    blind = run_method(QUICK[1], "noise-estimation", 0, FAST)
+    assert blind.last is None and "needs true states" in blind.error
+    studied = run_method(WALK, "study", 0, FAST)
+    assert studied.last is None  # it would draw runs of its own
+    em = run_method(WALK, "em", 0, FAST)
+    assert em.error == "" and em.by_seconds.keys() == {"1"} and em.taken_runs <= FAST.runs + WALK.runs
+    best = reference(WALK, FAST).last
+    assert best.score < em.last.score * 1.01
+
+
 def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     few = FAST._replace(methods=("likelihood", "noise-estimation"), sets=2)
     with ThreadPoolExecutor(1) as pool:
@@ -89,6 +107,23 @@ def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     assert name.is_file() and file_of(tmp_path, WALK, "likelihood", 1, few._replace(runs=999)) != name
     made = tables(again, few)
     assert "noise-estimation" in made["what to use"]() and "`walk`" in made["groups A to D"]()
+
+
+def test_results_that_say_way_are_read(tmp_path):
+    few = FAST._replace(cases=(WALK,), methods=("random-only",), sets=1)
+    file = file_of(tmp_path, WALK, "random-only", 0, few)
+    assert file.name.startswith("random-0-")
+    file.parent.mkdir()
+    content = result("random", 0, 1.0)._asdict()
+    file.write_text(json.dumps({"way": content.pop("method"), **content}))
+    assert runs.read(tmp_path, few) == [result("random-only", 0, 1.0)]
+
+
+def test_the_protocol_names_all_groups_and_was_predicted():
+    assert {case.group for case in CASES} == set(GROUPS)
+    assert len({case.name for case in CASES}) == len(CASES) and Protocol().methods == ENTRIES
+    assert pickle.loads(pickle.dumps(CASES)) is not None  # --jobs sends them to processes
+    assert {"we", "Rawlings et al."} <= {one.who for one in PREDICTIONS}
 
 
 @pytest.mark.slow
@@ -108,6 +143,17 @@ def test_two_targets_have_full_blocks_of_q_which_noise_estimation_finds():
         run_method(case, method, 0, FAST).last for method in ("noise-estimation", "start", "oracle")
     )
     assert found.score < 1.01 * oracle.score < 0.9 * start.score
+
+
+@pytest.mark.slow
+def test_a_ring_is_tuned_by_its_inflation_alone():
+    case = next(case for case in CASES if case.make is ring)._replace(make=lambda: ring(100), runs=2)
+    starts = [start_of(case, place) for place in range(3)]
+    assert starts[0] == starts[1] == starts[2] and starts[0].numbers["ensemble_size"] == 20
+    assert set(starts[0].model["measurement_noise_cov"]) == {1.0}
+    found = run_method(case, "anderson", 0, FAST)
+    assert found.error == "" and 1.005 < found.choice["numbers"]["inflation"] < 1.05
+    assert run_method(case, "likelihood", 0, FAST).last is None
 
 
 def test_the_command_writes_its_page(as_json, thruster, tmp_path):  # noqa: F811

@@ -15,6 +15,8 @@ from tuning.experiments.policies import (
     BEST,
     CLASSICAL,
     QUICK,
+    VARIANTS,
+    WRONG,
     Comparison,
     Result,
     Run,
@@ -24,7 +26,7 @@ from tuning.experiments.policies import (
     typical_error,
     typical_return,
 )
-from tuning.experiments.policies_report import HEADER
+from tuning.experiments.policies_report import HEADER, answers, rows_of, summary_rows
 from tuning.policies.environments import make_environments
 from tuning.policies.saved import Scores, classical_policy, run_episodes, score
 from tuning.policies.setup import FIRST_SCORED_STEP, THRUSTER, Part, make_configuration
@@ -88,6 +90,57 @@ def test_thrust_errors_are_pooled_before_the_root():
     assert np.isnan(typical_error([none], "reversal").value)
 
 
+def test_the_table_tells_what_part_of_the_gap_to_the_best_controller_is_closed():
+    noise = np.random.default_rng(1).normal(0.0, 0.01, 60)
+    made = [result(arm, level + noise) for arm, level in (("raw", -4.0), ("ekf", -2.0), ("true", -1.5))]
+    made += [result(arm, level + noise, kind=BEST) for arm, level in (("ekf", -1.6), ("true", -1.0))]
+    made.append(result("ekf", -3.0 + noise, kind="pi", errors=2.0))
+    made.append(result("ekf", -4.0 + noise, kind="lqr"))
+    rows = {row[0]: dict(zip(HEADER, row, strict=True)) for row in rows_of(made, "medium")}
+    assert rows["PPO: ekf"]["gap closed"] == "67 %" and rows["PI: ekf"]["gap closed"] == "33 %"
+    assert rows["PPO: raw"]["gap closed"] == "0 %" and rows["MPC: true"]["gap closed"] == "100 %"
+    assert rows["PPO: true"]["gap closed"] == "83 %" and rows["PI: ekf"]["steady"] == "2.00"
+    said = dict(summary_rows(made))
+    assert said["gap closed by PPO: ekf"].startswith("66.7 % [66.") and said["gap closed by PPO: enkf"] == ""
+    assert said["cost of MPC: ekf / of MPC: true"].startswith("1.600 [")
+    assert said["cost of PPO: stack / of PPO: ekf"] == ""
+    assert said["cost of PPO: ekf / of MPC: ekf"].startswith("1.250 [")
+    assert said["cost of LQG: ekf / of MPC: ekf"].startswith("2.500 [")
+    found = answers(made)
+    assert "at least 66.7 % [66." in found[0] and found[0].endswith(
+        "70 % is not reached by all, intervals counted."
+    )
+    assert "knowing the true state is worth +0.6000 [+0.6000, +0.6000]: better." in found[1]
+    assert found[2].startswith("PPO: true costs 1.500 [") and found[2].endswith("as much as MPC: not within 2 %.")
+
+
+@pytest.mark.parametrize(
+    ("level", "said"),
+    [(-0.99, "better"), (-1.01, "within 2 %"), (-1.02, "perhaps within 2 %"), (-1.1, "not within")],
+)
+def test_near_the_best_controller_means_with_the_whole_interval(level, said):
+    noise = np.random.default_rng(1).normal(0.0, 0.1, 60)
+    own = np.random.default_rng(2).normal(0.0, 0.003, 60)
+    made = [result("true", level + noise + own), result("true", -1.0 + noise, kind=BEST)]
+    (found,) = answers(made)
+    assert f"as much as MPC: {said}" in found
+
+
+def test_a_situation_that_the_model_does_not_know_is_judged_against_the_controller():
+    made = [
+        result("ekf", [-1.0, -1.1])._replace(run=Run("medium", kind, "dead band", setup("ekf")))
+        for kind in ("ppo",)
+    ]
+    made.append(result("ekf", [-1.5, -1.6])._replace(run=Run("medium", BEST, "dead band", setup("ekf"))))
+    assert answers(made) == ["PPO: ekf, dead band returns +0.500 [+0.500, +0.500] more than MPC: better."]
+
+
+def test_nothing_is_said_of_a_gap_that_is_not_there():
+    made = [result(arm, np.full(20, -1.0)) for arm in ("raw", "ekf")]
+    made.append(result("true", np.full(20, -1.0), kind=BEST))
+    assert {row[2] for row in rows_of(made, "medium")} == {""} and answers(made) == []
+
+
 def test_scores_are_what_a_naive_loop_finds():
     chosen = setup("ekf")
     policy = classical_policy("lqr", chosen)
@@ -113,6 +166,15 @@ def test_scores_are_what_a_naive_loop_finds():
             found.parts["observed"].squares[b] == pytest.approx(seen) and found.parts["observed"].steps[b] == 450
         )
     assert found.parts["all"].steps.tolist() == [500] * 3
+
+
+def test_pi_has_gains_that_do_better_than_the_usual_ones_on_held_out_episodes():
+    chosen = setup("raw")
+    found = classical_policy("pi", chosen)
+    usual = found.controller.for_env(make_environments(chosen, [0], native=False).envs[0])
+    held_out = held_out_seeds(0, 40)
+    of_usual = score(type(found)(usual, 0, found.half), chosen, held_out).returns
+    assert (score(found, chosen, held_out).returns - of_usual).mean() > 0.5
 
 
 def test_a_controller_of_states_refuses_raw_measurements():
@@ -154,6 +216,28 @@ def test_the_plan_has_every_arm_at_every_noise_with_equal_networks_and_steps():
     assert {tuple(run.setup.env_arguments["process_noise_cov"]) for run in planned} == {(4.0, 0.01)}
     with_memory = runs_of(Comparison(noises=("low",), seeds=1, variants=False, recurrent=True))
     assert [run.name for run in with_memory if run.kind == "recurrent-ppo"] == ["low-recurrent-ppo-raw-seed0"]
+
+
+def test_variants_change_what_the_filter_assumes_and_nothing_else():
+    runs_there = runs_of(Comparison(noises=("medium",), observation_sets=("ekf",), seeds=1))
+    planned = {run.label: run.setup for run in runs_there if run.kind == "ppo"}
+    best = {run.label: run.setup for run in runs_there if run.kind == BEST}
+    for arm, variant in VARIANTS:
+        assert best[f"{arm}, {variant}"].filter_arguments == planned[f"{arm}, {variant}"].filter_arguments
+    assert {run.variant for run in runs_there if run.kind == "ppo+mpc"} == {"", *WRONG}
+    (dead,) = planned["ekf, dead band"].env_arguments["amplifier"]
+    (flow,) = planned["ekf, unknown flow"].env_arguments["flow"]
+    assert dead["name"] == "dead-band" and flow["name"] == "gauss-markov"
+    exact, wrong = planned["ekf"], planned["ekf, wrong model"]
+    assert exact.filter_arguments == {}
+    assert wrong.filter_arguments == {"parameter_factors": {"lift_coefficient": 1.15, "voltage_gain": 0.95}}
+    assert wrong.env_arguments == exact.env_arguments
+    untuned, tuned = planned["ekf, untuned"].filter_arguments, planned["ekf, tuned"].filter_arguments
+    assert untuned["process_noise_cov"] == list(MEDIUM.untuned["process_noise_cov"])
+    found = np.asarray(tuned["process_noise_cov"])
+    variances = np.diag(found) if found.ndim == 2 else found
+    assert np.allclose(np.log(variances / [4.0, 0.01]), 0.0, atol=np.log(2))
+    assert set(planned["ekf, wrong model tuned"].filter_arguments) == {"parameter_factors", *tuned}
 
 
 @pytest.mark.slow
@@ -211,3 +295,17 @@ def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path,
     assert thruster(*command[:-2]).returncode == 0
     assert {path: path.stat().st_mtime_ns for path in times} == times
     assert (tmp_path / "found" / "policies.md").read_text().startswith("# Policies")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line"),
+    [
+        ("page.txt", "", "a page must be a file that ends in .md, but got 'page.txt'"),
+        ("page.md", "nothing here", "a page that is there must have a place for a table"),
+    ],
+)
+def test_a_page_without_a_place_for_tables_is_refused_before_the_work(name, text, line, thruster, tmp_path):
+    (tmp_path / name).write_text(text)
+    done = thruster("reproduce", "policies", "--quick", "--page", name)
+    assert done.returncode == 2 and line in done.stderr and "Traceback" not in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == text

@@ -8,7 +8,7 @@ pytest.importorskip("stable_baselines3")
 from scipy.stats import t as student
 from scipy.stats import ttest_ind
 
-from tuning.experiments.policies import as_interval, combined, mean_figure
+from tuning.experiments.policies import EPISODES, Figure, as_interval, combined, mean_figure
 
 SEEDS, EPISODE_COUNT = 5, 40
 TRIALS = 1200
@@ -56,6 +56,14 @@ def test_episodes_are_shared_and_seeds_are_not():
     assert as_interval(same - same) == pytest.approx((0, 0, 0)) and tied.high > 1.5 and tied.value == 0
 
 
+def test_figures_combine_as_their_numbers_do():
+    one, other = Figure(6.0, {EPISODES: np.array([6.0, 7.0])}), Figure(2.0, {"b": np.array([1.0, 2.0, 4.0])})
+    ratio = combined(lambda a, b: a / b, one, other)
+    assert ratio.value == 3.0 == (one / other).value
+    np.testing.assert_array_equal(ratio.without[EPISODES], [3.0, 3.5])
+    np.testing.assert_array_equal(ratio.without["b"], [6.0, 3.0, 1.5])
+
+
 def covered(own):
     """The share of trials whose interval has the truth, for each question that a comparison asks, by name."""
     generator, hits = np.random.default_rng(7), {}
@@ -87,3 +95,19 @@ def test_with_five_seeds_the_intervals_cover_what_they_promise():
     """95 %, to three standard errors of 1200 trials."""
     share = covered(own=0.03)
     assert len(share) == 5 and all(abs(found - 0.95) < 0.019 for found in share.values()), share
+
+
+def test_where_a_policy_and_an_episode_do_not_add_up_the_intervals_are_rather_too_wide():
+    """What a policy does in one episode and not in others is in both sources of chance."""
+    share = covered(own=0.3)
+    assert all(found > 0.935 for found in share.values()), share
+
+
+def test_the_bootstrap_of_five_seeds_covers_less_than_it_promises():
+    generator = np.random.default_rng(3)
+    seeds = generator.normal(size=(2000, SEEDS))
+    drawn = generator.integers(SEEDS, size=(400, SEEDS))
+    low, high = np.quantile(seeds[:, drawn].mean(axis=2), [0.025, 0.975], axis=1)
+    assert 0.80 < ((low <= 0) & (high >= 0)).mean() < 0.90
+    means = [as_interval(figure(row[None].repeat(2, axis=0))) for row in seeds]
+    assert 0.935 < np.mean([found.covers(0.0) for found in means]) < 0.965

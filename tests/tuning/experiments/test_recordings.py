@@ -1,5 +1,7 @@
 """The recorded ROV thruster: on runs of our own and, where there are any, on the recorded ones."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -8,9 +10,13 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.model.simulate import simulate
 from tuning.experiments.recordings.identification import (
     CHOSEN,
+    LOOKUP,
     OURS,
+    OWN,
+    STATIC_MAP,
     STRUCTURES,
     Structure,
+    after_reversal,
     averaged,
     best_rmse,
     error,
@@ -20,16 +26,19 @@ from tuning.experiments.recordings.identification import (
     ladder_rows,
     number_rows,
     ratios,
+    regimes,
     rmse,
     settled_rmse,
     tasks_of,
     thrusts,
 )
-from tuning.experiments.recordings.model import DT, clock_offset, read_recordings, to_identify
+from tuning.experiments.recordings.model import DT, clock_offset, model, read_recordings, to_identify
 from tuning.identification.result import valued
 
+RECORDED = Path(__file__).parents[4] / "shared" / "data" / "rov_thruster"
 TRUTH = {"inertia": 0.01, "thrust_factor": 1.2e-3, "dead_band_high": 0.9, "Q11": 1.0, "Q22": 0.04, "R22": 0.04}
 OFFSET = 0.05
+SERIES = "times", "command", "flow", "tachometer", "load", "own", "desired"
 HEADER = (
     "t_s,Td_N,n_desired_rad_s,u_cmd_V,y_tach_abs_rad_s,y_flow_m_s,loadcell_thrust_N,loadcell_torque_Nm,"
     "loadcell_tach_abs_rad_s,authors_nhat_rad_s,authors_vhat_axial_m_s,authors_vahat_ambient_m_s"
@@ -119,6 +128,20 @@ def test_numbers_found_from_runs_estimate_thrust_where_the_load_cell_is_not(runs
 
 
 @pytest.mark.slow
+def test_more_noise_after_reversals_is_the_projects_filter_where_there_is_none(runs):
+    assert (
+        after_reversal(np.array([0.0, -1.0, -1.0, *[-1.0] * 12, 2.0, 2.0])).tolist()
+        == [True] * 11 + [False] * 4 + [True] * 2
+    )
+    short = [runs[1]._replace(**{name: getattr(runs[1], name)[:40] for name in SERIES})]
+    (one,) = regimes(valued(to_identify(), TRUTH), short, [1.0])
+    ours = thrusts(valued(to_identify(), TRUTH), short)[0]
+    assert one.ratio == pytest.approx(ratios(ours, short[0]).averaged, rel=1e-6)
+    (more,) = regimes(valued(to_identify(), TRUTH), short, [16.0])
+    assert more.nis < one.nis
+
+
+@pytest.mark.slow
 def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
     class Learnt:
         interrupted, log_likelihood, agreement, optima = False, -1.0, 1, (1,)
@@ -149,9 +172,36 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
     assert [row[0] for row in ladder_rows(runs, tasks)] == [one.about for one in few.values()]
 
 
+@pytest.mark.slow
+def test_the_command_compares_with_the_recorders_own_estimate(as_json, folder, tmp_path):  # noqa: F811
+    found = as_json("reproduce", "recordings", "--data", folder)
+    assert [row["run"] for row in found["ratios"]] == ["CLLookupStep", "Ramp", "mean"]
+    assert {OURS, OWN, STATIC_MAP, LOOKUP} <= set(found["estimators"][0])
+    assert float(found["clocks"][1]["offset, s"]) == pytest.approx(OFFSET, abs=1e-2)
+
+
 def test_a_folder_without_recordings_is_refused(thruster, tmp_path):  # noqa: F811
     refused = thruster("reproduce", "recordings", "--data", tmp_path)
     assert refused.returncode == 2 and "recordings must be .csv files in" in refused.stderr
     (tmp_path / "x.csv").write_text("t_s,u_cmd_V\n0,1\n1,2\n", encoding="utf-8")
     refused = thruster("reproduce", "recordings", "--data", tmp_path)
     assert refused.returncode == 2 and "a recording must have the column y_flow_m_s" in refused.stderr
+
+
+@pytest.mark.skipif(not RECORDED.is_dir(), reason="the recordings are no part of this project")
+def test_goals_on_the_recorded_runs():
+    recorded = read_recordings(RECORDED)
+    found = np.array([ratios(one, run) for one, run in zip(thrusts(model(), recorded), recorded, strict=True)])
+    averages, best, raw = found.T
+    steps = np.array(["Step" in run.name for run in recorded])
+    assert averages.max() <= 0.6 and averages.mean() <= 0.4 and best.max() <= 0.8
+    assert raw[~steps].max() <= 0.65 and raw[steps].max() <= 0.7
+    assert rmse(recorded[0].own, recorded[0], 0.0, window=1) == pytest.approx(1.99, abs=5e-3)  # as filed
+
+
+def test_the_own_estimate_of_another_estimator_is_not_made_up(folder, tmp_path):
+    """Coefficients of runs named CL1state are not known: these are compared with the desired thrust."""
+    (tmp_path / "CL1stateKFRamp.csv").write_text((folder / "Ramp.csv").read_text())
+    (run,) = read_recordings(tmp_path)
+    assert run.own_is_desired
+    np.testing.assert_array_equal(run.own, run.desired)

@@ -5,13 +5,16 @@ import math
 import re
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
+import optuna
 import pytest
 from scipy.integrate import solve_ivp
 
-from filters import make_filter, run
+from filters import EstimateState, make_filter, run
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.held_out import evaluate_held_out
+from tuning.evaluation.tuned import write_tuned
 from tuning.experiments import benchmark, lorenz63, lorenz96, pendulum, range_bearing
 from tuning.experiments.benchmark import (
     BENCHMARKS,
@@ -21,8 +24,12 @@ from tuning.experiments.benchmark import (
     mean_of_roots,
     noise_free_problem,
 )
+from tuning.problems.check import checked_problem
+from tuning.problems.data import held_out_seeds
 from tuning.problems.find import find_problem
+from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
+from tuning.search.study import open_study, run_study
 
 
 def lorenz_63(t, x):
@@ -164,6 +171,15 @@ def test_a_row_on_the_pendulum_and_on_range_and_bearing_is_recomputed():
     assert ours == pytest.approx(row_of_page("range_bearing", "ekf, untuned, sigma_a 2")[2][0], abs=6e-4)
 
 
+@pytest.mark.slow
+def test_the_inflation_that_a_study_found_has_its_score():
+    cells = row_of_page("inflation", "etkf | 10")
+    numbers = {"ensemble_size": 10, "inflation": cells[2][0], "relaxation": cells[3][0]}
+    seeds, rows = held_out_seeds(0, benchmark.RUNS), [Published("etkf", numbers, 0.6)]
+    (row,) = against_published(lorenz63.problem, lorenz63.model, rows)(seeds, lambda row: None)
+    assert abs(row.ours.value - cells[4][0]) < cells[4][2] - cells[4][1]  # a chaotic state
+
+
 def small(why=""):
     settings = {"steps": 30, "first_scored_step": 5, "scale": [1.0] * 3}
     rows = [Published("ekf", {}, 0.92, {"inflation": 180.0}), Published("ekf", {}, 5.0, why=why)]
@@ -235,3 +251,34 @@ def test_every_benchmark_is_found_and_its_problem_is_one():
         assert parameter.name in ("inflation", "jitter")
     with pytest.raises(ValueError, match="benchmark must be one of lorenz63"):
         find_benchmark("lorenz84")
+
+
+@pytest.mark.slow
+def test_a_study_finds_the_acceleration_of_a_target():
+    assert 0.1 < range_bearing.tuned_sigma(trials=8) < 0.4  # 0.2 is true, and 2 the guess that it starts from
+
+
+@pytest.mark.slow
+def test_a_study_tunes_inflation_and_nothing_else():
+    short = noise_free_problem(lorenz63.model(), steps=40, first_scored_step=10, scale=[1.0] * 3)
+    choice, score = benchmark.tune_inflation("etkf", short, trials=3, runs=4)
+    assert set(choice.numbers) == {"ensemble_size", "inflation", "relaxation"} and 1 <= choice.numbers["inflation"]
+    assert choice.model["process_noise_cov"] == (0.0, 0.0, 0.0) and 0.2 < score.value < 1.5
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
+def test_the_pendulum_goes_from_a_file_to_a_filter_around_the_env(tmp_path, thruster):  # noqa: F811
+    plan = Plan("ekf", (checked_problem(find_problem("tuning.experiments.pendulum:problem")),))
+    result = run_study(open_study("pendulum", plan, optuna.storages.InMemoryStorage()), plan, 4)
+    path, comparison = tmp_path / "pendulum.json", evaluate_held_out(result.choice, plan.scenarios[0], 0, 4)
+    assert comparison.tuned.score.value < comparison.untuned.score.value
+    write_tuned(path, plan, result, [comparison], "pendulum")
+    done = thruster("report", path, "--problem", "tuning.experiments.pendulum:problem")
+    assert done.returncode == 0, done.stderr
+    env = EstimateState(gym.make("Pendulum-v1"), tuned=path, model=pendulum.model())
+    env.reset(seed=3)
+    for _ in range(50):
+        info = env.step(np.array([1.0], dtype=np.float32))[-1]
+    wrong = np.array(info["estimate"]) - env.unwrapped.state
+    assert abs(np.angle(np.exp(1j * wrong[0]))) < 0.2 and abs(wrong[1]) < 0.5

@@ -1,3 +1,4 @@
+import json
 import sys
 
 import numpy as np
@@ -6,7 +7,9 @@ from scipy.linalg import solve_discrete_are
 
 from filters import KalmanFilter, run
 from tests.oracles import kalman_update
+from thruster_env.core.text_tables import console
 from thruster_env.model.simulate import simulate
+from thruster_env.thruster.linear import PUBLISHED
 from tuning.cli.main import main
 from tuning.experiments.thruster_papers import (
     NOISE_LEVELS,
@@ -121,6 +124,19 @@ def test_published_kalman_filters_are_not_explained(comparisons, name):
     assert all("no mechanism known" in f.why for f in kalman)
 
 
+def test_the_text_corrects_cells_of_the_table():
+    cells = STUDIES["kiki2020"].kf
+    assert cells["open-bladed", 0.8][:2] == (
+        1.9957,
+        2.6939,
+    )  # as the table is printed, and both abstracts quote it
+    assert cells["open-bladed", 0.8].meant == (2.6821, 2.6939)
+    assert cells["open-bladed", 0.5].meant == (2.7061, 1.9870) and cells["tunnel", 0.5].meant == (0.8740, 0.9232)
+    assert cells["tunnel", 0.6].meant == cells["tunnel", 0.6][:2]
+    every = [value for table in STUDIES.values() for cell in table.kf.values() for value in cell[:2]]
+    assert every.count(1.9957) == 1
+
+
 @pytest.mark.parametrize(
     ("name", "rows"),
     [("kiki2020", "in 7 of 8 rows (6 by the table, which the text corrects)"), ("nurhadi2022", "in 7 of 8 rows,")],
@@ -129,6 +145,16 @@ def test_rows_with_equal_errors_in_both_states(comparisons, name, rows):
     said = study_statements(STUDIES[name], findings(STUDIES[name], comparisons))
     assert sum(rows in statement for statement in said) == 1
     assert set(STUDIES[name].remarks) <= set(said)
+
+
+def test_misprints_of_the_linear_models_are_in_the_remarks_of_the_papers():
+    model = PUBLISHED["open_bladed"]
+    (eigenvalue,) = [f"{one:.4f}" for one in np.linalg.eigvals(np.array(model.a)).real if one > 0]
+    for name in ("kiki2020", "nurhadi2022"):
+        assert f"{eigenvalue} of the open-bladed system is printed 31872" in " ".join(STUDIES[name].remarks)
+    trace = -np.trace(np.array(model.a))
+    assert f"528.83 where the trace gives {trace:.2f}" in " ".join(STUDIES["kiki2020"].remarks)
+    assert f"0.065 for {model.b[0][0]}" in " ".join(STUDIES["nurhadi2022"].remarks)
 
 
 def test_by_the_article_s_own_numbers_the_ensemble_filter_is_the_worse_one_in_the_motor_speed():
@@ -188,3 +214,54 @@ def command_line(monkeypatch, *arguments):
     with pytest.raises(SystemExit) as stop:
         main()
     return stop.value.code or 0
+
+
+def test_json_on_standard_output_is_whole(monkeypatch, capsys, tmp_path):
+    few = ("--runs", "4", "--members", "5", "--seed", "3")
+    picture = tmp_path / "series.png"
+    assert command_line(monkeypatch, "thruster-papers", *few, "--series", str(picture), "--json", "-") == 0
+    data = json.loads(capsys.readouterr().out)
+    assert picture.read_bytes().startswith(b"\x89PNG") and data["picture"] == str(picture)
+    assert [(s["case"], s["q"]) for s in data["series"]] == [(c, q) for c in SYSTEMS for q in NOISE_LEVELS]
+    assert all(np.shape(s[line]) == (101, 2) for s in data["series"] for line in ("truth", "kf", "enkf"))
+    assert data["settings"] == {"runs": 4, "members": 5, "seed": 3}
+    assert [(r["case"], r["q"]) for r in data["results"]] == [(c, q) for c in SYSTEMS for q in NOISE_LEVELS]
+    for result in data["results"]:
+        for name in ("kf", "enkf", "kf_identity", "enkf_identity", "unupdated"):
+            assert set(result[name]) == {"rmse", "low", "high", "run_std", "run_ratio"}
+            assert np.isfinite(np.array(list(result[name].values()))).all()
+    assert set(data["studies"]) == set(STUDIES)
+    for study in data["studies"].values():
+        assert len(study["rows"]) == 16 and study["source"] and study["statements"]
+        assert all(row["why"] and len(row["published"]) == 2 for row in study["rows"])
+
+
+@pytest.mark.parametrize("width", [100, pytest.param(160, marks=pytest.mark.slow)])
+def test_tables_fit_the_terminal(monkeypatch, capsys, tmp_path, width):
+    target = tmp_path / "table.json"
+    monkeypatch.setattr(console, "_width", width)
+    arguments = ["nurhadi2022", "--runs", "4", "--members", "5", "--json", str(target)]
+    assert command_line(monkeypatch, *arguments) == 0
+    out = capsys.readouterr().out
+    assert json.loads(target.read_text())["studies"].keys() == {"nurhadi2022"}
+    assert width - 40 < max(map(len, out.splitlines())) <= width
+    assert "…" not in out
+    for words in ("0.8051", "1.8830", "a copy of the row q = 0.5", "Riccati", "un-updated", "known to us"):
+        assert words in " ".join(out.split())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("healey1995",),
+        ("thruster-papers", "--runs", "1"),
+        ("thruster-papers", "--members", "1"),
+        ("thruster-papers", "--runs", "many"),
+        ("thruster-papers", "--series", "series.txt"),
+    ],
+)
+def test_a_users_mistake_ends_with_code_2(monkeypatch, capsys, arguments):
+    assert command_line(monkeypatch, *arguments) == 2
+    output = capsys.readouterr()
+    assert output.err and not output.out
+    assert "Traceback" not in output.err

@@ -57,6 +57,21 @@ def test_chances_are_those_of_the_bootstrap(lengths):
     assert chance_if_no_worse(base, worse) == pytest.approx(1.0 - chance_if_no_worse(worse, base), rel=1e-9)
 
 
+def test_a_third_state_that_does_not_count_changes_nothing():
+    a, b = pair(3)
+    other = Errors(a.mean_squares * [1.0, 1.0, 50.0], a.scale)
+    assert chance_if_no_worse(other, b) == chance_if_no_worse(a, b)
+
+
+def test_ends_of_chances():
+    a, b = pair(5)
+    assert chance_if_no_worse(a, a) == 1.0
+    assert chance_if_no_worse(Errors(b.mean_squares * 1.21, b.scale), b) == 0.0  # 10 % worse in each run alike
+    assert chance_if_no_worse(Errors(b.mean_squares * np.inf, b.scale), b) == 0.0
+    with pytest.raises(ValueError, match="a p-value needs at least two runs, but got 1"):
+        chance_if_no_worse(*pair(5, runs=1))
+
+
 def test_holms_procedure_is_that_of_his_paper():
     assert holm([0.01, 0.04, 0.03, 0.005], 0.05) == [True, False, False, True]  # 0.0125, 0.0167, then 0.03 > 0.025
     assert holm([0.02, 0.02], 0.05) == [True, True] and holm([0.03, 0.03], 0.05) == [False, False]
@@ -127,6 +142,21 @@ def test_the_quick_study_goes_on_where_it_was(as_json, thruster, tmp_path, monke
         run_panel(Panel(users.PANEL[:2], ("ekf",), 3), tmp_path)
 
 
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_is_done(monkeypatch, tmp_path):
+    real = users.tuned_case
+
+    def second_is_interrupted(problem, name, trials, seed):
+        if "battery" in problem.name:
+            raise KeyboardInterrupt
+        return real(problem, name, trials, seed)
+
+    monkeypatch.setattr(users, "tuned_case", second_is_interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_panel(Panel(users.PANEL[:2], ("ekf",), 2), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["altitude-ekf-2-seed0.json"]
+
+
 def test_problems_that_do_not_fit_are_refused(tmp_path, monkeypatch):
     with pytest.raises(
         ValueError, match="a problem of the panel must have true states, but tests.tuning.experiments"
@@ -135,3 +165,7 @@ def test_problems_that_do_not_fit_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(users, "PANEL", ("no_such_module:problem",))
     with pytest.raises(ValueError, match="must be found in tests/users of the working folder, a checkout"):
         found_problems(["no_such_module:problem"])
+
+
+def test_levels_are_those_that_the_page_says():
+    assert users.LEVEL == 0.05 and users.TAIL == 0.025

@@ -30,8 +30,8 @@ from tuning.experiments.vehicle.experiment import (
     scores_of,
     true_runs,
 )
-from tuning.experiments.vehicle.papers import DT, NOISE, PRINTED_PATHS, TABLE_III, papers_model
-from tuning.experiments.vehicle.tables import GOLDEN, MEAN_ONLY
+from tuning.experiments.vehicle.papers import DT, NOISE, PRINTED_PATHS, TABLE_III, PrintedRow, papers_model
+from tuning.experiments.vehicle.tables import GOLDEN, MEAN_ONLY, digits, unstable_corners, why_different
 
 ENDS = {  # (north, east, down) [m], of a prototype with other code
     "I": (-2.415, 3.789, 0.114),
@@ -154,6 +154,11 @@ def test_filters_on_the_same_runs(as_python):
     np.testing.assert_array_equal(again.velocities, result.scores["EKF8"].velocities)
 
 
+def test_corners_of_the_bounds_are_unstable():
+    count, growth = unstable_corners()
+    assert count == 23 and growth == pytest.approx(1.77, abs=0.01)
+
+
 def test_printed_tables_are_whole():
     assert set(PRINTED_PATHS) == set(PATHS) and list(TABLE_III) == [50, 100, 200, 300]
     assert [len(row.rmse) for row in TABLE_III.values()] == [4] * 4
@@ -166,6 +171,29 @@ def test_printed_tables_are_whole():
         )
     dynamic = PRINTED_PATHS["dynamic"]
     assert dynamic.enkf.final_percent == dynamic.enkf.rmse and dynamic.remark
+
+
+def test_why_differences_are_told_by_size(as_python):
+    (result,) = run_tasks([Task("III", "vehicle", [measured(), kalman()[0]])], runs=2, steps=60)
+    scores = result.scores["EKF8"]
+    pose = dict(zip(("x", "y", "psi"), scores.rmse("full")[[0, 1, 3]], strict=True))
+    full = why_different(PrintedRow(pose, 1.0), scores, result)
+    assert full == "similar to ours by the full transformation"
+    tiny = why_different(PrintedRow({"psi": 1e-3 * result.bound.pose[3]}, 1.0), scores, result)
+    assert "psi below the limit" in tiny
+    huge = why_different(PrintedRow({"x": 1e3, "psi": pose["psi"]}, 1.0), scores, result)
+    assert "x unlike any of ours" in huge and "psi similar to" in huge
+    assert "no one transformation gives the row" in huge and "transformation gives" not in full + tiny
+
+
+def test_digits_stand_apart_by_thousands():
+    assert [digits(one) for one in (0.78612, 12.34, 8.0, 45421.0, float("nan"))] == [
+        "0.786",
+        "12.3",
+        "8",
+        "45 400",
+        "",
+    ]
 
 
 @pytest.fixture
@@ -201,6 +229,22 @@ def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, t
         assert by_path["III", "vehicle"]["fuzzy 0..1"]["published"]["rmse"]["psi"] == 1e-5
         assert "23 of the 64" in words and "4.83" in words
     assert all(one["why"] for filters in by_path.values() for one in filters.values() if one["published"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "rule"),
+    [
+        (("ngatini2019", "--members", "5"), "No such option: --members"),
+        (("nurhadi2022", "--steps", "5"), "No such option: --steps"),
+        (("ngatini2017", "--runs", "1"), "runs must be a whole number of at least 2"),
+        (("ngatini2017", "--steps", "1"), "steps must be a whole number of at least 2"),
+        (("ngatini2017", "--series", "a.tex"), "--series must end in .png, .svg or .pdf"),
+    ],
+)
+def test_a_wrong_argument_is_one_line(monkeypatch, capsys, arguments, rule):
+    assert command_line(monkeypatch, *arguments) == 2
+    said = capsys.readouterr()
+    assert rule in " ".join(said.err.split()) and not said.out
 
 
 def test_errors_of_yaw_are_the_short_way_round():

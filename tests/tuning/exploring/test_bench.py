@@ -1,6 +1,7 @@
 """A bench shows what evaluations and studies compute, and refuses what a knob cannot have."""
 
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -88,6 +89,14 @@ def test_a_map_has_what_views_have(bench):
         assert found.nis[row, column] == pytest.approx(figure(view, "NIS"), rel=1e-12)
 
 
+def test_a_map_of_whole_numbers_and_one_of_a_disturbance():
+    bench = Bench(find_problem("nominal"), "enkf")
+    assert bench.map(OWN, "N", "outliers", 4, seeds=2).xs.tolist() == [5.0, 17.0, 58.0, 200.0]
+    of_two = bench.map({**OWN, "N": 5}, "outliers", "inflation", 2, seeds=2)
+    other = figure(bench.view({**OWN, "N": 5, "outliers": 0.5, "inflation": 1.3}, 2), "score")
+    assert of_two.score[1, 1] == pytest.approx(other, rel=1e-12)
+
+
 def test_knobs_mark_the_baselines_within_their_ranges(bench):
     knobs = {knob.name: knob for knob in bench.knobs}
     assert {"rule of thumb", "scaled default", "oracle"} == set(knobs["Q11"].marks)
@@ -114,6 +123,21 @@ def test_a_value_that_a_knob_cannot_have_is_refused_in_one_line(bench, values, m
     with pytest.raises(ValueError, match=message.replace("(", r"\(")) as caught:
         bench.view(values)
     assert "\n" not in str(caught.value)
+
+
+def test_other_arguments_are_refused():
+    bench = Bench(find_problem("nominal"), "enkf")
+    for call, rule in (
+        (lambda: bench.view({"N": 7.5}), "N must be a whole number"),
+        (lambda: bench.view(seeds=0), "seeds must be a whole number of at least 1"),
+        (lambda: bench.map({}, "R", "R"), "x and y must be different"),
+        (lambda: bench.map({}, "R", "S"), "y must be one of"),
+        (lambda: bench.map({}, "R", "N", 1000), "size must be at most 128"),
+        (lambda: bench.with_filter("nought"), "filter must be one of"),
+        (lambda: Bench(find_problem("nominal"), "open-loop"), "has a number to change"),
+    ):
+        with pytest.raises(ValueError, match=rule):
+            call()
 
 
 def test_a_study_is_that_of_tune_and_stops_where_it_is_closed(bench):
@@ -168,3 +192,17 @@ def test_python_lines_make_the_same_filter(bench):
     )
     assert ours == theirs
     assert bench.command(values) == "thruster evaluate tuned.json"
+
+
+def test_a_bench_can_be_pickled(bench):
+    again = pickle.loads(pickle.dumps(bench))
+    assert figure(again.view(OWN, 2), "score") == figure(bench.view(OWN, 2), "score")
+
+
+def test_an_ekf_halves_the_rule_of_thumbs_error_on_outliers_within_the_knobs(bench):
+    rule = figure(bench.view(), "score")
+    by_r_alone = bench.map({}, "Q11", "R", 8, seeds=4).score
+    assert by_r_alone.min() < 0.5 * rule
+    assert figure(bench.view({"R": 5.5}), "score") < 0.5 * rule
+    both = bench.view({**OWN, "R": 5.5})
+    assert figure(both, "score") < 0.16 * rule and 0.8 < figure(both, "NIS") < 1.25

@@ -71,6 +71,15 @@ def test_tanh_and_its_derivative_are_those_of_torch():
     torch.testing.assert_close(quickly, usual, rtol=1e-6, atol=3e-7)
 
 
+@pytest.mark.parametrize("kind", [{"dtype": torch.bfloat16}, {"dtype": torch.int64}, {"device": "meta"}])
+@pytest.mark.parametrize("shape", [(), (3,)])
+def test_of_what_numpy_cannot_hold_tanh_is_torchs(kind, shape):
+    x = torch.ones(shape, **kind)
+    found, usual = NumpyTanh()(x), torch.tanh(x)
+    assert (found.dtype, found.device, found.shape) == (usual.dtype, usual.device, usual.shape)
+    assert found.is_meta or torch.equal(found, usual)
+
+
 @pytest.mark.parametrize("algo", ["ppo", "recurrent-ppo", "sac"])
 def test_only_while_a_model_learns_tanh_is_numpys(algo):
     setup = setup_of(algo=algo)
@@ -101,3 +110,11 @@ def test_what_is_learnt_is_what_stable_baselines3_learns_by_itself_but_for_round
     ours, theirs = learnt(quickly=True), learnt(quickly=False)
     moved = abs(theirs - start).max()
     assert moved > 1e-3 and abs(ours - theirs).max() < 1e-4 * moved
+
+
+def test_a_policy_that_has_become_nan_is_noticed_in_the_same_step():
+    setup = setup_of()
+    model = new_model(setup, make_environments(setup, SEEDS))
+    with learning(model), pytest.raises(ValueError, match="not NaN"):
+        torch.nn.init.constant_(model.policy.action_net.bias, float("nan"))
+        model.learn(8)

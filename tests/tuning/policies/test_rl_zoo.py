@@ -34,6 +34,11 @@ def test_the_numbers_are_those_of_thruster_train(name):
     assert told == algorithm.hyperparameters
 
 
+def test_there_is_a_file_for_every_algorithm_and_no_other():
+    assert {path.stem for path in (ROOT / "hyperparams").glob("*")} == set(NAMES)
+    assert set(NAMES.values()) == set(ALGORITHMS)
+
+
 @pytest.mark.slow
 def test_rl_zoo_trains_with_them(tmp_path):
     """One process trains with all files, as most of its time goes into imports."""

@@ -17,6 +17,7 @@ from tuning.policies.learn import VALIDATION_EPISODES, _episodes_after
 from tuning.policies.saved import (
     CHECKPOINTS,
     FINAL,
+    configuration_from_json,
     find_saved,
     load,
     read_configuration,
@@ -108,6 +109,20 @@ def test_an_interrupted_training_goes_on_where_it_was(tmp_path):
     assert contents(folder) == before, "a finished training is left alone"
 
 
+def test_a_longer_training_that_is_interrupted_is_not_lost(copied):
+    longer = replace(setup_of(), steps=1024)
+
+    def interrupt(steps, value):
+        if steps == 400:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    assert learn(longer, copied, on_progress=interrupt).steps == 400
+    assert steps_of(find_saved(copied)) == 400
+    seen = []
+    learn(longer, copied, on_progress=lambda steps, value: seen.append(steps))
+    assert seen[0] == 404
+
+
 def test_episodes_of_training_evaluation_and_proof_differ(tmp_path, monkeypatch):
     import tuning.policies.learn as module
 
@@ -140,6 +155,13 @@ def test_a_training_goes_on_after_any_number_of_steps_with_episodes_of_its_own(s
     seeds = _episodes_after(setup_of("ekf"), steps)
     assert len(set(seeds)) == COPIES and min(seeds) >= VALIDATION_EPISODES
     assert max(seeds) < held_out_seeds(0, 2)[0]
+
+
+def test_a_setup_survives_its_text():
+    for observe in OBSERVATION_SETS:
+        setup = setup_of(observe)
+        again = configuration_from_json(setup.as_json(), "setup.json")
+        assert again == setup and not setup.differences(again)
 
 
 @pytest.mark.parametrize("observe", ["stack", "ekf"])

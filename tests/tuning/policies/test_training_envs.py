@@ -6,7 +6,10 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
-from stable_baselines3.common.vec_env import DummyVecEnv
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormalize, VecVideoRecorder
 
 import thruster_env  # noqa: F401 - registers the envs
 from tests.slow import slow_but
@@ -82,6 +85,43 @@ def test_actions_are_parts_of_the_voltage_range():
     expected = env.step(np.array([[-24.0], [0.0], [12.0]]))
     np.testing.assert_array_equal(observations, expected[0])
     np.testing.assert_array_equal(rewards, expected[1].astype(np.float32))
+
+
+def test_attributes_and_methods_are_those_of_all_copies():
+    venv = native()
+    assert [plant.dt for plant in venv.get_attr("plant")] == [0.01] * COPIES
+    assert len(venv.get_attr("plant", indices=[0, 2])) == 2 and len(venv.get_attr("plant", indices=1)) == 1
+    assert venv.has_attr("task") and not venv.has_attr("no_such_thing")
+    venv.set_attr("mark", 4)
+    assert venv.get_attr("mark") == [4] * COPIES
+    assert [model.n for model in venv.env_method("state_space_model", operating_voltage=3.0)] == [2] * COPIES
+    assert venv.env_is_wrapped(TimeLimit) == [False] * COPIES and not is_wrapped(venv, TimeLimit)
+    assert venv.render_mode is None
+    with pytest.raises(ValueError, match="indices must be None, for the copies are one object, but got 0"):
+        venv.set_attr("mark", 5, indices=0)
+
+
+def test_only_envs_that_reset_within_the_step_are_taken():
+    with pytest.raises(
+        ValueError, match="make_vec.*autoreset_mode='SameStep'.*, but got one with autoreset mode 'NextStep'"
+    ):
+        native(autoreset_mode="NextStep")
+    with pytest.raises(ValueError, match="env must be a vector env, of gym.make_vec"):
+        NativeVecEnv(gym.make("BowThruster-v0"))
+
+
+class Still:
+    """A policy that leaves the thruster alone."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 1), dtype=np.float32), state
+
+
+def test_helpers_of_stable_baselines_take_the_envs():
+    venv = VecNormalize(VecCheckNan(make_environments(setup_of("ekf"), SEEDS), raise_exception=True))
+    returns, lengths = evaluate_policy(Still(), venv, n_eval_episodes=6, return_episode_rewards=True)
+    assert lengths == [LIMIT] * 6 and all(value < 0 for value in returns)
+    assert VecVideoRecorder  # needs a render mode, which single envs have
 
 
 @pytest.mark.parametrize("observe", slow_but(OBSERVATION_SETS, ["raw", "ekf", "enkf"]))

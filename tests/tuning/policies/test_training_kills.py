@@ -12,7 +12,7 @@ pytest.importorskip("sb3_contrib")
 from tests.fuzz.checkpoints import kill_training
 from tests.learners import contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures
 from tuning.policies.learn import mend
-from tuning.policies.saved import BEST, CHECKPOINTS, SETUP
+from tuning.policies.saved import BEST, CHECKPOINTS, FINAL, SETUP, find_saved
 
 
 class Killed(BaseException):
@@ -40,6 +40,15 @@ def test_a_training_that_was_killed_before_its_setup_was_there_starts_anew(tmp_p
     assert not list(tmp_path.rglob(".*"))
 
 
+def test_a_folder_of_something_else_is_left_as_it_is(tmp_path):
+    (tmp_path / ".best.old").write_text("mine")
+    (tmp_path / "notes").write_text("mine")
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match="the folder must be new, empty or that of a training"):
+        learn(setup_of(steps=128), tmp_path)
+    assert contents(tmp_path) == before
+
+
 def test_an_end_while_evaluations_are_written_leaves_those_of_before(copied, monkeypatch):
     before = (copied / "evaluations.npz").read_bytes()
 
@@ -54,6 +63,20 @@ def test_an_end_while_evaluations_are_written_leaves_those_of_before(copied, mon
         learn(longer, copied)
     assert (copied / "evaluations.npz").read_bytes() == before
     assert learn(longer, copied).steps == 512
+
+
+def test_an_end_while_a_policy_is_removed_leaves_none_that_is_half_there(copied, monkeypatch):
+    def half(path, **options):
+        if path.exists():
+            (path / "normalisation.pkl").unlink()
+            raise Killed
+
+    longer = setup_of(steps=512)
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(shutil, "rmtree", half)
+        learn(longer, copied)  # whose final policy becomes a checkpoint that is there already
+    assert not (copied / FINAL).exists() and steps_of(find_saved(copied)) == 256
+    assert learn(longer, copied).learnt == 256
 
 
 @pytest.mark.slow

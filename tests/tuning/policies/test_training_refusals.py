@@ -1,6 +1,7 @@
 """What training, scoring and playing refuse: one clear line, and nothing is overwritten."""
 # ruff: noqa: F811 - fixtures come by import and go by name
 
+import importlib.util
 import shutil
 from dataclasses import replace
 
@@ -11,8 +12,9 @@ pytest.importorskip("sb3_contrib")
 
 from tests.learners import SMALL, contents, copied, learn, setup_of, short_episodes, trained  # noqa: F401 - some are fixtures
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
+from tuning.policies.algorithms import check_installed
 from tuning.policies.environments import make_environments
-from tuning.policies.saved import FINAL, configuration_from_json, find_saved, load
+from tuning.policies.saved import FINAL, configuration_from_json, find_saved, load, play
 from tuning.policies.setup import make_configuration
 from tuning.thruster.scenario import find_scenario
 
@@ -80,6 +82,16 @@ def test_a_folder_of_another_setup_is_left_alone(change, named, copied):
     assert contents(copied) == before
 
 
+def test_a_folder_of_other_things_is_left_alone(tmp_path):
+    (tmp_path / "thesis.txt").write_text("precious")
+    for folder in (tmp_path, tmp_path / "thesis.txt"):
+        with pytest.raises(
+            ValueError, match="must be new, empty or that of a training, but .* contains other files"
+        ):
+            learn(setup_of(), folder)
+    assert contents(tmp_path) == {(tmp_path / "thesis.txt").relative_to(tmp_path): b"precious"}
+
+
 def test_a_policy_needs_the_observation_it_was_trained_on(trained):
     with pytest.raises(ValueError, match="on observe='ekf' must see 4 numbers, but the env shows 2"):
         load(trained / FINAL, make_environments(setup_of("raw"), [0]))
@@ -107,6 +119,35 @@ def test_unknown_names_and_wrong_numbers_are_refused():
 def test_the_setup_of_a_policy_must_be_one(text):
     with pytest.raises(ValueError, match="setup.json must (hold the configuration of a policy|be of version 1)"):
         configuration_from_json(text, "setup.json")
+
+
+def without(package, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == package else find(name, *rest)
+    )
+
+
+@pytest.mark.parametrize("package", ["torch", "stable_baselines3", "sb3_contrib"])
+def test_a_missing_extra_is_named(package, monkeypatch, thruster, tmp_path):
+    without(package, monkeypatch)
+    line = f"policies need {package}, which is not installed: pip install '.[rl]' in the project's folder"
+    with pytest.raises(ValueError) as error:
+        check_installed()
+    assert str(error.value) == line
+    for arguments in (("train",), ("play", "x"), ("score", "x")):
+        done = thruster(*arguments)
+        assert (done.returncode, done.stderr) == (2, f"thruster: {line}\n")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("package", ["pygame", "moviepy"])
+def test_drawing_names_its_extra(package, monkeypatch, copied):
+    without(package, monkeypatch)
+    before = contents(copied)
+    with pytest.raises(ValueError, match=f"drawing needs {package}, .* pip install '.\\[render\\]'"):
+        play(copied / FINAL, copied / "film.mp4", 1)
+    assert contents(copied) == before
 
 
 BAD = [

@@ -1,6 +1,9 @@
 """Policies on the underwater vehicle: the same trainings, and PD beside them on what they see."""
 
+from dataclasses import replace
+
 import gymnasium as gym
+import numpy as np
 import pytest
 
 pytest.importorskip("sb3_contrib")
@@ -8,8 +11,8 @@ pytest.importorskip("sb3_contrib")
 import thruster_env.auv  # noqa: F401 - registers the envs
 from tests.learners import COPIES, SMALL, learn
 from tuning.policies.environments import make_environments, make_single
-from tuning.policies.saved import classical_policy, configuration_from_json, find_saved, load, score
-from tuning.policies.setup import PLANTS, TASKS, in_scenario, make_configuration, plant_of
+from tuning.policies.saved import classical_policy, configuration_from_json, find_saved, load, run_episodes, score
+from tuning.policies.setup import PLANTS, TASKS, Part, in_scenario, make_configuration, plant_of
 from tuning.problems.data import held_out_seeds
 from tuning.problems.find import find_problem
 
@@ -48,6 +51,11 @@ def test_a_policy_learns_and_is_scored(task, observe, tmp_path):
 
 
 @pytest.mark.slow
+def test_sac_learns_too(tmp_path):
+    assert learn(setup_of("depth", "ekf", "sac"), tmp_path / "policy").steps == 256
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("observe", ["raw", "ekf", "true"])
 def test_pd_in_number_is_pd_on_a_single_env(observe):
     setup = setup_of("depth", observe)
@@ -62,6 +70,23 @@ def test_pd_in_number_is_pd_on_a_single_env(observe):
             observation, reward, *_ = env.step(action)
             total += reward
         assert total == pytest.approx(expected, rel=1e-5)
+
+
+def test_an_episode_that_ends_early_is_scored_to_its_end():
+    setup = setup_of("path", "true")
+    nose_up = {"initial_state": [3.0, *[0.0] * 6, 1.38, *[0.0] * 4]}
+    climbing = replace(setup, env_arguments={**setup.env_arguments, **nose_up})
+
+    class Climb:
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return np.tile([1.0, -1.0, 0.0], (len(observation), 1)), state
+
+    venv, kind = make_environments(climbing, SEEDS, endless=True), plant_of("path")
+    returns, recorded, alive = run_episodes(Climb(), venv, LIMIT, kind)
+    steps = alive.sum(axis=1)
+    assert (steps < LIMIT).all() and (steps > 0).all() and np.isfinite(returns).all()
+    parts = kind.parts_of(recorded, alive, venv.unwrapped.env.unwrapped.plant)
+    assert parts["vertical"].steps.tolist() == steps.tolist() and isinstance(parts["vertical"], Part)
 
 
 @pytest.mark.slow

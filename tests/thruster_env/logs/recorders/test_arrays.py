@@ -218,6 +218,16 @@ def test_attributes_of_valid_numbers_and_of_signs(tmp_path):
     assert "valid_range='0, 1' is no number" in contents(tmp_path / "a.h5").unread["wrong"]
 
 
+def test_a_dataset_of_two_names_has_both(tmp_path):
+    """As NeXus files have: hard links. A group within itself has no end, and is read once."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["entry/time"], file["entry/speed"] = 0.1 * np.arange(40), np.arange(40.0)
+        file["entry/again"], file["data/speed"] = file["entry"], file["entry/speed"]
+    some = contents(tmp_path / "a.h5")
+    assert {one.name for one in some.fields} == {"entry.time", "entry.speed", "data.speed"}
+    assert some.unread == {"entry.again": "a group that has another name, too"}
+
+
 @pytest.mark.parametrize("form", ["mat", "h5"])
 def test_sides_of_one_entry_count_for_nothing_and_larger_arrays_are_named(tmp_path, form):
     """Simulink writes the samples of a signal as 1 x 1 x N."""
@@ -240,6 +250,19 @@ def test_sides_of_one_entry_count_for_nothing_and_larger_arrays_are_named(tmp_pa
     np.testing.assert_array_equal(found["pair[1]"].times, 0.1 * values)
     assert set(found) == {"time", "force", "pair[0]", "pair[1]"}
     assert some.unread == {"cube": "of 3 dimensions", "picture": "a matrix of 70 times 80"}
+
+
+def test_times_that_cannot_be_read_leave_the_numbers(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("time", data=RNG.normal(size=400), chunks=(100,), compression="gzip")
+        file["voltage"] = np.arange(400.0)
+        where = file["time"].id.get_chunk_info(1)
+    with (tmp_path / "a.h5").open("r+b") as file:
+        file.seek(where.byte_offset)
+        file.write(bytes(50))
+    some = contents(tmp_path / "a.h5")
+    assert [(one.name, one.begin) for one in some.fields] == [("voltage", pytest.approx(np.nan, nan_ok=True))]
+    assert "damaged" in some.unread["time"]
 
 
 def test_a_dataset_that_was_never_written_is_named(tmp_path):
@@ -284,3 +307,15 @@ def test_units_may_be_one_for_each_column(tmp_path):
     with pytest.raises(ValueError, match="the unit of column 'two' .* but got 'mV, kV'.*name another in brackets"):
         read_log(path, MODEL, {"V_s": "two", "tach": "m[1]"})
     assert read_log(path, MODEL, {"V_s": "two[V]", "tach": "m[1]"}).inputs[1, 0] == np.sin(t[1])
+
+
+def test_numbers_come_from_the_reading_process_in_their_own_kind(tmp_path):
+    sent = {"d": RNG.normal(size=5), "f": RNG.normal(size=5).astype(np.float32), "i": np.arange(5, dtype=np.int16)}
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, values in sent.items():
+            file[name] = values
+    with topics.opened("hdf5", tmp_path / "a.h5") as file:
+        received = [file.read(i) for i in range(len(sent))]
+    for values, expected in zip(received, sent.values(), strict=True):
+        assert values.dtype == expected.dtype
+        np.testing.assert_array_equal(values, expected)

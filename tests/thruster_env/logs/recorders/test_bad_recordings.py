@@ -17,6 +17,7 @@ from thruster_env.logs.read import read_log
 from thruster_env.logs.recorders import topics
 from thruster_env.logs.recorders.registry import FORMATS, fields, read
 
+ENDINGS = [ending for one in FORMATS for ending in one.endings]
 MAGIC = {ending: one.magic for one in FORMATS for ending in one.endings}
 
 
@@ -256,6 +257,30 @@ def test_a_matlab_file_on_which_scipy_would_crash_is_refused(tmp_path, place, by
     refused(tmp_path / "a.mat", "it holds a|it ends within an")
 
 
+def formats(*texts):
+    """A ULog of these formats."""
+    out = b"ULog\x01\x12\x35\x01" + bytes(8)
+    for text in texts:
+        out += struct.pack("<HB", len(text), ord("F")) + text.encode()
+    name = texts[-1].partition(":")[0]
+    return out + struct.pack("<HBBH", 3 + len(name), ord("A"), 0, 1) + name.encode()
+
+
+@pytest.mark.parametrize(
+    ("texts", "said"),
+    [
+        (["a:a[2] x;"], "holds itself"),
+        (["a:b x;", "b:a x;"], "holds itself"),
+        (["a:float[60000] x;"], "has 6e.04 fields"),
+        (["a:float[999] x;", "b:a[999] x;", "c:b[999] x;"], "fields"),
+        (["a:float[99999999] x;"], "holds no data"),
+    ],
+)
+def test_a_ulog_of_endless_formats_is_refused(tmp_path, texts, said):
+    (tmp_path / "a.ulg").write_bytes(formats(*texts))
+    refused(tmp_path / "a.ulg", said)
+
+
 def test_links_objects_and_numbers_in_other_files_are_refused_by_name(tmp_path):
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["secret"] = np.arange(9.0)
@@ -314,3 +339,18 @@ def test_without_its_package_a_file_is_answered_with_the_extra(tmp_path):
         code += f"from thruster_env.logs.recorders.registry import fields\nfields({str(path)!r})"
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
         assert f"must be read by {name}, which is not installed (pip install '.[recorders]' in" in done.stderr
+
+
+def test_reading_takes_little_more_memory_than_what_is_read(tmp_path):
+    """A child process may have no more than twice what its imports take."""
+    write_good(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file.create_dataset("huge", (2 * 10**8,), "f8", chunks=(10**6,))
+    code = (
+        "import resource, sys, numpy, h5py\nfrom thruster_env.logs.recorders.registry import read\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        f"read({str(tmp_path / 'a.h5')!r}, ['v'])\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 50_000  # [kB]

@@ -40,6 +40,15 @@ def test_of_a_damaged_bag_all_messages_are_read_or_none(tmp_path, ending):
     assert not accepted[False] and accepted[True]
 
 
+def test_fifty_seven_zeros_in_an_mcap_file_are_said(tmp_path):
+    """The zeros are records of no known kind, and what follows is read as if it were another one."""
+    path = write_good(tmp_path / "a.mcap")
+    data = path.read_bytes()
+    place = 28_000
+    path.write_bytes(data[:place] + bytes(57) + data[place + 57 :])
+    refused(path, "a bag must hold the messages that it says it has, but '/.*' has .* of 100 by its statistics")
+
+
 def write_merged(path, kind):
     """A bag with one topic of two definitions, ten messages each, as of a node that was rebuilt."""
     from rosbags import rosbag1, rosbag2
@@ -127,3 +136,17 @@ def test_an_mcap_file_whose_parts_contradict_one_another_is_refused(tmp_path):
     assert struct.unpack_from("<Q", data, statistics + 9)[0] == 300
     path.write_bytes(data[: statistics + 9] + struct.pack("<Q", 301) + data[statistics + 17 :])
     refused(path, "its statistics say 301 messages, but 300 by channel|check sum of its summary")
+
+
+@pytest.mark.parametrize("kind", [3, 4])
+def test_an_mcap_file_that_does_not_repeat_its_schemas_or_channels_is_not_called_damaged(tmp_path, kind):
+    """Their summary may be without, as `Writer(repeat_channels=False)` of the package mcap writes it."""
+    path = write_good(tmp_path / "a.mcap")
+    data, place, changed = bytearray(path.read_bytes()), 8, 0
+    while place < len(data) - 8:
+        changed += data[place] == kind
+        data[place] = 0x81 if data[place] == kind else data[place]  # a record that only its writer knows
+        place += 9 + struct.unpack_from("<Q", data, place + 1)[0]
+    assert changed
+    path.write_bytes(data)
+    refused(path, "must have its schemas and channels in its summary, but .* mcap recover writes one that is read")

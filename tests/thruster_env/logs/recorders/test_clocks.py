@@ -88,6 +88,16 @@ def test_headers_or_reception_are_chosen_for_all_topics_or_refused(name, tmp_pat
     assert "\n" not in str(caught.value)
 
 
+def test_stamps_are_chosen_for_bags_only(tmp_path):
+    table = {"t": np.arange(9.0), "force": FORCE[:9], "speed": SPEED[:9]}
+    savemat(tmp_path / "a.mat", table)
+    for log in (table, tmp_path / "a.mat"):
+        with pytest.raises(ValueError, match="must be chosen for a bag, but got 'header'"):
+            read_log(log, MODEL, stamps="header")
+    with pytest.raises(ValueError, match="must be one of header, receipt, but got 'both'"):
+        read_log(tmp_path / "a.mat", MODEL, stamps="both")
+
+
 def groups(path, force_times, speed_times):
     """A file of two groups with times of their own."""
     some = {"a": {"t": force_times, "force": FORCE[: len(force_times)]}, "b": {"t": speed_times, "speed": SPEED}}

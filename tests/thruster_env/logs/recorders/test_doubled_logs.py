@@ -66,6 +66,15 @@ def test_damage_is_found_in_the_log_and_in_the_listing(tmp_path, ending):
         assert [one.sentence for one in found] == [damage] and "the log" in damage
 
 
+def test_a_dataflash_format_without_the_names_of_its_fields_is_said(tmp_path):
+    """A zero in place of the comma in "TimeUS,V" leaves the field out."""
+    path = write_good(tmp_path / "a.bin")
+    data = path.read_bytes()
+    assert data.count(b"TimeUS,V") == 1
+    path.write_bytes(data.replace(b"TimeUS,V", b"TimeUS\0V"))
+    assert contents(path).damage == ("the format of 'U' has not as many names as numbers",)
+
+
 @pytest.mark.parametrize("kind", b"E@Td\x04\xc4LF")
 def test_a_ulog_message_whose_kind_is_damaged_is_not_lost_unsaid(tmp_path, kind):
     """Each is one flipped bit away from D; the package passes over them as over newer kinds, text or formats."""
@@ -85,6 +94,17 @@ def ulog_of(path, change):
     write_ulog(path, [("v", 0, "double x;", columns), ("w", 0, "double x;", columns)])
     path.write_bytes(change(path.read_bytes()))
     return path
+
+
+def subscription(number, name, instance=0):
+    return struct.pack("<HBBH", 3 + len(name), ord("A"), instance, number) + name
+
+
+def test_a_number_of_two_ulog_subscriptions_is_refused(tmp_path):
+    again = ulog_of(
+        tmp_path / "a.ulg", lambda data: data.replace(subscription(1, b"w"), 2 * subscription(1, b"w"))
+    )
+    refused(again, "a ULog must give each subscription its own number, but .* gives 1 again, to 'w'")
 
 
 def test_a_ulog_format_that_is_defined_twice_is_refused(tmp_path):

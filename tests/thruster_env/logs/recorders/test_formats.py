@@ -203,6 +203,17 @@ def test_an_hdf5_file_has_groups_tables_and_units(tmp_path, ending):
     assert set(read(tmp_path / f"a{ending}", ["log.imu.acc[1]"])) == {"log.imu.acc[1]"}
 
 
+def test_the_course_of_a_field_is_its_means_and_leaves_out_what_is_missing(tmp_path):
+    values = np.repeat([1.0, np.nan, -2.0, 4.0], 8)
+    values[25] = 6.0
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["v"] = values
+    (field,) = fields(tmp_path / "a.h5")
+    assert (field.samples, field.least, field.greatest) == (32, -2.0, 6.0) and np.isnan(field.rate)
+    expected = [np.nanmean(values[4 * k : 4 * k + 4]) if not 2 <= k < 4 else np.nan for k in range(8)]
+    np.testing.assert_allclose(field.course, expected)
+
+
 def test_a_file_of_another_ending_is_known_by_its_first_bytes(tmp_path):
     write_ulog(tmp_path / "a.ulg", [("v", 0, "float x;", {"timestamp": np.arange(9), "x": np.arange(9)})])
     (tmp_path / "a.ulg").rename(tmp_path / "a.log")

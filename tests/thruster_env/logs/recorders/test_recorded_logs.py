@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.thruster_env.logs.recorders.files import h5py, write_ulog
+from tests.thruster_env.logs.recorders.files import dataflash, h5py, write_ulog
 from tests.thruster_env.logs.test_logs import MODEL
 from thruster_env.logs.read import read_log
 from thruster_env.logs.recorders.registry import fields
@@ -47,6 +47,29 @@ def test_an_input_at_its_own_rate_is_held_on_the_grid_of_the_measurement(tmp_pat
     fine = 100_000 + np.arange(0, 590_000, 100) + 50  # the mean of what is held, over each step
     held = np.floor((fine - 56_000) / 25_000).reshape(59, 100).mean(axis=1)
     np.testing.assert_allclose(log.inputs[:, 0], held, rtol=1e-9)
+
+
+def test_a_log_begins_when_all_inputs_are_known(tmp_path):
+    measured = 10_000 * np.arange(50), np.cos(np.arange(50.0))
+    log = ulog_of(tmp_path / "a.ulg", (203_000 + 10_000 * np.arange(20), np.arange(20.0)), measured)
+    assert log.start == 0.21 and log.steps == 28
+    np.testing.assert_array_equal(log.measurements[:, 0], measured[1][21:])
+    assert log.inputs[0, 0] == pytest.approx(0.7)  # 0 for 3 ms, then 1 for 7 ms
+
+
+def test_slower_measurements_are_missing_between(tmp_path):
+    kinds = {1: ("U", "Qd", "TimeUS,V"), 2: ("M", "Qd", "TimeUS,n"), 3: ("R", "Qd", "TimeUS,n")}
+    messages = [(1, (10_000 * k, float(k % 7))) for k in range(100)] + [
+        (2, (10_000 * k + 400, k)) for k in range(100)
+    ]
+    messages += [(3, (30_000 * k + 900, float(-k))) for k in range(33)]
+    (tmp_path / "a.bin").write_bytes(dataflash(kinds, sorted(messages, key=lambda one: one[1][0])))
+    log = read_log(tmp_path / "a.bin", MODEL, {"V_s": "U.V", "tach": "M.n", "state:n": "R.n"})
+    assert (log.dt, log.steps) == (0.01, 99)
+    np.testing.assert_array_equal(log.measurements[:, 0], np.arange(100.0))
+    reference = log.references["state:n"]
+    np.testing.assert_array_equal(reference[::3][:33], -np.arange(33.0))
+    assert np.isnan(np.delete(reference, np.s_[::3])).all()
 
 
 def test_jitter_of_a_clock_moves_no_sample_to_another_row(tmp_path):

@@ -7,6 +7,7 @@ from filters.logs.estimate import estimate
 from tests.thruster_env.logs.recorders.files import stamped
 from tests.thruster_env.logs.recorders.test_bad_recordings import refused
 from tests.thruster_env.logs.recorders.test_formats import EPOCH
+from thruster_env.logs.recorders import topics
 from thruster_env.logs.recorders.registry import contents, fields, read
 from thruster_env.thruster.model import thruster_model
 
@@ -106,3 +107,11 @@ def test_slashes_before_frames_are_no_part_of_their_names_and_pairs_are_not_mixe
     rows = ("/tf", EPOCH, [("c", "b", EPOCH, numbers)]), ("/tf/c/b", EPOCH, [("c", "d", EPOCH, numbers)])
     write_transforms(tmp_path / "c.bag", rows)
     refused(tmp_path / "c.bag", "must have names of their own, .* '/tf/c/b'")
+
+
+def test_pairs_of_frames_have_a_limit(tmp_path, monkeypatch):
+    rows = [("map", f"body{k}", EPOCH, np.arange(7.0)) for k in range(12)]
+    write_transforms(tmp_path / "a.bag", [("/tf", EPOCH, rows), ("/tf", EPOCH + 1, [])], "mcap")
+    assert len(fields(tmp_path / "a.bag")) == 12 * 7
+    monkeypatch.setattr(topics, "MOST_FIELDS", 11)
+    refused(tmp_path / "a.bag", "a bag must have at most 11 pairs of frames, but got more")

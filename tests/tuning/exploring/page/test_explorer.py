@@ -29,6 +29,18 @@ def test_a_notebook_shows_the_page_in_a_frame_until_it_is_closed(as_python):
         urllib.request.urlopen(url, timeout=30)
 
 
+def test_the_function_is_still_there_when_its_room_was_imported():
+    import tuning.exploring.bench  # noqa: F401
+
+    assert tuning.explore is tuning.explore and callable(tuning.explore)
+
+
+def test_own_numbers_are_where_one_starts(as_python):
+    problem = LinearProblem(n=2, m=1)
+    bench = tuning.explore(problem, problem.model(process_noise_cov=[0.3, 0.4])).bench
+    assert bench.filter == "ekf" and bench.start["Q11"] == pytest.approx(0.3)
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

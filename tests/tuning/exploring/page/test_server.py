@@ -103,6 +103,11 @@ def test_a_path_out_of_the_folder_of_scripts_is_not_answered(server):
         assert asked(server, f"/{token_of(server)}/{path}")[0] in (403, 404)
 
 
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1:1", "[::1]:80", ""])
+def test_another_name_that_leads_here_is_refused(server, host):
+    assert asked(server, f"/{token_of(server)}/", Host=host)[0] == 404
+
+
 def test_pages_of_others_are_refused_even_with_the_token(server):
     path = f"/{token_of(server)}/"
     assert asked(server, path, Origin="http://evil.example")[0] == 404
@@ -155,6 +160,11 @@ def test_it_ends_when_the_last_page_was_left(monkeypatch):
     assert not thread.is_alive()
     with pytest.raises(OSError):
         socket.create_connection((LOOPBACK, made.port), timeout=5)
+
+
+def test_a_port_in_use_is_named_with_a_way_out(server):
+    with pytest.raises(ValueError, match=f"port must be free, or 0 for one .*, but {server.port} is not: Address"):
+        Server(page, port=server.port)
 
 
 def test_hardly_anything_is_read_before_the_token(server):

@@ -1,8 +1,11 @@
 """What a tab asks and is told, without a browser: the document, its numbers, and wrong questions."""
 
+import base64
 import json
 import math
+import pickle
 import queue
+import urllib.request
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,8 +17,9 @@ from bokeh.document import Document
 
 from tests.linear_problem import LinearProblem
 from tuning.exploring.bench import Bench
-from tuning.exploring.page.pictures import DARK, HELD
-from tuning.exploring.page.session import Session
+from tuning.exploring.page.export import present
+from tuning.exploring.page.pictures import DARK, HELD, as_sent
+from tuning.exploring.page.session import Server, Session, _plain, page_of
 
 SEEDS = 3
 WITHIN = 1.959963984540054
@@ -85,6 +89,20 @@ def test_pictures_show_the_numbers_of_the_view(tab, bench):
         assert told["figures"][name]["start"] == pytest.approx(bench.view(bench.start, SEEDS).figures[name].value)
 
 
+def test_what_is_drawn_is_sent_in_one_array(tab):
+    drawn = tab.ask("hello")["drawn"]
+    sent, nis = np.frombuffer(base64.b64decode(drawn["numbers"]), "<f4"), tab.session.pictures.nis
+    first, last = drawn["columns"]["nis lines"]["line"]
+    np.testing.assert_array_equal(sent[first:last], as_sent(present(nis.columns["time"], nis.columns["line"])[1]))
+    band = [sent[slice(*drawn["columns"]["nis band"][name])] for name in ("time", "high")]
+    there = np.isfinite(nis.columns["high"])
+    np.testing.assert_allclose(np.interp(nis.columns["time"][there], *band), nis.columns["high"][there], rtol=1e-6)
+    assert set(drawn["axes"]["nis"]) == {"x", "y"}
+    parts = [part for columns in drawn["columns"].values() for part in columns.values()]
+    assert sum(last - first for first, last in parts) == len(sent)
+    assert "nis" not in tab.ask("view", values={})["drawn"]["axes"]
+
+
 def test_errors_of_all_runs_are_estimate_minus_truth(tab, bench):
     tab.ask("hello")
     tab.ask("plotted", states=[0], run=1, errors=True)
@@ -126,6 +144,12 @@ def test_a_wrong_question_is_answered_and_the_tab_lives_on(tab):
         told = tab.told()
         assert told["answers"] == tab.number and ("error" in told or question["do"] == "drop"), question
         assert "figures" in tab.ask("view", values={})
+
+
+def test_text_that_is_no_question_is_answered(tab):
+    for text in ("", "[]", "7", '{"do": "view"', "nul"):
+        tab.session.wire.asked = text + " "
+        assert tab.told()["error"]
 
 
 def test_four_configurations_are_held_in_colours_and_dropped(tab, bench):
@@ -174,3 +198,23 @@ def test_what_is_seen_is_exported(tab, kind, begins):
     tab.ask("hello")
     tab.ask("export", kind=kind)
     assert tab.wait_for("file")["text"].startswith(begins)
+
+
+def test_numbers_that_json_has_not_become_nothing():
+    assert _plain({"a": [math.nan, math.inf, 1, True, None, "x", np.float64(0.5)]}) == {
+        "a": [None, None, 1, True, None, "x", 0.5]
+    }
+
+
+def test_names_of_a_problem_are_text_on_the_page(as_python):
+    problem = LinearProblem(n=2, m=1)
+    problem.name = "</title><script>alert(1)</script>"
+    server = Server(page_of(Bench(problem, "kf"), SEEDS), ends_when_left=False).start()
+    with urllib.request.urlopen(server.url, timeout=60) as answer:
+        text = answer.read().decode()
+    server.stop()
+    assert "<script>alert" not in text and "&lt;script&gt;alert" in text and 'lang="en"' in text
+
+
+def test_a_bench_can_be_pickled(bench, as_python):
+    assert pickle.loads(pickle.dumps(bench)).filter == "kf"
