@@ -7,8 +7,7 @@ import types
 import numpy as np
 import pytest
 
-from thruster_env.core.compiled import function_fingerprint
-from thruster_env.core.user_functions import code_text
+from thruster_env.core.compiled import code_text, function_fingerprint
 
 USERS = """
 import params
