@@ -420,8 +420,8 @@ def begun_at(model: StateSpaceModel, first: np.ndarray) -> np.ndarray:
 
         min_x |R^-1/2 (z - h(x))|^2 + |P_0^-1/2 difference(x, m_0)|^2
 
-    by damped steps of Gauss and Newton in the tangent, from the best of 24 attitudes of each rotation. What the
-    measurement does not determine, such as a heading without a magnetometer, is the prior's.
+    by damped steps of Gauss and Newton in the tangent, from the best of 24 attitudes of each rotation, and of six
+    directions. What the measurement does not determine, such as a heading without a magnetometer, is the prior's.
 
     Source: Levenberg (1944), "A method for the solution of certain non-linear problems in least squares",
     Quarterly of Applied Mathematics 2(2); tangents: `thruster_env.model.turns`.
@@ -445,7 +445,7 @@ def _begun_at(model: StateSpaceModel, z: np.ndarray) -> np.ndarray:
     def jacobian(x: np.ndarray) -> np.ndarray:
         h = np.array(slopes(as_value(x), scales, *fed, c)).reshape(model.m, model.n)
         h = h @ np.array(turns.slopes_of_stored(x, of))
-        off = np.array(turns.inverse_reset_slopes(turns.difference(x, mean, of), of))
+        off = np.array(turns.inverse_reset_slopes(mean, turns.difference(x, mean, of), of))
         rows = np.linalg.solve(of_r, -h[measured][:, known]), np.linalg.solve(of_p, off[np.ix_(known, known)])
         return np.concatenate(rows)
 
@@ -467,8 +467,9 @@ def _begun_at(model: StateSpaceModel, z: np.ndarray) -> np.ndarray:
 
     nearest = [mean]
     for turn in of:
-        starts = np.repeat(nearest, len(ATTITUDES), axis=0)
-        starts[:, turn.stored : turn.stored + 4] = np.tile(ATTITUDES, (len(nearest), 1))
+        tried = np.concatenate([np.eye(3), -np.eye(3)]) if turn.kind == "direction" else ATTITUDES
+        starts = np.repeat(nearest, len(tried), axis=0)
+        starts[:, turn.quaternion] = np.tile(tried, (len(nearest), 1))
         nearest = sorted(starts, key=lambda start: float(np.sum(residuals(start) ** 2)))[:MOST_STARTS]
     return min(map(climbed, nearest), key=lambda ended: ended[0])[1]
 
