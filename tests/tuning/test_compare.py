@@ -160,9 +160,9 @@ def interrupt_at(label):
 def test_ctrl_c_keeps_the_rows_that_are_done():
     contenders = [contender(name) for name in ("ekf", "ukf", "ckf")]
     with ThreadPoolExecutor(1) as pool, task_map(pool) as elsewhere:
-        for tasks in (IN_PROCESS, elsewhere):
-            boards, interrupted = compare(contenders, [NOMINAL] * 2, SEEDS, interrupt_at("ukf"), tasks)
-            assert interrupted and [[row.label for row in board.rows] for board in boards] == [["ekf", "ukf"]]
+        for tasks, most in ((IN_PROCESS, 1), (elsewhere, 2)):  # which may have begun the next
+            (board,), interrupted = compare(contenders, [NOMINAL] * 2, SEEDS, interrupt_at("ukf"), tasks)
+            assert interrupted and [row.label for row in board.rows] in (["ekf"], ["ekf", "ukf"][:most])
 
 
 @pytest.fixture

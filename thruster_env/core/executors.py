@@ -13,7 +13,7 @@ import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any
 
@@ -40,7 +40,9 @@ class TaskMap:
         """Whether tasks run elsewhere than in this thread."""
         return self._open is not None or self._executor is not None
 
-    def __call__(self, function: Callable[..., Any], tasks: Iterable[tuple]) -> Iterator[tuple[int, Any]]:
+    def __call__(
+        self, function: Callable[..., Any], tasks: Iterable[tuple], stop: Callable[[], bool] = lambda: False
+    ) -> Iterator[tuple[int, Any]]:
         """Yield (index, function(*task)) of each task, as soon as it is finished; in order in this process.
 
         If the caller stops to iterate, for instance after Ctrl-C, tasks that have not begun are cancelled.
@@ -48,14 +50,15 @@ class TaskMap:
         Args:
             function: a function of a module, or a `functools.partial` of one.
             tasks: the arguments of each call.
+            stop: once it returns True no further task begins, and those that have begun are the last ones.
 
         Raises:
             ValueError: if a task cannot be pickled, or workers die again and again.
         """
         left, losses = dict(enumerate(tasks)), 0
-        while left and self.is_remote:
+        while left and self.is_remote and not stop():
             try:
-                for index, result in self._finished(function, left):
+                for index, result in self._finished(function, left, stop):
                     del left[index]
                     losses = 0
                     yield index, result
@@ -67,24 +70,35 @@ class TaskMap:
                     raise ValueError(f"{rule} {losses} times without finishing one: {error}") from None
                 again = "again" if self._open else "in this process"
                 warnings.warn(f"a worker has died: {len(left)} tasks are run {again}", stacklevel=3)
-        for index in list(left):
+        while left and not stop():
+            index = next(iter(left))
             yield index, function(*left.pop(index))
 
-    def _finished(self, function: Callable[..., Any], tasks: dict[int, tuple]) -> Iterator[tuple[int, Any]]:
-        packed = {index: packed_task(function, task) for index, task in tasks.items()}
-        futures: dict[Future, int] = {}
+    def _finished(
+        self, function: Callable[..., Any], tasks: dict[int, tuple], stop: Callable[[], bool]
+    ) -> Iterator[tuple[int, Any]]:
+        if self._executor is None:
+            assert self._open is not None  # or nothing would be remote
+            self._executor = self._open()
+        # A pool of processes takes more tasks than it has processes, and does not give them back.
+        most, own = MOST_PROCESSES, False
+        if isinstance(self._executor, ProcessPoolExecutor) and self._open is not None:
+            most, own = self._executor._max_workers, True
+        waiting, begun = list(tasks)[::-1], dict[Future, int]()
         try:
-            with without_interrupts(), safe_paths():
-                if self._executor is None:
-                    assert self._open is not None  # or nothing would be remote
-                    self._executor = self._open()
-                for index, content in packed.items():
-                    futures[self._executor.submit(run_packed, content)] = index
-            for future in as_completed(list(futures)):
-                yield futures.pop(future), future.result()
+            while (waiting and not stop()) or begun:
+                while waiting and len(begun) < most and not stop():
+                    content = packed_task(function, tasks[waiting[-1]])
+                    with without_interrupts(), safe_paths():
+                        begun[self._executor.submit(run_packed, content)] = waiting.pop()
+                if stop() and not own:
+                    begun = {future: index for future, index in begun.items() if not future.cancel()}
+                for future in wait(begun, return_when=FIRST_COMPLETED).done:
+                    yield begun.pop(future), future.result()
         finally:
-            for future in futures:
-                future.cancel()
+            if not own:  # processes are ended in `close`
+                for future in begun:
+                    future.cancel()
 
     def close(self) -> None:
         """End an executor that was opened here, at once: nobody waits for a task that is left."""

@@ -382,13 +382,12 @@ def compare(
     try:
         with stop_on_interrupt() as stopped:
             on_row(pairs[0][1], pairs[0][0].label)
-            for index, result in tasks(measured_on, runs):
+            for index, result in tasks(measured_on, runs, stopped):
                 finished[index] = result
                 del waiting[index]
-                if stopped():
-                    raise KeyboardInterrupt
-                for contender, scenario in [*waiting.values()][:1]:
+                for contender, scenario in [] if stopped() else [*waiting.values()][:1]:
                     on_row(scenario, contender.label)
+            interrupted = stopped()
     except KeyboardInterrupt:
         interrupted = True
     finally:

@@ -221,13 +221,11 @@ def identify(
         from_one = from_start if tasks.is_remote else partial(from_start, stop=asked, tell=tell)
         ends: dict[int, tuple[np.ndarray, Ascent]] = {}
         begins = [(objective, number, point, first, simulation_first) for number, point in enumerate(points)]
-        for number, (point, ascent, evaluations) in tasks(from_one, begins):
+        for number, (point, ascent, evaluations) in tasks(from_one, begins, asked):
             ends[number] = point, ascent
             if tasks.is_remote:
                 objective.evaluations += evaluations
                 tell(ascent.at, ascent.found, number)
-            if asked():
-                break
         ascents = [ends[number][1] for number in sorted(ends)]
         if not any(math.isfinite(ascent.found.value) for ascent in ascents):
             raise ValueError(

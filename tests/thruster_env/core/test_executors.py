@@ -69,12 +69,15 @@ def test_the_rest_of_an_executor_that_breaks_runs_here_and_ours_are_not_opened_f
 
 
 def test_who_stops_waits_for_no_task_that_has_not_begun():
-    begun = []
-    with ThreadPoolExecutor(1) as pool, task_map(pool) as tasks:
-        for _, started in tasks(wait, [(0.02, number) for number in range(50)]):
-            begun.append(started)
-            break
-    assert begun == [0] and len(WAITED) < 50
+    numbers = [(0.02, number) for number in range(50)]
+    with ThreadPoolExecutor(1) as pool, task_map(pool) as elsewhere, task_map() as here:
+        assert next(elsewhere(wait, numbers)) == (0, 0)  # which ends there
+        assert len(WAITED) < 50
+        for tasks, most in ((here, 2), (elsewhere, 3)):
+            finished = []
+            for index, _ in tasks(wait, numbers, stop=lambda: len(finished) > 1):  # noqa: B023 - it is called here
+                finished.append(index)
+            assert finished == [*range(len(finished))] and 2 <= len(finished) <= most
 
 
 WAITED = []
