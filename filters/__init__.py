@@ -32,8 +32,8 @@ from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanF
 from filters.horizon.moving_horizon import MovingHorizonFilter
 from filters.particles.particle import AuxiliaryParticleFilter, ParticleFilter, RaoBlackwellisedParticleFilter
 from filters.registry import FILTERS, make_filter
-from filters.runs import run
-from filters.smoothers.smooth import Smoothed, SmoothedModes, smooth, smooth_modes
+from filters.runs import run, smooth
+from filters.smoothers.smooth import Smoothed, SmoothedModes, smooth_modes
 from filters.starts import Restarts, RestartWarning, restarts_of
 from filters.tensors import torch
 from filters.wrappers import register_filtered_envs

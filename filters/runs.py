@@ -1,16 +1,18 @@
-"""`filters.run`: plain arrays and tables in, steps of any length; estimates with tables and pictures out."""
+"""`filters.run` and `smooth`: plain arrays and tables in, steps of any length; tables and pictures out."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from filters.engine import batch
 from filters.engine.batch import Estimates, Prepared, prepared
 from filters.filter import Filter
+from filters.smoothers.smooth import Smoothed, smoothed_rows
 from filters.starts import warn_of_restarts
 from thruster_env.core.checks import FEW, at_least
 from thruster_env.core.modules import to_install
@@ -25,27 +27,18 @@ if TYPE_CHECKING:
     from filters.logs.estimate import LogEstimate
 
 
-class FilteredRuns(Estimates):
-    """`Estimates` that know their filter and data, for tables and pictures."""
+class WithTables:
+    """Tables and pictures of estimates that know their filter and data."""
 
+    is_smoothed: ClassVar[bool] = False
     data: Prepared
+    means: np.ndarray
+    covs: np.ndarray
 
-    def __repr__(self) -> str:
-        if not hasattr(self, "data"):  # as after `_replace`
-            return super().__repr__()
-        data, (n, t) = self.data, (self.means.shape[-1], self.covs.shape[-1])
-        count, rows = len(data.keys), len(data.rows)
-        names = [quantity.label for quantity in data.filter.model.states] if count == 1 and n == t else []
-        last = self.means.reshape(count, rows, n)[0, -1], self.stds.reshape(count, rows, t)[0, -1]
-        of = f"{count} trajectories of {rows} rows each" if count > 1 else f"{rows} rows"
-        lines = [f"Estimates of {data.filter.name}: {of}, {data.times[0]:g} to {data.times[-1]:g} s"]
-        lines += [f"  last {name} {m:.6g} +- {s:.3g}" for name, m, s in [*zip(names, *last, strict=False)][:FEW]]
-        lines[1:] += ["  ..."] * (len(names) > FEW)
-        total, restarts = float(np.sum(self.log_likelihoods)), int(np.sum(self.divergences))
-        lines.append(f"log-likelihood {total:.6g}" + f", {restarts} restarts" * (restarts > 0))
-        each = "to_frame() has all, plot(run=0) one" if count > 1 else "to_frame(), plot()"
-        lines.append(f".means {self.means.shape}, .stds, .covs, .innovations, .log_likelihoods; {each}")
-        return "\n".join(lines)
+    @property
+    def _filtered(self) -> Estimates:
+        """The filter's estimates, whose innovations are drawn."""
+        raise NotImplementedError
 
     def to_frame(self, run: int | None = None) -> pandas.DataFrame:
         """A table by time: inputs, measurements, estimates with standard deviations, and innovations, with units.
@@ -91,8 +84,9 @@ class FilteredRuns(Estimates):
             "run", float(np.median(steps)), inputs, z, plain.input_quantities, plain.measurements, stamps=stamps
         )
         log = replace(log, start=float(data.times[0]))
+        filtered = self._filtered
         means, covs, innovations, innovation_covs, likelihoods = (
-            part if data.is_single else part[run] for part in self[:5]
+            part if data.is_single else part[run] for part in (self.means, self.covs, *filtered[2:5])
         )
         filter_ = data.filter if plain is model else replace(data.filter, model=plain)
         return LogEstimate(
@@ -103,9 +97,52 @@ class FilteredRuns(Estimates):
             np.where(np.isnan(z), np.nan, innovations),
             innovation_covs,
             likelihoods,
-            int(np.max(self.divergences)),
-            smoothed=False,
+            int(np.max(filtered.divergences)),
+            smoothed=self.is_smoothed,
         )
+
+
+class FilteredRuns(WithTables, Estimates):
+    """`Estimates` that know their filter and data, for tables and pictures."""
+
+    @property
+    def _filtered(self) -> Estimates:
+        return self
+
+    def __repr__(self) -> str:
+        if not hasattr(self, "data"):  # as after `_replace`
+            return super().__repr__()
+        data, (n, t) = self.data, (self.means.shape[-1], self.covs.shape[-1])
+        count, rows = len(data.keys), len(data.rows)
+        names = [quantity.label for quantity in data.filter.model.states] if count == 1 and n == t else []
+        last = self.means.reshape(count, rows, n)[0, -1], self.stds.reshape(count, rows, t)[0, -1]
+        of = f"{count} trajectories of {rows} rows each" if count > 1 else f"{rows} rows"
+        lines = [f"Estimates of {data.filter.name}: {of}, {data.times[0]:g} to {data.times[-1]:g} s"]
+        lines += [f"  last {name} {m:.6g} +- {s:.3g}" for name, m, s in [*zip(names, *last, strict=False)][:FEW]]
+        lines[1:] += ["  ..."] * (len(names) > FEW)
+        total, restarts = float(np.sum(self.log_likelihoods)), int(np.sum(self.divergences))
+        lines.append(f"log-likelihood {total:.6g}" + f", {restarts} restarts" * (restarts > 0))
+        each = "to_frame() has all, plot(run=0) one" if count > 1 else "to_frame(), plot()"
+        lines.append(f".means {self.means.shape}, .stds, .covs, .innovations, .log_likelihoods; {each}")
+        return "\n".join(lines)
+
+
+class SmoothedRuns(WithTables, Smoothed):
+    """`Smoothed` that know their filter and data; innovations of tables and pictures are the filter's."""
+
+    is_smoothed: ClassVar[bool] = True
+
+    @property
+    def stds(self) -> np.ndarray:
+        """Standard deviations of the errors, (B, K + 1, n)."""
+        return np.sqrt(np.diagonal(self.covs, axis1=-2, axis2=-1))
+
+    @cached_property
+    def _filtered(self) -> Estimates:
+        data = self.data
+        estimates = batch.run(data.filter, data.keys, data.inputs, data.measurements, **data.noise)
+        parts = [*(part[:, data.rows] for part in estimates[:5]), estimates.divergences]
+        return Estimates(*(part[0] for part in parts) if data.is_single else parts)
 
 
 def run(
@@ -168,5 +205,71 @@ def run(
     if len(data.rows) < estimates.means.shape[1]:  # else a copy would take as long as the filter
         parts = [*(part[:, data.rows] for part in estimates[:5]), estimates.divergences]
     runs = FilteredRuns(*(part[0] for part in parts) if data.is_single else parts)
+    runs.data = data
+    return runs
+
+
+def smooth(
+    filter_: Filter,
+    keys: np.ndarray | None = None,
+    inputs: np.ndarray | None = None,
+    measurements: np.ndarray | None = None,
+    lag: int | None = None,
+    *,
+    dt: Any = None,
+    noise: Callable[[float], Any] | None = None,
+    update_first: bool = True,
+    process_noise_covs: np.ndarray | None = None,
+    measurement_noise_covs: np.ndarray | None = None,
+) -> SmoothedRuns:
+    """Filter trajectories forwards and correct the estimates by later measurements.
+
+    - Kalman filters, also scheduled, extended or iterated extended, unscented and cubature Kalman filters: the
+      recursion of Rauch, Tung and Striebel backwards, on the filter's own linearisation or sigma points.
+    - Filters of several models: `smooth_modes`, which also returns the probabilities of the modes; without a lag.
+    - Ensemble Kalman filters of all kinds: the smoother of Evensen and van Leeuwen. Each update moves the members
+      of earlier steps, too. Each adds its sampling error, so that a small ensemble gains by a short lag only.
+
+    The recursion backwards, with both covariances given the measurements up to k, is
+
+        G_k = cov(x_k, x_{k+1}) cov(x_{k+1})^-1,   mean_k += G_k (smoothed mean_{k+1} - predicted mean_{k+1}),
+        P_k += G_k (smoothed P_{k+1} - predicted P_{k+1}) G_k'
+
+    A single trajectory may have the shapes (K + 1,) or (K + 1, m) and (K,) or (K, p), as `filters.run` takes it.
+
+    The recursion runs without bounds on states, like the filter's; its estimates are constrained at the end, by
+    truncation or projection.
+
+    With lag = 0 the result is the filter's own. The full smoother of an ensemble takes K/2 updates per step, so
+    give it a lag of the length of the system's memory.
+
+    Args:
+        filter_: a filter of one of these types.
+        keys: random keys, one a trajectory, (B, 2); those of seeds 0, 1, ..., B - 1 if None.
+        inputs: u, (B, K, p), in the units of the model's inputs; None for a model without inputs.
+        measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing.
+        lag: number of later measurements that each estimate uses (fixed-lag smoothing); all of them if None.
+        dt: lengths of the steps [s], as `filters.run` takes them.
+        noise: Q by the length of a step [s], likewise.
+        update_first: whether the first measurement updates the prior itself, likewise.
+        process_noise_covs: Q of every step, (K, n, n), in place of the model's, as `filters.run` takes it.
+        measurement_noise_covs: R of every measurement, (K + 1, m, m), likewise.
+
+    Returns:
+        `SmoothedRuns`: `Smoothed` with `to_frame()` and `plot()`, which do not depend on the number of cores; a
+        `RestartWarning` if the filter restarted.
+
+    Raises:
+        ValueError: if shapes do not fit, an input is not finite, or there is no smoother for the filter.
+
+    Source: Rauch, Tung, Striebel (1965), "Maximum likelihood estimates of linear dynamic systems"; Sarkka (2008),
+    "Unscented Rauch-Tung-Striebel smoother"; Evensen, van Leeuwen (2000), "An ensemble Kalman smoother for
+    nonlinear dynamics"; fixed lag: Anderson, Moore (1979), Optimal Filtering, chapter 7.
+    """
+    covs = process_noise_covs, measurement_noise_covs
+    data = prepared(filter_, keys, inputs, measurements, *covs, dt=dt, noise=noise, update_first=update_first)
+    estimates, divergences = smoothed_rows(data, lag)
+    warn_of_restarts(data.filter, divergences, data.keys, data.inputs, data.measurements, **data.noise)
+    runs = SmoothedRuns(*(part[0] for part in estimates) if data.is_single else estimates)
     runs.data = data
     return runs

@@ -10,7 +10,7 @@ from filters.logs.estimate import SKIPPED
 from filters.logs.findings import header_of
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs import write
-from thruster_env.logs.columns import DATE_NAMES, LENGTHS, TIME_NAMES, WORDS, conversion, plain
+from thruster_env.logs.columns import COUNTERS, DATE_NAMES, LENGTHS, TIME_NAMES, WORDS, conversion, plain
 from thruster_env.model.quantities import Quantity
 
 COLUMNS = r"""
@@ -223,13 +223,16 @@ static int take_time(void)
     static char base[LONGEST], unit[LONGEST];
 
     column_of[TIME] = -1;
-    for (int is_date = 0; is_date < 2; is_date++) {
+    for (int is_date = 0; is_date < 3; is_date++) { /* the last for counters, whose name is the unit */
         for (int k = 0; k < width; k++) {
             part(titles[k], base, unit);
             for (char *letter = base; is_date && *letter != '\0'; letter++) {
                 *letter = (char)lower(*letter);
             }
-            if (!is_taken(k) && is_among(base, is_date ? date_names : time_names)) {
+            if (!is_taken(k) && is_among(base, is_date == 2 ? counters : is_date ? date_names : time_names)) {
+                if (is_date == 2 && unit[0] == '\0') {
+                    strcpy(unit, counter_units[strcmp(base, counters[0]) != 0]);
+                }
                 is_bare = unit[0] == '\0';
                 return take(TIME, k, unit);
             }
@@ -481,6 +484,8 @@ def _tables(quantities: tuple[Quantity, ...]) -> str:
             _array("symbols[COLUMNS]", [plain(quantity.symbol) for quantity in quantities]),
             _array("time_names[]", [*TIME_NAMES, ""]),
             _array("date_names[]", [*DATE_NAMES, ""]),
+            _array("counters[]", [*COUNTERS, ""]),
+            _array("counter_units[]", COUNTERS.values()),
             _array("known_units[]", [*WORDS, ""]),
             _array("lengths[]", [*LENGTHS, ""]),
             "/* Units by the first column that has them, the last for times: (number factor + zero)/divisor. */",

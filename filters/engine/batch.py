@@ -29,7 +29,7 @@ from thruster_env.core.streams import filter_keys
 from thruster_env.core.threads import spread
 from thruster_env.logs.grid import count_steps, resolution_of, resolution_of_digits
 from thruster_env.logs.log import in_any_steps
-from thruster_env.logs.table import times_of_index
+from thruster_env.logs.table import refuse_holes, times_of_index
 from thruster_env.model.continuous import SAME_DT, same_dt
 from thruster_env.model.shape import LANES, with_root
 from thruster_env.model.state_space import StateSpaceModel
@@ -287,6 +287,8 @@ def prepared(
         raise ValueError(f"measurements must be an array (B, K + 1, m), but got None: {BY_NAME}")
     by_index = dt is None and hasattr(measurements, "iloc")
     stamps = times_of_index(measurements.index) if by_index else None
+    if by_index and stamps is None:
+        refuse_holes(measurements.index)
     measurements, inputs = _in_rows(filter_.kernel_model, keys, inputs, measurements)
     if is_single(None, inputs, measurements):
         filter_, inputs = filter_.from_first_input(inputs, len(measurements), update_first)

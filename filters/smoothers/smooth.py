@@ -1,8 +1,8 @@
 """Smoothers: estimates of each state from measurements of later steps as well as from earlier ones.
 
 In order: the ensemble Kalman smoother, in which each measurement also moves the members of earlier steps;
-`smooth`, forwards and backwards over runs; and the fixed-lag smoother of a running filter, which estimates the
-state some steps ago from all measurements so far.
+`smoothed`, forwards and backwards over runs (`filters.runs.smooth`); and the fixed-lag smoother of a running
+filter, which estimates the state some steps ago from all measurements so far.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.engine.batch import Beliefs, Prepared, noise_rows, prepared, run, trajectories
+from filters.engine.batch import Beliefs, Prepared, noise_rows, run, trajectories
 from filters.engine.belief import Kernels, constrained, memory_offsets, restart_if_lost
 from filters.engine.compile import new_memory
 from filters.engine.session import Session
@@ -399,69 +399,6 @@ class Smoothed(NamedTuple):
     covs: np.ndarray
 
 
-def smooth(
-    filter_: Filter,
-    keys: np.ndarray | None = None,
-    inputs: np.ndarray | None = None,
-    measurements: np.ndarray | None = None,
-    lag: int | None = None,
-    *,
-    dt: Any = None,
-    noise: Callable[[float], Any] | None = None,
-    update_first: bool = True,
-    process_noise_covs: np.ndarray | None = None,
-    measurement_noise_covs: np.ndarray | None = None,
-) -> Smoothed:
-    """Filter trajectories forwards and correct the estimates by later measurements.
-
-    - Kalman filters, also scheduled, extended or iterated extended, unscented and cubature Kalman filters: the
-      recursion of Rauch, Tung and Striebel backwards, on the filter's own linearisation or sigma points.
-    - Filters of several models: `smooth_modes`, which also returns the probabilities of the modes; without a lag.
-    - Ensemble Kalman filters of all kinds: the smoother of Evensen and van Leeuwen. Each update moves the members
-      of earlier steps, too. Each adds its sampling error, so that a small ensemble gains by a short lag only.
-
-    The recursion backwards, with both covariances given the measurements up to k, is
-
-        G_k = cov(x_k, x_{k+1}) cov(x_{k+1})^-1,   mean_k += G_k (smoothed mean_{k+1} - predicted mean_{k+1}),
-        P_k += G_k (smoothed P_{k+1} - predicted P_{k+1}) G_k'
-
-    A single trajectory may have the shapes (K + 1,) or (K + 1, m) and (K,) or (K, p), as `filters.run` takes it.
-
-    The recursion runs without bounds on states, like the filter's; its estimates are constrained at the end, by
-    truncation or projection.
-
-    With lag = 0 the result is the filter's own. The full smoother of an ensemble takes K/2 updates per step, so
-    give it a lag of the length of the system's memory.
-
-    Args:
-        filter_: a filter of one of these types.
-        keys: random keys, one a trajectory, (B, 2); those of seeds 0, 1, ..., B - 1 if None.
-        inputs: u, (B, K, p), in the units of the model's inputs; None for a model without inputs.
-        measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing.
-        lag: number of later measurements that each estimate uses (fixed-lag smoothing); all of them if None.
-        dt: lengths of the steps [s], as `filters.run` takes them.
-        noise: Q by the length of a step [s], likewise.
-        update_first: whether the first measurement updates the prior itself, likewise.
-        process_noise_covs: Q of every step, (K, n, n), in place of the model's, as `filters.run` takes it.
-        measurement_noise_covs: R of every measurement, (K + 1, m, m), likewise.
-
-    Returns:
-        `Smoothed`, which does not depend on the number of cores; a `RestartWarning` if the filter restarted.
-
-    Raises:
-        ValueError: if shapes do not fit, an input is not finite, or there is no smoother for the filter.
-
-    Source: Rauch, Tung, Striebel (1965), "Maximum likelihood estimates of linear dynamic systems"; Sarkka (2008),
-    "Unscented Rauch-Tung-Striebel smoother"; Evensen, van Leeuwen (2000), "An ensemble Kalman smoother for
-    nonlinear dynamics"; fixed lag: Anderson, Moore (1979), Optimal Filtering, chapter 7.
-    """
-    covs = process_noise_covs, measurement_noise_covs
-    data = prepared(filter_, keys, inputs, measurements, *covs, dt=dt, noise=noise, update_first=update_first)
-    estimates, divergences = smoothed_rows(data, lag)
-    warn_of_restarts(data.filter, divergences, data.keys, data.inputs, data.measurements, **data.noise)
-    return Smoothed(*(part[0] for part in estimates)) if data.is_single else estimates
-
-
 def smoothed_rows(data: Prepared, lag: int | None) -> tuple[Smoothed, np.ndarray]:
     """`smoothed` at the rows of the user's measurements, which the lag counts."""
     rows = None if lag is None or len(data.rows) == data.measurements.shape[1] else data.rows
@@ -482,7 +419,7 @@ def smoothed(
     measurement_noise_covs: np.ndarray | None = None,
     step_filters: Sequence[Filter] | None = None,
 ) -> tuple[Smoothed, np.ndarray]:
-    """The result of `smooth`, and the filter's restarts (B,) in the forward pass, without a warning.
+    """The result of `filters.smooth`, and the filter's restarts (B,) in the forward pass, without a warning.
 
     The lag counts `rows`, all if None; `step_filters` are those of `filters.engine.batch.run`.
     """

@@ -33,6 +33,7 @@ from thruster_env.model.continuous import AtDt
 from thruster_env.model.state_space import StateSpaceModel
 
 OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
+FAR = 5.0  # standard deviations, of a first measurement from where a model begins
 APPENDED = "appended_entries"  # attribute of an env: entries of its observation after the measurement
 HOOK = "measured_inputs"  # method of an env; what it returns is a `Split`, or None for an ordinary model
 
@@ -80,6 +81,23 @@ def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | 
         rule = "model must be 'module:factory' that can be imported, a model's name, or a StateSpaceModel"
         raise ValueError(f"{rule}, but got {model!r}") from None
     return f"model {model!r}", factory
+
+
+def warn_if_far(model: str, innovation: np.ndarray, innovation_cov: np.ndarray) -> None:
+    """Warn the caller's caller of a model by name, which begins at its mean, if a first measurement is far away.
+
+    Args:
+        model: its name.
+        innovation: of the first measurements, (..., m).
+        innovation_cov: S, (..., m, m).
+    """
+    apart = np.abs(innovation) / np.sqrt(np.diagonal(innovation_cov, axis1=-2, axis2=-1))
+    if np.size(apart) and (furthest := float(np.nanmax(apart))) > FAR:
+        warnings.warn(
+            f"the first measurement is {furthest:.3g} standard deviations from where {model!r} begins: "
+            "give the mean of the data, mean=..., as thruster fit does",
+            stacklevel=3,
+        )
 
 
 def offered(env, name: str) -> Any:

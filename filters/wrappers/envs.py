@@ -20,6 +20,7 @@ from filters.engine.belief import checked_actions
 from filters.estimators.foreign import Estimator, EstimatorBeliefs, ForeignFilter
 from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of, watch_of
+from filters.named import NamedMaker, model_named
 from filters.smoothers.smooth import WithSmoother
 from filters.starts import FirstRestart, FirstRestarts
 from filters.wrappers.arguments import (
@@ -32,6 +33,7 @@ from filters.wrappers.arguments import (
     filter_for,
     given_filter,
     split_of,
+    warn_if_far,
 )
 from thruster_env.core.checks import as_floats, one_of, short_repr
 from thruster_env.core.checks import seed as checked_seed
@@ -123,6 +125,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         gym.utils.RecordConstructorArgs.__init__(self, **recorded)
         gym.Wrapper.__init__(self, env)
         self._form = one_of("observation", observation, OBSERVATIONS)
+        self._name = str(model) if isinstance(model_named(model), NamedMaker) else ""
         self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
         split = split_of(env, self.filter.model)
         self._split = bool(split.inputs)  # whether some channels are inputs of the model
@@ -162,6 +165,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self._session.start(draw_key(self._generator), z)
         self._first = FirstRestart(self.filter)
         self._first.note(self._session, None, as_floats(z)[self._measurements])
+        if self._name:
+            warn_if_far(self._name, self._session.innovation, self._session.innovation_cov)
         if self._watch is not None:
             self._watch.restart()
         return self._observe(observation, z, info), info
@@ -273,6 +278,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         super().__init__(env)
         self._form = one_of("observation", observation, OBSERVATIONS)
         filter, tuned = given_filter(filter, tuned)
+        self._name = str(model) if isinstance(model_named(model), NamedMaker) else ""
         self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
         split = split_of(env, self.filter.model)
         inputs = len(split.inputs)
@@ -356,6 +362,9 @@ class EstimateStates(gym.vector.VectorWrapper):
         for i in which if self._watches else ():
             self._watches[i].restart()
         self._beliefs.start(which, self._keys.draw(which), z)
+        if self._name:
+            m, part = self.filter.model.m, self._beliefs.part
+            warn_if_far(self._name, part("innovation", m)[which], part("innovation_cov", m, m)[which])
 
     def _end(self, u, z, done, info) -> None:
         """Update with the last measurements of episodes that end; put these estimates into final_obs and info."""

@@ -14,7 +14,7 @@ from filters import (
     KalmanFilter,
     SerialSquareRootFilter,
 )
-from filters.smoothers.smooth import smooth
+from filters.runs import smooth
 from tests.models import KEY, plane_model, scalar_model, simulated, wide_model
 from tests.oracles import normals
 from thruster_env.core.compiled import interpreted

@@ -209,6 +209,13 @@ def test_a_program_in_c_reads_a_log_as_estimate_does(tmp_path):
     with open(tmp_path / "log.csv") as rows:
         program = [tmp_path / "c" / "battery", "i_A", "v_V"]
         printed_rows = subprocess.run(program, stdin=rows, capture_output=True, text=True, check=True).stdout
+    header, *lines = (tmp_path / "log.csv").read_text().splitlines()
+    counted = [f"{1e6 * float(time)!r},{rest}" for time, rest in (line.split(",", 1) for line in lines)]
+    text = "\n".join([header.replace("t_s", "Micros"), *counted, ""])
+    of_counter = subprocess.run(program, input=text, capture_output=True, text=True, check=True).stdout
+    for row, expected_row in zip(of_counter.splitlines(), printed_rows.splitlines(), strict=True):
+        assert row.split(",")[1:] == expected_row.split(",")[1:]
+    assert of_counter.splitlines()[-1].startswith("59,")
     means = np.array([line.split(",")[1:5:2] for line in printed_rows.splitlines()[1:]], float)
     np.testing.assert_allclose(means, expected.means, rtol=1e-9, atol=1e-12)
 

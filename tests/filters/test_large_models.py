@@ -11,7 +11,7 @@ from filters import StateSpaceModel, bounds, make_filter, run, sensitivity, thru
 from filters import bounds as posterior
 from filters.augmented import augmented_model
 from filters.registry import FILTERS, filter_type
-from filters.smoothers.smooth import smooth
+from filters.runs import smooth
 from tests.models import (
     OF_EACH_KIND,
     lonely_model,

@@ -139,6 +139,11 @@ def test_a_filter_of_a_model_without_inputs_ignores_the_actions(as_python):
     np.testing.assert_allclose(several[0], single, rtol=1e-12)
     env = filters.EstimateState(gym.make("BowThruster-v0"), "kf", model="constant:drift=1,R=0.25")  # of its dt
     assert env.filter.model.process_noise_cov[0, 0] == pytest.approx(env.unwrapped.plant.dt)
+    far = name + ",mean=-1e4"
+    single_env = filters.EstimateState(Drifting(), "kf", model=far)
+    for wrapped in (single_env, filters.EstimateStates(copies.env, "kf", model=far)):
+        with pytest.warns(UserWarning, match="the first measurement is 100 standard deviations from where"):
+            wrapped.reset(seed=3)
     with pytest.raises(ValueError, match="must have a sample time, but .* has no dt here: constant:dt=..."):
         filters.EstimateState(Drifting(), model="constant:drift=0.01,R=1")
 

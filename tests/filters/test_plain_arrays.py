@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import filters
+import tuning
 from filters.models import kalman_filter
 
 
@@ -154,6 +155,10 @@ def test_an_index_of_times_gives_the_steps(walk):
         filters.run(walk, series.drop(series.index[[7, 8]]))
     with pytest.raises(ValueError, match=r"for steps of 0.1 s and a step of 5 s"):
         filters.run(walk, Z, dt=5.0)
+    holes = pandas.Series(Z).drop([7, 8])
+    for function in (lambda z: filters.run(walk, z), lambda z: tuning.fit(z, model="constant", dt=0.1)):
+        with pytest.raises(ValueError, match="whole numbers must be equal steps, but 9 follows 6: z.reindex"):
+            function(holes)
     with pytest.raises(ValueError, match="times of the index must increase, but row 1 comes -0.1 s later"):
         filters.run(walk, series[::-1])
 

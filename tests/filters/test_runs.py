@@ -28,6 +28,11 @@ def test_a_run_of_a_list_a_table_or_a_batch_is_a_table_and_a_picture(as_python):
     np.testing.assert_array_equal(table["std_velocity_1_per_s"], estimates.stds[:, 1])
     labels = [axis.get_ylabel() for axis in estimates.plot().axes]
     assert len(labels) == 3 and labels[2] == "innovation of\nz"
+    smoothed = filters.smooth(LEVEL, Z.tolist(), dt=0.1)
+    of_smoother = smoothed.to_frame()
+    np.testing.assert_array_equal(of_smoother["position"], smoothed.means[:, 0])
+    np.testing.assert_array_equal(of_smoother["std_position"], smoothed.stds[:, 0])
+    assert (of_smoother["innovation_z"] == table["innovation_z"]).all() and len(smoothed.plot().axes) == 3
     batch = filters.run(LEVEL, np.stack([0 * Z, Z])[..., None], dt=0.1)
     pandas.testing.assert_frame_equal(batch.to_frame(1), table)
     of_pandas = filters.run(LEVEL, pandas.DataFrame({"z": Z}))

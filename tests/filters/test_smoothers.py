@@ -15,7 +15,7 @@ from filters import (
     run,
 )
 from filters.consistency.nees import mean_interval, normalized_squares, rmse_ratios
-from filters.smoothers.smooth import smooth
+from filters.runs import smooth
 from tests.filters.test_differentiated import swing_if
 from tests.models import KEY, held_voltages, pendulum, scalar_model, simulated, swing, wide_model
 from thruster_env.core.compiled import interpreted

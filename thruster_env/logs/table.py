@@ -386,6 +386,16 @@ def times_of_index(index: Any) -> np.ndarray | None:
     return None
 
 
+def refuse_holes(index: Any) -> None:
+    """Raise ValueError for a pandas index that counts rows of which some are missing, as after `dropna`."""
+    steps = np.diff(index.to_numpy()) if getattr(index.dtype, "kind", "") in "iu" else np.ones(1)
+    if (steps > 0).all() and len(set(steps.tolist())) > 1:
+        row = int(np.argmax(steps != steps.min())) + 1
+        rule = "rows of an index of whole numbers must be equal steps"
+        way = "z.reindex(range(first, last + 1)) puts NaN in missing rows, z.to_numpy() leaves the index out"
+        raise ValueError(f"{rule}, but {index[row]} follows {index[row - 1]}: {way}")
+
+
 def _of_arrays(path: Path | str, cells: dict[str, np.ndarray]) -> Table:
     rule = "a log must have columns of equal length with some rows"
     first = next((name for name, column in cells.items() if column.ndim == 1 and len(column)), None)

@@ -24,7 +24,7 @@ from thruster_env.logs.grid import resolution_of_digits
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 from thruster_env.logs.recorders.registry import format_of
-from thruster_env.logs.table import TIME_HEADER, Table, read_table, table_of
+from thruster_env.logs.table import TIME_HEADER, Table, read_table, refuse_holes, table_of
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -228,6 +228,8 @@ def log_of_columns(
     reader = named_model("constant").model({"drift": 1.0}, 1.0, 1.0, quantities=quantities)
     columns = {quantity.symbol: header for quantity, header in zip(quantities, headers, strict=True)}
     columns |= {} if time is None else {TIME: time}
+    if time is None and hasattr(z, "iloc"):
+        refuse_holes(z.index)
     options["dt"] = 1.0 if dt is None and time is None and not recorded else dt
     options = {key: value for key, value in options.items() if value is not None}
     log = read_log(source, reader, columns, table=table, **options)
