@@ -81,9 +81,8 @@ class TaskMap:
             assert self._open is not None  # or nothing would be remote
             self._executor = self._open()
         # A pool of processes takes more tasks than it has processes, and does not give them back.
-        most, own = MOST_PROCESSES, False
-        if isinstance(self._executor, ProcessPoolExecutor) and self._open is not None:
-            most, own = self._executor._max_workers, True
+        most = self._executor.count if isinstance(self._executor, Processes) else MOST_PROCESSES
+        own = isinstance(self._executor, Processes)
         waiting, begun = list(tasks)[::-1], dict[Future, int]()
         try:
             while (waiting and not stop()) or begun:
@@ -105,7 +104,7 @@ class TaskMap:
         executor, self._executor = self._executor, None
         if executor is None or self._open is None:
             return
-        processes = executor._processes if isinstance(executor, ProcessPoolExecutor) else {}
+        processes = executor._processes if isinstance(executor, Processes) else {}
         for process in list((processes or {}).values()):
             process.terminate()
         executor.shutdown(wait=bool(processes))
@@ -165,7 +164,7 @@ def opener_of(name: str) -> Callable[[], Executor]:
     if kind == "processes":
         rule = "executor (--executor) processes"
         count = cores() if name == kind else at_least(rule, rest, 1, MOST_PROCESSES)
-        return lambda: ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), prepare_process, (count,))
+        return lambda: Processes(count)
     if name == "mpi":
         return _mpi
     if kind == "dask" and rest:
@@ -194,6 +193,15 @@ def _dask(address: str) -> Executor:
 
 
 # Processes of this host.
+
+
+class Processes(ProcessPoolExecutor):
+    """A pool of `count` processes that share the cores."""
+
+    def __init__(self, count: int) -> None:
+        """Start none: the first tasks do."""
+        super().__init__(count, multiprocessing.get_context("spawn"), prepare_process, (count,))
+        self.count = count
 
 
 def prepare_process(count: int) -> None:
