@@ -10,7 +10,8 @@ state.
 
 Roll phi, pitch theta, yaw psi [rad]; the earth's axes are north, east, down, the body's ahead, starboard, down. An
 attitude is (cos phi, sin phi, cos theta, sin theta). Euler angles end at theta = +-90 deg, where the rates of phi
-and psi are infinite. Source: Fossen (2011), "Handbook of Marine Craft Hydrodynamics and Motion Control", 2.2.
+and psi are infinite; with a quaternion in their place (`rotating_rates`) the vehicle may loop. Source: Fossen
+(2011), "Handbook of Marine Craft Hydrodynamics and Motion Control", 2.2.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ import numpy as np
 from thruster_env.auv.parameters import VehicleParameters, accelerated, derive_constants, forces, forces_tangent
 from thruster_env.core.derivatives import runge_kutta
 from thruster_env.core.streams import cosine_and_sine
+from thruster_env.model import rotations
+from thruster_env.model.turns import Rotation, runge_kutta_munthe_kaas, with_rotations
 
 # Attitude and path of a vehicle: Euler angles, transformations between body and earth, their tangents.
 
@@ -189,10 +192,20 @@ def current_rates(x, u, c):
     current [m/s] is the same everywhere, and held over the step: in the body's axes it turns with them.
     """
     attitude = attitude_of(x[6], x[7])
-    along, across, below = in_body_axes(attitude, x[8], u[4], u[5], u[6])
+    current = in_body_axes(attitude, x[8], u[4], u[5], u[6])
+    return (
+        *_in_current(x, current, down(attitude), u, c),
+        *angle_rates(attitude, x[3], x[4], x[5]),
+        *in_earth_axes(attitude, x[8], x[0], x[1], x[2]),
+    )
+
+
+def _in_current(x, current, downwards, u, c):
+    """Nu' in a current (ahead, to starboard, down in the body's axes), which turns with them."""
+    along, across, below = current
     p, q, r = x[3], x[4], x[5]
     through_water = (x[0] - along, x[1] - across, x[2] - below, p, q, r)
-    accelerations = accelerated(forces(through_water, down(attitude), u, c), c)
+    accelerations = accelerated(forces(through_water, downwards, u, c), c)
     return (
         accelerations[0] + r * across - q * below,
         accelerations[1] + p * below - r * along,
@@ -200,8 +213,6 @@ def current_rates(x, u, c):
         accelerations[3],
         accelerations[4],
         accelerations[5],
-        *angle_rates(attitude, p, q, r),
-        *in_earth_axes(attitude, x[8], x[0], x[1], x[2]),
     )
 
 
@@ -241,6 +252,47 @@ def drifting_rates_tangent(x, dx, u, c):
         0.0,
     )
 
+
+# The same motion with a quaternion (w, x, y, z) of `thruster_env.model.rotations` for the attitude.
+
+
+_, ROTATING = with_rotations((*"uvwpqr", Rotation("attitude"), *"xyz"))
+"""The rotation of a state (nu, quaternion, x, y, z), whose error is in the body's axes."""
+
+
+def rotating_rates(x, u, c):
+    """Rates of the tangent of x = (nu, quaternion) or (nu, quaternion, x, y, z).
+
+        nu' as in `current_rates`, angular rate (p, q, r) of the body, (x, y, z)' = R (u, v, w)
+
+    u = (X_prop, K_prop, delta_s, delta_r), and a current (north, east, down) or none.
+    """
+    attitude, downwards = x[6:10], rotations.to_body(x[6:10], (0.0, 0.0, 1.0))
+    current = rotations.to_body(attitude, u[4:7]) if len(u) > 4 else (0.0, 0.0, 0.0)
+    velocity = rotations.to_world(attitude, x[:3]) if len(x) > 10 else ()
+    return (*_in_current(x, current, downwards, u, c), x[3], x[4], x[5], *velocity)
+
+
+def rotating_state(x):
+    """(nu, quaternion, ...) of a state (nu, phi, theta, psi, ...): turned by yaw, then pitch, then roll."""
+    c_phi, s_phi, c_theta, s_theta = attitude_of(0.5 * x[6], 0.5 * x[7])
+    c_psi, s_psi = cosine_and_sine(0.5 * x[8])
+    rolled = rotations.product((c_theta, 0.0, s_theta, 0.0), (c_phi, s_phi, 0.0, 0.0))
+    return (*x[:6], *rotations.product((c_psi, 0.0, 0.0, s_psi), rolled), *x[9:])
+
+
+def angled_state(x):
+    """(nu, phi, theta, psi, ...) of a state (nu, quaternion, ...); roll and yaw are within half a turn.
+
+    At theta = +-90 deg, roll and yaw are not determined.
+    """
+    ahead, starboard, below = rotations.matrix(x[6:10])
+    theta = np.arctan2(-below[0], np.sqrt(below[1] * below[1] + below[2] * below[2]))
+    return (*x[:6], np.arctan2(below[1], below[2]), theta, np.arctan2(starboard[0], ahead[0]), *x[10:])
+
+
+rotating_substep = runge_kutta_munthe_kaas(rotating_rates, ROTATING)
+"""`rotating_substep(x, u, c)`: velocities and quaternion, and position if it is in x, after c.substep seconds."""
 
 motion_substep = runge_kutta(motion_rates, 8)
 """`motion_substep(x, u, c)`: velocities, roll and pitch after c.substep seconds of constant input."""

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
+from thruster_env.auv.dynamics import angled_state
 from thruster_env.auv.equations import PHI, PSI, THETA, U, X, Y, Z, page_of
 from thruster_env.auv.paths import make_depth_task, make_task
-from thruster_env.auv.plant import Plant, make_plant
+from thruster_env.auv.plant import QUATERNION, SYMBOLS, Plant, make_plant
 from thruster_env.auv.rendering import ChartEntry, Renderer
 from thruster_env.core.checks import arguments_of, takes_arguments_of
 from thruster_env.env.copies import TIME
@@ -45,6 +46,8 @@ class ModelledVehicle(ModelledEnv):
     def state_space_model(self, **changes) -> StateSpaceModel:
         """See `thruster_env.env.model_env`; for "velocities" roll and pitch are as measured, else level."""
         attitude = "measured" if {"phi", "theta"} <= set(self.plant.channels) else "level"
+        if self.plant.attitude == QUATERNION:
+            attitude = "input"  # which has no effect
         return super().state_space_model(**{"attitude": attitude} | changes)
 
     def measured_inputs(self, model: StateSpaceModel) -> Split | None:
@@ -62,6 +65,9 @@ class ModelledVehicle(ModelledEnv):
         from thruster_env.auv.rendering import Overlay
 
         names = {state.symbol: i for i, state in enumerate(model.states)}
+        if model.turns:
+            names, mean = {symbol: i for i, symbol in enumerate(SYMBOLS)}, np.array(angled_state(tuple(mean)))
+            names = {symbol: i for symbol, i in names.items() if i < len(mean)}
         std = np.sqrt(np.maximum(np.diag(cov), 0.0)).tolist()
         symbol_of = {"x": "x", "y": "y", "depth": "z", "phi": "phi", "theta": "theta", "psi": "psi", "u": "u"}
         known = {name: names[symbol] for name, symbol in symbol_of.items() if symbol in names}
@@ -107,6 +113,8 @@ class SegorogeniAUVEnv(ModelledVehicle, PlantEnv):
     | 6-8 | roll phi, pitch theta, yaw psi | rad |
     | 9-11 | position x north, y east, z down | m |
 
+    With `attitude="quaternion"` entries 6-9 are a unit quaternion, scalar first, and 10-12 the position.
+
     ## Reward
     | term | weight | default |
     |---|---|---|
@@ -128,7 +136,8 @@ class SegorogeniAUVEnv(ModelledVehicle, PlantEnv):
     Starts about a cruise at 1 m/s, N(mean, diag) with 0.05 m/s in u, 0.02 m/s and rad/s in the other velocities,
     0.01 rad and 0.01 m besides, unless `initial_state` says otherwise ({"speed": 0} for rest, as the papers), or
     `reset(options={"state": [..]})`. Truncated after 1200 steps (60 s); terminated where pitch is beyond 80 deg,
-    near which Euler angles end, or the state is not finite. There is no surface: z < 0 ends nothing.
+    near which Euler angles end (not with a quaternion), or the state is not finite. There is no surface: z < 0
+    ends nothing.
 
     ## Arguments
     The list, with units and defaults, is that of `thruster_env.auv.plant.make_plant` (the vehicle, its noise,
@@ -173,6 +182,8 @@ class SegorogeniAUVEnv(ModelledVehicle, PlantEnv):
         """The renderer's input from a report: truth, measurements, the path abreast and the actuators."""
         values = self._by_name(report)
         state, inputs = values["state"], values["inputs"]
+        if self.plant.attitude == QUATERNION:
+            state = angled_state(tuple(state))
         measured = dict(zip(self.plant.channels, values["measurement"], strict=True))
         return ChartEntry(
             time=report[TIME],
@@ -202,7 +213,7 @@ def action_space(plant: Plant) -> gym.spaces.Box:
 def at_depth(plant: Plant, depth: float) -> Plant:
     """The plant whose initial state has its mean at a depth [m]."""
     mean = plant.initial_mean.copy()
-    mean[Z] = depth
+    mean[-1] = depth
     return plant._replace(initial_mean=mean)
 
 

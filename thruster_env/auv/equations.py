@@ -19,9 +19,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.auv.dynamics import angle_rates, attitude_of, current_substep, in_earth_axes
+from thruster_env.auv.dynamics import (
+    ROTATING,
+    angle_rates,
+    angled_state,
+    attitude_of,
+    current_substep,
+    in_earth_axes,
+    rotating_substep,
+)
 from thruster_env.auv.paths import PIECE, Task, make_task, step_cost
-from thruster_env.auv.plant import CHANNELS, DIRECTIONS, MEASURED, STATES, SYMBOLS, Plant
+from thruster_env.auv.plant import (
+    CHANNELS_BY_ATTITUDE,
+    DIRECTIONS,
+    MEASURED,
+    QUATERNION,
+    STATES,
+    SYMBOLS,
+    VECTORS,
+    Plant,
+)
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS, REFERENCE_SIGNAL, cosine_and_sine
 from thruster_env.effects.effects import SPACING, Context, Moment, chain_of, chain_runner
 from thruster_env.effects.sensors import Reading
@@ -29,6 +46,7 @@ from thruster_env.env.copies import Page, PlantCopies, clipped, correlated, root
 from thruster_env.env.record import check_finite, record
 from thruster_env.graphs.graphs import where
 from thruster_env.graphs.values import Table, traceable
+from thruster_env.model.turns import move
 
 N = len(STATES)
 U, V, W, P, Q, R, PHI, THETA, PSI, X, Y, Z = range(N)  # places in a state
@@ -101,13 +119,39 @@ def off_path(pieces: Any, piece: Any, x, y, z) -> tuple[tuple, Any]:
     return (*errors, cosine, sine), piece
 
 
+def moved(x, w):
+    """The state with a quaternion, moved by an error of its tangent."""
+    return tuple(move(x, w, ROTATING))
+
+
+def by_vectors(down, field, velocity):
+    """Velocity to the north, to the east and down, and yaw, by measured directions of gravity and magnetic field.
+
+        d = down/|down|,  e = d x field/|d x field|,  n = e x d
+
+    Source: Black (1964), "A passive system for determining the attitude of a satellite", AIAA Journal 2(7).
+    """
+    (a, b, c), (x, y, z) = down, field
+    scale = 1.0 / np.sqrt(a * a + b * b + c * c)
+    a, b, c = a * scale, b * scale, c * scale
+    x, y, z = b * z - c * y, c * x - a * z, a * y - b * x
+    scale = 1.0 / np.sqrt(x * x + y * y + z * z)
+    x, y, z = x * scale, y * scale, z * scale
+    north = y * c - z * b, z * a - x * c, x * b - y * a
+    u, v, w = velocity
+    along = north[0] * u + north[1] * v + north[2] * w
+    return along, x * u + y * v + z * w, a * u + b * v + c * w, np.arctan2(x, north[0])
+
+
 def finite(error):
     """An error within LARGEST_ERROR; NaN, too, as the episode ends."""
     return where(abs(error) < LARGEST_ERROR, error, LARGEST_ERROR)
 
 
 @lru_cache(maxsize=64)
-def vehicle(kinds: tuple, channels: tuple[str, ...], substeps: int, has_torque: bool, steps_depth: bool) -> Page:
+def vehicle(
+    kinds: tuple, channels: tuple[str, ...], substeps: int, has_torque: bool, steps_depth: bool, attitude: str
+) -> Page:
     """The page of a vehicle.
 
     Args:
@@ -116,9 +160,18 @@ def vehicle(kinds: tuple, channels: tuple[str, ...], substeps: int, has_torque: 
         substeps: Runge-Kutta steps of a sample time.
         has_torque: whether the propeller's torque is an action of its own.
         steps_depth: whether the depth to keep steps up and down.
+        attitude: of the state, "euler" or "quaternion".
     """
-    act = chain_runner(dict(kinds))
-    measured_in = {SYMBOLS.index(name): i for i, name in enumerate(channels) if MEASURED[name] == name}
+    act, rotates = chain_runner(dict(kinds)), attitude == QUATERNION
+    substep = traceable(rotating_substep) if rotates else current_substep
+    measured_in = {SYMBOLS.index(name): i for i, name in enumerate(channels) if MEASURED.get(name) == name}
+    vectors = (
+        [[channels.index(f"{s}_{axis}") for axis in "xyz"] for s in "gm"] if set(VECTORS) <= set(channels) else []
+    )
+
+    def disturbed(x: Any, w: Any) -> tuple:
+        """The state moved by noise."""
+        return traceable(moved)(x, w) if rotates else tuple(a + b for a, b in zip(x, w, strict=True))
 
     def flow(p: Parameters, effects: dict | None, t: Moment) -> tuple[tuple, dict]:
         """The current to the north, to the east and down [m/s]."""
@@ -139,7 +192,7 @@ def vehicle(kinds: tuple, channels: tuple[str, ...], substeps: int, has_torque: 
         noise = correlated(p.r_root, t.draws.normals(MEASUREMENT, len(channels)))
         readings, memories = list[Reading](), dict[str, Any]()
         for i, name in enumerate(channels):
-            reading = Reading(traceable(CHANNELS[name].read)(x, (), (), ()) + noise[i], 1.0)
+            reading = Reading(traceable(CHANNELS_BY_ATTITUDE[attitude][name].read)(x, (), (), ()) + noise[i], 1.0)
             reading, memory = act(f"sensor {i}", p, reading, effects, t._replace(state=x))
             readings, memories = [*readings, reading], memories | memory
         return readings, memories
@@ -149,10 +202,17 @@ def vehicle(kinds: tuple, channels: tuple[str, ...], substeps: int, has_torque: 
         z = [readings[measured_in[i]].z if i in measured_in else 0.0 for i in range(N)]
         attitude = attitude_of(z[PHI], z[THETA])
         turning = angle_rates(attitude, z[P], z[Q], z[R])[2]
-        yaw = p.prior_mean[PSI] if m is None else m.reckoned[3] + p.dt * turning
+        yaw = (
+            (traceable(angled_state) if rotates else tuple)(p.prior_mean)[PSI]
+            if m is None
+            else m.reckoned[3] + p.dt * turning
+        )
         yaw = z[PSI] if PSI in measured_in else yaw
         speed = in_earth_axes(attitude, yaw, z[U], z[V], z[W])
-        position = p.prior_mean[X:]
+        if vectors:
+            down, field = (tuple(readings[i].z for i in part) for part in vectors)
+            *speed, yaw = traceable(by_vectors)(down, field, (z[U], z[V], z[W]))
+        position = p.prior_mean[-3:]
         if m is not None:
             moves = zip(m.reckoned, m.ground_speed, speed, strict=False)
             position = tuple(at + 0.5 * p.dt * (before + after) for at, before, after in moves)
@@ -181,7 +241,9 @@ def vehicle(kinds: tuple, channels: tuple[str, ...], substeps: int, has_torque: 
         along, across = cosine_and_sine(yaw)
         speed_error = readings[measured_in[U]].z - p.speed if U in measured_in else 0.0
         course = across * cosine - along * sine, along * cosine + across * sine
-        within_limits = (abs(x[THETA]) < STEEPEST) & (sum(map(abs, x)) < LARGEST)
+        within_limits = sum(map(abs, x)) < LARGEST
+        if not rotates:
+            within_limits = (abs(x[THETA]) < STEEPEST) & within_limits
         report = {
             "terminated": where(within_limits, 0.0, 1.0),
             "time": t.step * p.dt,
@@ -201,10 +263,10 @@ def vehicle(kinds: tuple, channels: tuple[str, ...], substeps: int, has_torque: 
     def begin(p: Parameters, t: Moment) -> tuple[Memory, dict]:
         current, flows = flow(p, None, t)
         noise = correlated(p.prior_root, t.draws.normals(INITIAL, N))
-        x = tuple(mean + w for mean, w in zip(p.prior_mean, noise, strict=True))
+        x = disturbed(p.prior_mean, noise)
         offset = step_depth(p, 0.0, t)
         readings, sensors = measure(p, x, None, t)
-        (aside, below, *_), piece = off_path(p.pieces, 0.0, x[X], x[Y], x[Z] - offset)
+        (aside, below, *_), piece = off_path(p.pieces, 0.0, x[-3], x[-2], x[-1] - offset)
         inputs = (0.0,) * 4
         return guide(p, None, x, inputs, current, (aside, below), piece, offset, readings, flows | sensors, t)
 
@@ -212,11 +274,11 @@ def vehicle(kinds: tuple, channels: tuple[str, ...], substeps: int, has_torque: 
         current, flows = flow(p, m.effects, t)
         inputs, planes = command(p, m.inputs, action)
         u = (*inputs, *current)
-        x = t.repeat(substeps, lambda x, of: current_substep(x, *of), m.x, (u, p.constants))
+        x = t.repeat(substeps, lambda x, of: substep(x, *of), m.x, (u, p.constants))
         noise = correlated(p.q_root, t.draws.normals(PROCESS, N))
-        x = tuple(f + w for f, w in zip(x, noise, strict=True))
+        x = disturbed(x, noise)
         readings, sensors = measure(p, x, m.effects, t)
-        (aside, below, *_), piece = off_path(p.pieces, m.piece, x[X], x[Y], x[Z] - m.offset)
+        (aside, below, *_), piece = off_path(p.pieces, m.piece, x[-3], x[-2], x[-1] - m.offset)
         per_plane = where(p.max_plane > 0.0, 1.0 / p.max_plane, 0.0)
         errors = finite(aside), finite(below), finite(x[U] - p.speed)
         stern, rudder = (angle * per_plane for angle in planes)
@@ -260,7 +322,8 @@ def page_of(plant: Plant, task: Task) -> tuple[Page, Parameters]:
     )
     kinds = tuple((name, kinds) for name, (kinds, _) in chains.items())
     has_torque = plant.propeller_torque is None
-    return vehicle(kinds, plant.channels, plant.substeps, has_torque, task.step_size > 0.0), parameters
+    steps_depth = task.step_size > 0.0
+    return vehicle(kinds, plant.channels, plant.substeps, has_torque, steps_depth, plant.attitude), parameters
 
 
 def decay(dt: float, time_constant: float) -> float:
@@ -271,7 +334,7 @@ def decay(dt: float, time_constant: float) -> float:
 class Simulation(NamedTuple):
     """Trajectories of a batch of B vehicles over K steps."""
 
-    states: np.ndarray  # (B, K + 1, 12)
+    states: np.ndarray  # (B, K + 1, 12), or 13 with a quaternion
     measurements: np.ndarray  # (B, K + 1, m)
     valid: np.ndarray  # (B, K + 1, m), false where a measurement is missing and the last one repeated
     current: np.ndarray  # (B, K + 1, 3), to the north, to the east and down [m/s]

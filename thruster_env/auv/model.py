@@ -22,12 +22,16 @@ from thruster_env.auv.dynamics import angle_rates, attitude_of, cruise_thrust, i
 from thruster_env.auv.parameters import VehicleParameters, checked
 from thruster_env.auv.plant import (
     ATTITUDE_INPUTS,
-    CHANNELS,
+    CHANNELS_BY_ATTITUDE,
     CRUISE_SPEED,
     CURRENT_STATES,
     MEASURED,
+    QUATERNION,
+    ROTATING_CHANNELS,
+    ROTATING_STATES,
     STATES,
     SYMBOLS,
+    VECTORS,
     Plant,
     channels_of,
     make_plant,
@@ -39,6 +43,7 @@ from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.matrices import scaled
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.env.copies import functions_of
+from thruster_env.model import rotations
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
@@ -138,6 +143,22 @@ def observation_of(channels: tuple[str, ...], count: int) -> tuple[Callable, Cal
     return functions_of(channels_of(channels, count), no_outputs, no_outputs, count)
 
 
+@makes_functions
+def rotating_functions(channels: tuple[str, ...], torque_is_input: bool) -> tuple[Callable, Callable]:
+    """One step and `observe` of a model with a quaternion; their Jacobians follow by tracing."""
+    source = f"move(x, {tuple_of(forces_of('motion', torque_is_input, False))}, c)"
+    reads: dict[str, Callable] = {f"read_{i}": ROTATING_CHANNELS[name].read for i, name in enumerate(channels)}
+    return (
+        written_out("transition", "x, u, c", source, move=dynamics.rotating_substep),
+        written_out("observe", "x, c", tuple_of(f"{name}(x, (), (), c)" for name in reads), **reads),
+    )
+
+
+def rotating_sinking_of(x, c):
+    """Rate of depth [m/s] of a state with a quaternion."""
+    return rotations.to_world(x[6:10], x[:3])[2]
+
+
 def speed_of(x, c):
     """Speed [m/s] over ground at components x of the state, floats or arrays."""
     return (x[0] * x[0] + x[1] * x[1] + x[2] * x[2]) ** 0.5
@@ -190,8 +211,9 @@ def auv_model(
         sensors: as `thruster_env.auv.plant.make_plant` takes them; None for those of the suite "default" that the
             states predict.
         integration: "runge-kutta", or "euler" as in the papers.
-        attitude: of "velocities" alone: "input" for phi and theta as two further inputs, "measured" for these as
-            the sensors measure them, see `thruster_env.auv.model`, "level" for zeros.
+        attitude: of "velocities": "input" for phi and theta as two further inputs, "measured" for these as the
+            sensors measure them, see `thruster_env.auv.model`, "level" for zeros. "quaternion", of "motion" and
+            "navigation", is the plant's, too: a `Rotation` for roll, pitch and yaw, whose errors P and Q have.
         parameter_factors: factors on fields of `VehicleParameters`, by which the assumed vehicle differs.
         operating_speed: speed straight ahead about which a Kalman filter linearises the model [m/s].
         current_std: of "current" alone: standard deviation of each component of the current at the start [m/s].
@@ -208,7 +230,11 @@ def auv_model(
     if sensors is None:
         states = "motion" if states is None else one_of("states", states, tuple(MODELS))
         known = SYMBOLS[: max(MODELS[states].count, 8 if attitude == "measured" else 0)]
+        if attitude == QUATERNION and states == "motion":
+            known = SYMBOLS[:9]
         sensors = [channel for channel in suite("default") if MEASURED[channel] in known]
+    if attitude == QUATERNION:
+        attitude, plant_arguments = "input", {**plant_arguments, "attitude": QUATERNION}
     return model_of_plant(
         make_plant(sensors=sensors, **plant_arguments),
         states=states,
@@ -240,15 +266,29 @@ def model_of_plant(
 ) -> StateSpaceModel:
     """The model of a plant, exact unless changed; see `auv_model` for the arguments."""
     states = _smallest(plant.channels) if states is None else one_of("states", states, tuple(MODELS))
+    rotates = plant.attitude == QUATERNION
+    if rotates:
+        states = one_of("states of an attitude 'quaternion'", states, ("motion", "navigation"))
+        one_of("integration of an attitude 'quaternion'", integration, METHODS[:1])
+    elif attitude == QUATERNION:
+        raise ValueError(
+            "attitude must be the plant's, make_plant(attitude='quaternion'), but the plant's is 'euler'"
+        )
     method = one_of("integration", integration, METHODS)
     attitude = one_of("attitude", attitude, ATTITUDES)
     n, torque_is_input = MODELS[states].count, plant.propeller_torque is None
     as_inputs, observed = split_channels(plant.channels, states, attitude)
-    observe, observe_jacobian = observation_of(tuple(plant.channels[i] for i in observed), n)
+    channels = tuple(plant.channels[i] for i in observed)
     if parameter_factors is not None:
         changed = scaled(plant.parameters, parameter_factors, VehicleParameters._fields)
         plant = plant._replace(parameters=checked(changed))
-    move, move_jacobian = transition_of(states, method, torque_is_input, attitude)
+    if rotates:
+        n = 9 if states == "motion" else 12  # errors
+        move, observe = rotating_functions(channels, torque_is_input)
+        move_jacobian = observe_jacobian = None
+    else:
+        move, move_jacobian = transition_of(states, method, torque_is_input, attitude)
+        observe, observe_jacobian = observation_of(channels, n)
     inputs = plant.inputs + (ATTITUDE_INPUTS if states == "velocities" and attitude != "level" else ())
     speed = positive("operating_speed", operating_speed)
     thrust = cruise_thrust(plant.parameters, speed)
@@ -267,6 +307,21 @@ def model_of_plant(
         q = covariance("process_noise_cov", process_noise_cov, n)
     if measurement_noise_cov is not None:
         r = covariance("measurement_noise_cov", measurement_noise_cov, len(observed))
+    if rotates:
+        all_states = ROTATING_STATES[: n - 2]
+        outputs = {"U": OUTPUTS["U"], "z_dot": (OUTPUTS["z_dot"][0], rotating_sinking_of)}
+        prior_mean = plant.initial_mean[: n + 1]
+        cruise, low = (np.insert(part, 6, start) for part, start in ((cruise, 1.0), (-high, -1.0)))
+        cruise[7:10], low[7:10], high = 0.0, -1.0, np.insert(high, 6, 1.0)
+        high[7:10] = 1.0
+    else:
+        all_states, prior_mean, low = (
+            (*STATES, *CURRENT_STATES)[:n],
+            np.append(plant.initial_mean, np.zeros(2))[:n],
+            -high,
+        )
+        outputs = {symbol: output for symbol, output in OUTPUTS.items() if n > 6 or symbol == "U"}
+    low[0] = 0.0
     return StateSpaceModel(
         transition=move,
         observe=observe,
@@ -274,19 +329,19 @@ def model_of_plant(
         observe_jacobian=observe_jacobian,
         process_noise_cov=q,
         measurement_noise_cov=r,
-        prior_mean=np.append(plant.initial_mean, np.zeros(2))[:n],
+        prior_mean=prior_mean,
         prior_cov=prior_factor * _block(plant.initial_cov, n, std**2),
         inputs=len(inputs),
         constants=plant.constants,
         substeps=plant.substeps,
         operating_state=cruise,
         operating_input=operating_input,
-        state_low=np.where(np.arange(n) == 0, 0.0, -high),
+        state_low=low,
         state_high=high,
-        states=(*STATES, *CURRENT_STATES)[:n],
+        states=all_states,
         input_quantities=inputs,
-        measurements=[CHANNELS[plant.channels[i]].quantity for i in observed],
-        outputs={symbol: output for symbol, output in OUTPUTS.items() if n > 6 or symbol == "U"},
+        measurements=[CHANNELS_BY_ATTITUDE[plant.attitude][name].quantity for name in channels],
+        outputs=outputs,
     )
 
 
@@ -301,8 +356,8 @@ MODEL_ARGUMENTS = tuple(inspect.signature(model_of_plant).parameters)[1:]
 
 def _smallest(channels: tuple[str, ...]) -> str:
     """The smaller of the two closed models that predicts all channels."""
-    within = SYMBOLS[: MODELS["motion"].count]
-    return "motion" if all(MEASURED[channel] in within for channel in channels) else "navigation"
+    within = (*SYMBOLS[: MODELS["motion"].count], *VECTORS)
+    return "motion" if all(MEASURED.get(channel, channel) in within for channel in channels) else "navigation"
 
 
 def _block(cov: np.ndarray, n: int, of_current: float) -> np.ndarray:
@@ -336,6 +391,10 @@ def continuous_auv(**arguments) -> ContinuousModel:
         ValueError: if an argument is wrong, and for a Q that no white noise has.
     """
     model = auv_model(**arguments)
+    if model.turns:
+        inputs = tuple_of(forces_of("motion", "K_prop" in [part.symbol for part in model.input_quantities], False))
+        rates = written_out("rates", "x, u, c", f"move(x, {inputs}, c)", move=dynamics.rotating_rates)
+        return ContinuousModel.of(model, rates)
     states = next(name for name, steps in MODELS.items() if steps.count == model.n)
     symbols = [quantity.symbol for quantity in model.input_quantities]
     return ContinuousModel.of(model, rates_of(states, "K_prop" in symbols, "phi" in symbols))

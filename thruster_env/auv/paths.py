@@ -17,7 +17,7 @@ import numpy as np
 
 from thruster_env.auv.dynamics import cruise_thrust, navigation_substep
 from thruster_env.auv.parameters import SEGOROGENI, derive_constants
-from thruster_env.auv.plant import CRUISE_SPEED, SYMBOLS, Plant
+from thruster_env.auv.plant import CRUISE_SPEED, QUATERNION, SYMBOLS, Plant
 from thruster_env.core.checks import as_floats, between, one_of, positive, short_repr, takes_arguments_of, within
 from thruster_env.env.model_env import remembered
 from thruster_env.env.plant_data import checked_weights
@@ -305,6 +305,8 @@ class DepthAndCourse:
         plant, task = base.plant, base.task
         if not getattr(base, "single_env", type(base)).observes_errors:
             raise ValueError(f"an env must observe its path, as SegorogeniAUVPath-v0 does, but got {base}")
+        if plant.attitude == QUATERNION:
+            raise ValueError("attitude must be 'euler' for this controller, but the env's is 'quaternion'")
         names = plant.channels if one_of("seen", seen, SEEN) == "measurement" else SYMBOLS
         missing = [name for name in ("u", "q", "r", "theta") if name not in names]
         if missing:

@@ -13,7 +13,7 @@ whose model has no current takes it for a disturbance.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,9 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.auv.dynamics import required_substeps
+from thruster_env.auv.dynamics import angled_state, required_substeps, rotating_state
 from thruster_env.auv.parameters import PRESETS, Constants, VehicleParameters, derive_constants, preset_parameters
 from thruster_env.core.checks import at_least, between, finite, one_of, positive, short_repr, within
+from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.effects.effects import (
     ConstantSignal,
@@ -45,7 +46,9 @@ from thruster_env.env.plant_data import (
     initial_distribution,
     sensor_effects,
 )
+from thruster_env.model import rotations
 from thruster_env.model.quantities import Quantity
+from thruster_env.model.turns import Rotation
 
 # The current that a vehicle goes in: signals to the north, to the east and down [m/s], the same everywhere.
 
@@ -198,6 +201,10 @@ INSTRUMENTS: dict[str, Instrument] = {
         "Xsens MTi-G-700: 2 m circular error; HoloOcean's works above 1 m depth",
         at_surface=True,
     ),
+    "gravity": Instrument(
+        ("g_x", "g_y", "g_z"), 0.005, 20.0, "the AHRS's angle, as a direction in the body's axes"
+    ),
+    "field": Instrument(("m_x", "m_y", "m_z"), 0.0175, 20.0, "the compass's, in three axes"),
     "papers": Instrument(
         ("u", "v", "w", "r"), 1e-3, None, "Ngatini, Apriliani, Nurhadi (2017), slides: R = 1e-6, every step"
     ),
@@ -213,6 +220,10 @@ SUITES: dict[str, tuple[str, ...]] = {
     "papers": ("papers",),
 }
 """Suites of instruments by name: "default" for navigation, "motion" for what eight states predict, ..."""
+
+VECTORS = (*INSTRUMENTS["gravity"].channels, *INSTRUMENTS["field"].channels)
+ROTATING_SUITES = {**SUITES, "vectors": ("dvl", "gyros", "gravity", "field", "depth")}
+"""Those of a vehicle whose attitude is a quaternion: "vectors" measures directions, which no attitude spoils."""
 
 
 def _of_state(symbol: str, name: str | None = None) -> Channel:
@@ -241,10 +252,59 @@ CHANNELS: dict[str, Channel] = {
 }
 """Channels by name, of a plant of twelve states."""
 
-MAX_CHANNELS = len(CHANNELS)
-
 MEASURED = {name: name.removesuffix("_gps") for name in CHANNELS}
 """The state that each channel measures."""
+
+
+# A vehicle whose attitude is a quaternion: states (nu, quaternion, x, y, z), and channels that read them.
+
+
+ATTITUDES = EULER, QUATERNION = "euler", "quaternion"
+ROTATING_STATES = (*STATES[:6], Rotation("attitude"), *STATES[9:])
+DIP = math.radians(-32.0)  # of the magnetic field, which points up south of the magnetic equator; assumed
+FIELD = (math.cos(DIP), 0.0, math.sin(DIP))
+DOWN = (0.0, 0.0, 1.0)
+
+
+@makes_functions
+def _rotating_reading(index: int) -> Callable:
+    def read(x, y, u, c):
+        return x[index]
+
+    return read
+
+
+@makes_functions
+def _angle_reading(index: int) -> Callable:
+    def read(x, y, u, c):
+        return angled_state(x)[index]
+
+    return read
+
+
+@makes_functions
+def _direction_reading(direction: tuple[float, float, float], axis: int) -> Callable:
+    def read(x, y, u, c):
+        return rotations.to_body(x[6:10], direction)[axis]
+
+    return read
+
+
+def _rotating_channels() -> dict[str, Channel]:
+    result = {}
+    for name, channel in CHANNELS.items():
+        index = SYMBOLS.index(MEASURED[name])
+        is_angle = 6 <= index < 9
+        read = _angle_reading(index) if is_angle else _rotating_reading(index + (index >= 9))
+        quantity = channel.quantity._replace(angle=is_angle and name != "theta")
+        result[name] = Channel(quantity, channel.variance, read)
+    for symbol, what, direction in (("g", "gravity", DOWN), ("m", "the magnetic field", FIELD)):
+        for axis, letter in enumerate("xyz"):
+            name = f"{symbol}_{letter}"
+            quantity = Quantity(f"direction of {what}, {letter}", name)
+            variance = default_instrument(name).deviation ** 2
+            result[name] = Channel(quantity, variance, _direction_reading(direction, axis))
+    return result
 
 
 @cache
@@ -262,9 +322,10 @@ def channels_of(names: tuple[str, ...], states: int) -> tuple[Channel, ...]:
     )
 
 
-def suite(name: str) -> dict[str, Instrument]:
+def suite(name: str, attitude: str = EULER) -> dict[str, Instrument]:
     """The instrument of each channel of a suite; ValueError if there is no such suite."""
-    instruments = [INSTRUMENTS[instrument] for instrument in SUITES[one_of("sensors", name, tuple(SUITES))]]
+    suites = SUITES if attitude == EULER else ROTATING_SUITES
+    instruments = [INSTRUMENTS[instrument] for instrument in suites[one_of("sensors", name, tuple(suites))]]
     return {channel: instrument for instrument in instruments for channel in instrument.channels}
 
 
@@ -272,6 +333,12 @@ def default_instrument(channel: str) -> Instrument:
     """The instrument that measures a channel unless a suite has another."""
     return next(instrument for instrument in INSTRUMENTS.values() if channel in instrument.channels)
 
+
+ROTATING_CHANNELS = _rotating_channels()
+"""Channels by name, of a plant whose attitude is a quaternion."""
+
+CHANNELS_BY_ATTITUDE = {EULER: CHANNELS, QUATERNION: ROTATING_CHANNELS}
+MAX_CHANNELS = len(ROTATING_CHANNELS)
 
 DEFAULT_DT = 0.05  # [s]; one Runge-Kutta step follows the vehicle to 2e-5 of its range
 DEFAULT_MAX_THRUST = 4.0  # [N], for 1.19 m/s; with it 14 deg of stern plane, if held, pitch by 80 deg
@@ -298,13 +365,14 @@ class Plant(NamedTuple):
     substeps: int  # Runge-Kutta steps a sample time
     process_noise_cov: np.ndarray  # (12, 12), a step
     measurement_noise_cov: np.ndarray  # (m, m)
-    initial_mean: np.ndarray  # (12,)
+    initial_mean: np.ndarray  # (12,), or (13,) with a quaternion
     initial_cov: np.ndarray  # (12, 12)
     sensors: dict[str, tuple[Effect, ...]]  # effects by channel; the m channels in their order
     instruments: dict[str, Instrument]  # by channel
     current: Current = {}  # signals by direction
     propeller_lag: float = 0.0  # time constant from the commanded thrust to the propeller's [s]
     plane_lag: float = 0.0  # and of both planes [s]
+    attitude: str = EULER  # or "quaternion"
 
     @property
     def constants(self) -> Constants:
@@ -353,6 +421,7 @@ def make_plant(
     propeller_lag: float = 0.0,
     plane_lag: float = 0.0,
     substeps: int | None = None,
+    attitude: str = EULER,
 ) -> Plant:
     """Make a plant from plain arguments, the same ones that the env takes.
 
@@ -375,11 +444,15 @@ def make_plant(
             propeller's is some 1 s.)
         plane_lag: that of both planes [s]. (Servos have some 0.1 s.) Filters model neither lag.
         substeps: Runge-Kutta steps per sample time; None for the fewest that reach `operating.ONE_STEP_ACCURACY`.
+        attitude: of the state, "euler" for roll, pitch and yaw, which end at a pitch of 90 deg, or "quaternion",
+            with which the vehicle may loop: the state has 13 numbers, and the covariances are of its error, three
+            angles about the body's axes in the place of roll, pitch and yaw. `initial_state` has twelve numbers as
+            before.
 
     Raises:
         ValueError: if an argument is wrong; the message states the rule and the value.
     """
-    parameters = preset_parameters(preset)
+    parameters, attitude = preset_parameters(preset), one_of("attitude", attitude, ATTITUDES)
     dt = between("dt", positive("dt", dt), *SAMPLE_TIMES, "s")
     max_thrust = between("max_thrust", positive("max_thrust", max_thrust), *THRUSTS, "N")
     max_plane = between("max_plane", max_plane, *PLANE_RANGE, "rad")
@@ -392,7 +465,9 @@ def make_plant(
         *("twelve", "speed", "U"),
         lambda speed: positive("the speed of initial_state", speed, zero_allowed=True) * at_speed,
     )
-    effects, instruments = _sensors(sensors, dt)
+    effects, instruments = _sensors(sensors, dt, attitude)
+    if attitude == QUATERNION:
+        mean = np.array(rotating_state(tuple(mean.tolist())))
     if measurement_noise_cov is None:
         measurement_noise_cov = [instrument.deviation**2 for instrument in instruments.values()]
     if substeps is None:
@@ -413,24 +488,25 @@ def make_plant(
         make_current(current),
         positive("propeller_lag", propeller_lag, zero_allowed=True),
         positive("plane_lag", plane_lag, zero_allowed=True),
+        attitude,
     )
 
 
-def _sensors(sensors, dt: float) -> tuple[dict[str, tuple[Effect, ...]], dict[str, Instrument]]:
+def _sensors(sensors, dt: float, attitude: str) -> tuple[dict[str, tuple[Effect, ...]], dict[str, Instrument]]:
     """Effects and instrument of each channel."""
     if sensors is None or isinstance(sensors, str):
-        instruments = suite("default" if sensors is None else sensors)
+        instruments = suite("default" if sensors is None else sensors, attitude)
         return {channel: _timing(instrument, dt) for channel, instrument in instruments.items()}, instruments
     if not isinstance(sensors, Mapping):
         if not hasattr(sensors, "__iter__"):
             rule = "sensors must be a suite's name, a list of channels or a mapping from them"
             raise ValueError(f"{rule}, but got {short_repr(sensors)}")
         names = list(sensors)
-        known = [one_of("a channel of sensors", name, tuple(CHANNELS)) for name in names]
+        known = [one_of("a channel of sensors", name, tuple(CHANNELS_BY_ATTITUDE[attitude])) for name in names]
         sensors = {name: _timing(default_instrument(name), dt) for name in known}
         if len(sensors) != len(names):
             raise ValueError(f"sensors must name each channel once, but got {short_repr(names)}")
-    effects = sensor_effects(sensors, CHANNELS, VEHICLE_SENSOR_EFFECTS, MAX_CHANNELS)
+    effects = sensor_effects(sensors, CHANNELS_BY_ATTITUDE[attitude], VEHICLE_SENSOR_EFFECTS, MAX_CHANNELS)
     return effects, {channel: default_instrument(channel) for channel in effects}
 
 

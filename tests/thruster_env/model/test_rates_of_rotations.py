@@ -144,7 +144,7 @@ def test_a_continuous_model_is_found_again():
         ContinuousModel.of(model, lambda x, u, c: (u[0], u[1], u[2], 1.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize("kind", ["ekf", "ukf"])
+@pytest.mark.parametrize("kind", ["ekf", pytest.param("ukf", marks=pytest.mark.slow)])
 def test_filters_take_it(kind):
     """Compiled as in Python; with exact measurements of a constant rate the attitude is the exponential.
 
