@@ -25,6 +25,7 @@ from filters.algebra.operations import (
     wrap,
 )
 from filters.algebra.points import log_density, outer
+from filters.algebra.tangents import move, reset
 from filters.engine.belief import Belief
 from filters.filter import PageFilter
 from filters.gaussian.extended import add_process_noise, propagate
@@ -85,8 +86,9 @@ def update_variational(model, x, P, z):
     used = uncorrelated(measured, R)
     K, any_measured = divide(P @ H.T, HPH + used), exceeds(count(measured), 0.0)
     extras = {"V": choose(any_measured, R * later, V), "nu": choose(any_measured, later, nu)}
-    x = wrap(x + K @ v, model.state_angles)
-    return x, joseph(P, K, H, used), v, S, log_density(v, S, measured), extras
+    d = K @ v
+    P = reset(model, joseph(P, K, H, used), x, d)
+    return move(model, x, d), P, v, S, log_density(v, S, measured), extras
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,6 +123,7 @@ class VariationalBayesFilter(PageFilter):
     """
 
     name: ClassVar[str] = "vb"
+    rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise, update_variational, initial=initial_variational)
     unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
     varying_noise: ClassVar[bool] = False  # R is in the belief, and starts at the model's
@@ -142,7 +145,7 @@ class VariationalBayesFilter(PageFilter):
     def estimated_noise(self, belief: Belief) -> np.ndarray:
         """The estimate V/nu of R (m, m) in a belief."""
         m = self.model.m
-        extras = belief.extras[self.model.shape.feed :]
+        extras = belief.extras[self.model.any_shape.feed :]
         return extras[: m * m].reshape(m, m) / extras[m * m]
 
 
@@ -165,8 +168,9 @@ def update_robust(model, x, P, z):
         weight = (d + count(measured)) / (d + trace(divide(E, R)))
     R = R / weight
     K = divide(P @ H.T, HPH + R)
-    x = wrap(x + K @ v, model.state_angles)
-    return x, joseph(P, K, H, R), v, S, log_density(v, S, measured), {"weight": weight}
+    change = K @ v
+    P = reset(model, joseph(P, K, H, R), x, change)
+    return move(model, x, change), P, v, S, log_density(v, S, measured), {"weight": weight}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -197,6 +201,7 @@ class RobustExtendedKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "ekf-robust"
+    rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise, update_robust, initial=initial_robust)
     unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
     degrees_of_freedom: float = 4.0
@@ -235,7 +240,8 @@ def update_sage_husa(model, x, P, z):
         after = bounded_step(Q, outer(correction, correction), old - P, for_q)
         Q = choose(exceeds(model.extras["predicted"], 0.0), after, Q)
     extras = {"R": R, "Q": Q, "predicted": constant(0.0, for_r)}
-    return wrap(x + correction, model.state_angles), P, v, S, log_density(v, S, measured), extras
+    P = reset(model, P, x, correction)
+    return move(model, x, correction), P, v, S, log_density(v, S, measured), extras
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -267,6 +273,7 @@ class SageHusaFilter(PageFilter):
     """
 
     name: ClassVar[str] = "sage-husa"
+    rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(
         propagate, add_process_noise_sage_husa, update_sage_husa, initial=initial_sage_husa
     )
@@ -297,10 +304,10 @@ class SageHusaFilter(PageFilter):
     def estimated_noise(self, belief: Belief) -> np.ndarray:
         """The estimate of R (m, m) in a belief."""
         m = self.model.m
-        first = self.model.shape.feed
+        first = self.model.any_shape.feed
         return belief.extras[first : first + m * m].reshape(m, m).copy()
 
     def estimated_process_noise(self, belief: Belief) -> np.ndarray:
-        """The estimate of Q (n, n) in a belief."""
-        n, first = self.model.n, self.model.shape.feed + self.model.m**2
+        """The estimate of Q (n, n) in a belief, of errors if the state has rotations."""
+        n, first = self.model.t, self.model.any_shape.feed + self.model.m**2
         return belief.extras[first : first + n * n].reshape(n, n).copy()

@@ -88,6 +88,11 @@ def reset(model, p, x, d):
     return sym(G @ p @ G.T)
 
 
+def after_reset(model, D, x, d):
+    """G D: errors about x, the columns of D or a vector, in the tangent at move(model, x, d)."""
+    return reset_slopes(x, d, model.turns) @ D if model.turns else D
+
+
 def reset_back(model, p, x, d):
     """G^-1 P G^-1': a covariance about move(model, x, d) in the tangent at x."""
     if not model.turns:

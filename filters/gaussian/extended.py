@@ -275,7 +275,8 @@ def update_schmidt(model, x, P, z):
     v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     S = sym(H @ P @ H.T + R)
     K = model.own.corrected @ divide(P @ H.T, S)
-    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, measured)
+    d = K @ v
+    return move(model, x, d), reset(model, joseph(P, K, H, R), x, d), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -290,7 +291,7 @@ class SchmidtKalmanFilter(PageFilter):
     its uncertainty. Without considered states this is the extended filter.
 
     Attributes:
-        considered: indices of these states; -1 is the last one.
+        considered: indices of these states, of components of the error in a state with rotations; -1 is the last.
 
     Raises:
         ValueError: if an index is not that of a state.
@@ -300,17 +301,18 @@ class SchmidtKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "schmidt"
+    rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise, update_schmidt)
     considered: Any = ()
 
     def __post_init__(self):
-        considered = indices_of("considered", self.considered, self.model.n)
+        considered = indices_of("considered", self.considered, self.model.t)
         object.__setattr__(self, "considered", considered)
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
         """J."""
-        return {"corrected": np.diag([float(i not in self.considered) for i in range(self.model.n)])}
+        return {"corrected": np.diag([float(i not in self.considered) for i in range(self.model.t)])}
 
 
 # The H-infinity filter: it bounds the errors that the worst noise of a given size can cause.
@@ -319,7 +321,7 @@ class SchmidtKalmanFilter(PageFilter):
 def add_process_noise_h_infinity(model, x, P):
     """Add Q and guard against the worst noise, at the end of a step."""
     W, P = model.own.weights, sym(P + model.Q)
-    D = eye(x) - sym(W @ P @ W.T) * model.own.theta
+    D = eye(P) - sym(W @ P @ W.T) * model.own.theta
     return x, sym(P + sym(divide(P @ W.T, D) @ (W @ P)) * model.own.theta)
 
 
@@ -338,7 +340,7 @@ class HInfinityFilter(PageFilter):
 
     Attributes:
         theta: the bound, above 0.
-        scale: (n,), of the errors, in units of the states; the prior's standard deviations if None.
+        scale: (n,), of the errors, in their units; the prior's standard deviations if None.
 
     Raises:
         ValueError: if a number is not positive.
@@ -348,6 +350,7 @@ class HInfinityFilter(PageFilter):
     """
 
     name: ClassVar[str] = "h-infinity"
+    rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise_h_infinity, update)
     theta: float = 0.01
     scale: Any = None
@@ -355,14 +358,14 @@ class HInfinityFilter(PageFilter):
     def __post_init__(self):
         object.__setattr__(self, "theta", positive("theta", self.theta))
         if self.scale is not None:
-            scale = vector("scale", self.scale, self.model.n)
+            scale = vector("scale", self.scale, self.model.t)
             object.__setattr__(self, "scale", np.array([positive("scale", value) for value in scale]))
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
         """Theta and W; a state whose scale is zero has no weight."""
         scale = np.sqrt(np.diag(self.model.prior_cov)) if self.scale is None else self.scale
-        weights = np.divide(1.0, scale, out=np.zeros(self.model.n), where=scale > 0.0)
+        weights = np.divide(1.0, scale, out=np.zeros(self.model.t), where=scale > 0.0)
         return {"theta": self.theta, "weights": np.diag(weights)}
 
     @property

@@ -12,7 +12,7 @@ from filters.algebra.matrices import operation
 from filters.algebra.operations import divide, mask_missing, of_best_gain, present, sym, uncorrelated, wrap
 from filters.algebra.points import first, log_density, on_circle, ones, outer, root, square, units, without_first
 from filters.algebra.roots import hstack, part, triangle, vstack, zeros
-from filters.algebra.tangents import differences, move, points_around, reset
+from filters.algebra.tangents import after_reset, differences, move, points_around, reset
 from filters.baselines import index_of
 from filters.filter import PageFilter
 from filters.gaussian.extended import initial_root, root_result
@@ -199,13 +199,13 @@ class UnscentedKalmanFilter(PageFilter):
 
 
 def represent_cubature(model, x, P):
-    """The points of a belief."""
-    return cubature_points(model, x, root(P))
+    """The points of a belief; with rotations the mean comes before them."""
+    return unscented_points(model, x, root(P)) if model.turns else cubature_points(model, x, root(P))
 
 
 def cubature_points(model, x, L):
     """The points around the mean."""
-    return outer(x, ones(without_first(units(x)))) + (L * model.own.spread) @ without_first(units(x))
+    return points_around(model, x, (L * model.own.spread) @ without_first(units(first(L))))
 
 
 def cubature_moments(model, Y, angles):
@@ -217,13 +217,24 @@ def cubature_moments(model, Y, angles):
 
 def add_process_noise_cubature(model, X):
     """Mean and covariance of the points, with Q added, at the end of a step."""
-    x, D = cubature_moments(model, X, model.state_angles)
-    return wrap(x, model.state_angles), square(D) * model.own.weight + model.Q
+    x, D = cubature_state(model, X)
+    return x, square(D) * model.own.weight + model.Q
+
+
+def cubature_state(model, X):
+    """Mean of states at the points, and deviations from it, in its tangent."""
+    if not model.turns:
+        x, D = cubature_moments(model, X, model.state_angles)
+        return wrap(x, model.state_angles), D
+    D = differences(model, without_first(X), first(X))
+    s = (D @ ones(D)) * model.own.weight
+    return move(model, first(X), s), after_reset(model, D - outer(s, ones(D)), first(X), s)
 
 
 def update_cubature(model, x, P, z):
     """Update with the measurement z; NaN marks missing channels."""
-    (g, w), L, U, measured = model.own, root(P), without_first(units(x)), present(z)
+    (g, w), L, measured = model.own, root(P), present(z)
+    U = without_first(units(first(L)))
     y, D = cubature_moments(model, model.h(cubature_points(model, x, L)), model.measurement_angles)
     D, R = mask_missing(measured, D), uncorrelated(measured, model.R)
     v = mask_missing(measured, wrap(z - y, model.measurement_angles))
@@ -231,7 +242,8 @@ def update_cubature(model, x, P, z):
     S = square(D) * w + R
     K = divide(C, S)
     rest = square((L * g) @ U - K @ D) * w + sym(K @ R @ K.T)
-    return wrap(x + K @ v, model.state_angles), of_best_gain(rest, P, C, S, K), v, S, log_density(v, S, measured)
+    d, P = K @ v, of_best_gain(rest, P, C, S, K)
+    return move(model, x, d), reset(model, P, x, d), v, S, log_density(v, S, measured)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -246,18 +258,20 @@ class CubatureKalmanFilter(PageFilter):
 
     The last line equals P - K S K'; sums of squares, all covariances are symmetric and positive by construction.
     The moments are exact for cubic f and h. The filter has no parameters: its moments are those of an unscented
-    filter with alpha = 1 and beta = kappa = 0, but it does not evaluate f and h at the mean.
+    filter with alpha = 1 and beta = kappa = 0, but it does not evaluate f and h at the mean, only f if a state has
+    rotations, whose deviations begin there.
 
     Source: Arasaratnam, Haykin (2009), "Cubature Kalman filters", IEEE Trans. Automatic Control 54(6), section IV.
     """
 
     name: ClassVar[str] = "ckf"
+    rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate_points, add_process_noise_cubature, update_cubature, represent_cubature)
 
     @property
     def parameters(self) -> dict[str, float]:
         """The distance of the points, and their weight."""
-        n = self.model.n
+        n = self.model.t
         return {"spread": n**0.5, "weight": 0.5 / n}
 
 

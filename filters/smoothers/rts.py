@@ -24,9 +24,9 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.algebra.operations import eye, quotient, sym
-from filters.algebra.points import root, square, units, without_first
+from filters.algebra.points import first, ones, root, square, units, without_first
 from filters.algebra.roots import careful
-from filters.algebra.tangents import differences, move, reset, reset_back
+from filters.algebra.tangents import after_reset, differences, move, reset, reset_back
 from filters.engine.batch import Estimates
 from filters.engine.belief import memory_offsets
 from filters.filter import Filter, PageFilter
@@ -252,8 +252,12 @@ def _smoother(relation: Relation, page: Page, functions: Functions, shape: Shape
 
 def link_unscented(model, x, P, X):
     """The link of an unscented filter."""
-    g, w, L, U = model.own.spread, model.own.weight, root(P), without_first(units(x))
-    mean, s, D = sigma_points.unscented_moments(model, X, model.state_angles)
+    g, w, L = model.own.spread, model.own.weight, root(P)
+    U = without_first(units(first(L)))
+    D = differences(model, without_first(X), first(X))
+    s = (D @ ones(D)) * w
+    mean = move(model, first(X), s)
+    s, D = (after_reset(model, part, first(X), s) for part in (s, D))
     C = (L @ (U @ D.T)) * (w * g)
     G = quotient(C, careful(scatter(model, D, s) + model.Q))
     left = scatter(model, (L * g) @ U - G @ D, G @ s)
@@ -262,8 +266,9 @@ def link_unscented(model, x, P, X):
 
 def link_cubature(model, x, P, X):
     """The link of a cubature filter."""
-    (g, w), L, U = model.own, root(P), without_first(units(x))
-    mean, D = sigma_points.cubature_moments(model, X, model.state_angles)
+    (g, w), L = model.own, root(P)
+    U = without_first(units(first(L)))
+    mean, D = sigma_points.cubature_state(model, X)
     C = (L @ (U @ D.T)) * (w * g)
     G = quotient(C, careful(square(D) * w + model.Q))
     return mean, G, square((L * g) @ U - G @ D) * w + sym(G @ model.Q @ G.T)
@@ -286,7 +291,7 @@ RELATIONS: dict[type[Filter], Relation] = {
 def relation_of(filter_: Filter, what: str, alternatives: str = "") -> Relation:
     """The relation of a filter for `smooth_backwards`; ValueError if it has no such smoother."""
     kind = type(filter_)
-    if RELATIONS.get(kind) is not LINEARISED:
+    if kind not in RELATIONS:
         refuse_rotations(filter_.model)
     if filter_.model.bounds:
         raise ValueError(f"{what} needs a model without bounds, but got {filter_.model.bounds}")

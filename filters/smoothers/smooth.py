@@ -31,7 +31,6 @@ from thruster_env.core.sources import joiner, vector_part, written_out
 from thruster_env.core.threads import spread
 from thruster_env.model.shape import number_offsets
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import refuse_rotations
 
 # The smoother of filters for several models: each pair of successive modes by a step of Rauch, Tung, Striebel.
 #
@@ -466,12 +465,11 @@ class WithSmoother:
         Raises ValueError for another lag, and a filter without a smoother of this kind.
         """
         self._runs, self._lag = runs, at_least("smoothing_lag", lag, 0)
-        refuse_rotations(filter_.model)
         self._relation = relation_of(filter_, "a smoothing_lag")
         assert isinstance(filter_, PageFilter)
         self._filter = filter_
-        n, model = filter_.model.n, filter_.kernel_model
-        self._means, self._covs = np.zeros((count, lag + 1, n)), np.zeros((count, lag + 1, n, n))
+        n, t, model = filter_.model.n, filter_.model.t, filter_.kernel_model
+        self._means, self._covs = np.zeros((count, lag + 1, n)), np.zeros((count, lag + 1, t, t))
         self._restarted = np.zeros((count, lag + 1), dtype=bool)
         self._inputs, self._age = np.zeros((count, lag, model.inputs)), np.zeros(count, dtype=int)
         self._numbers = self._first_numbers(lag)
@@ -533,5 +531,5 @@ class WithSmoother:
         runs = self._runs
         if isinstance(runs, Session):
             return runs.mean[None], runs.cov[None], np.array([float(runs.divergences)])
-        n = self._means.shape[2]
-        return runs.part("mean", n), runs.part("cov", n, n), runs.part("divergences")
+        n, t = self._means.shape[2], self._covs.shape[3]
+        return runs.part("mean", n), runs.part("cov", t, t), runs.part("divergences")

@@ -30,7 +30,18 @@ from thruster_env.model.turns import Rotation
 
 DT, GYRO, WALK, SENSOR, BIAS = 0.1, 2e-3, 2e-4, 0.05, 0.02
 GRAVITY, FIELD = (0.0, 0.0, 1.0), (0.0, 0.6, -0.8)
-TAKE_ROTATIONS = "ekf", "iekf", "fading", "ukf"
+TAKE_ROTATIONS = {  # each with parameters that make it another one, with others
+    "ekf": ({}, "ekf", {}),
+    "iekf": ({"iterations": 1}, "ekf", {}),
+    "fading": ({"fading": 1.0}, "ekf", {}),
+    "schmidt": ({}, "ekf", {}),
+    "h-infinity": ({"theta": 1e-12}, "ekf", {}),
+    "vb": ({"forgetting_factor": 1.0, "prior_weight": 1e14}, "ekf", {}),
+    "ekf-robust": ({"degrees_of_freedom": 1e14}, "ekf", {}),
+    "sage-husa": ({"forgetting_factor": 1.0}, "ekf", {}),
+    "ckf": ({}, "ukf", {"beta": 0.0}),
+    "ukf": ({"beta": 0.0}, "ckf", {}),
+}
 
 
 def advance(x, u, c):
@@ -318,10 +329,84 @@ def test_every_filter_runs_on_rotations_or_refuses_them(name):
     extra = {"low": -np.ones(7), "high": np.ones(7)} if name == "fuzzy" else {}
     make = lambda: FILTERS[name](model=attitude_model(), **extra)  # noqa: E731
     if name in TAKE_ROTATIONS:
-        assert make().kernels().t == 6
+        assert make().kernel_model.t == 6
     else:
         with pytest.raises(ValueError, match="is of rotations|must have an affine model"):
             make().kernels()
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", list(TAKE_ROTATIONS)[2:-1])
+def test_filters_of_rotations_have_the_estimates_of_their_kin(name, data):
+    """Parameters at their limits make one of the other."""
+    parameters, other, of_other = TAKE_ROTATIONS[name]
+    arguments = {"inputs": data[1][:2, :5], "measurements": data[2][:2, :6]}
+    models = attitude_model(), attitude_model()
+    first, second = (
+        filters.make_filter(kind, model, **more)
+        for kind, model, more in zip((name, other), models, (parameters, of_other), strict=True)
+    )
+    a, b = (filters.run(filter_, **arguments) for filter_ in (first, second))
+    np.testing.assert_allclose(a.means, b.means, atol=1e-12)
+    np.testing.assert_allclose(a.covs, b.covs, atol=1e-12)
+    np.testing.assert_allclose(a.log_likelihoods, b.log_likelihoods, atol=1e-7)
+    if name == "ckf":
+        a, b = (filters.smooth(filter_, **arguments) for filter_ in (first, second))
+        np.testing.assert_allclose(a.means, b.means, atol=1e-12)
+        np.testing.assert_allclose(a.covs, b.covs, atol=1e-12)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_the_smoother_by_points_is_that_of_matrices(data):
+    """A step backwards from 20 degrees, with later estimates in the tangent of the predicted mean."""
+    filter_ = filters.UnscentedKalmanFilter(model=attitude_model(degrees=20.0), beta=0.0)
+    arguments = {"inputs": data[1][0, :1], "measurements": data[2][0, :2]}
+    estimates, smoothed = filters.run(filter_, **arguments), filters.smooth(filter_, **arguments)
+    (mean, later), (P, later_P) = estimates.means, estimates.covs
+    q, bias, before = naive_points(mean, P)
+    q = q * Turned.from_rotvec((arguments["inputs"][0] - bias) * DT)
+    D = np.hstack([(q[0].inv() * q).as_rotvec(), bias - bias[0]])[1:]
+    s, G = D.sum(axis=0) / 12.0, np.eye(6)
+    G[:3, :3] = rotations.left_jacobian(-s[:3])
+    D = (D - s) @ G.T
+    predicted = D.T @ D / 12.0 + filter_.model.process_noise_cov
+    gain = before[1:].T @ D / 12.0 @ np.linalg.inv(predicted)
+    turned = ((q[0] * Turned.from_rotvec(s[:3])).inv() * Turned.from_quat(later[[1, 2, 3, 0]])).as_rotvec()
+    change, J = np.concatenate([turned, later[4:] - bias[0] - s[3:]]), np.eye(6)
+    J[:3, :3] = rotations.inverse_left_jacobian(-turned)
+    d, back = gain @ change, P + gain @ (J @ later_P @ J.T - predicted) @ gain.T
+    G[:3, :3] = rotations.left_jacobian(-d[:3])
+    error = Turned.from_quat(smoothed.means[0, [1, 2, 3, 0]]).inv() * Turned.from_quat(mean[[1, 2, 3, 0]])
+    assert (error * Turned.from_rotvec(d[:3])).magnitude() < 1e-14
+    np.testing.assert_allclose(smoothed.means[0, 4:], mean[4:] + d[3:], atol=1e-15)
+    np.testing.assert_allclose(smoothed.covs[0], G @ back @ G.T, atol=1e-14)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_considered_rotation_keeps_its_prior(data):
+    """Indices are of the errors: the bias is corrected, the attitude only propagated."""
+    filter_ = filters.make_filter("schmidt", attitude_model(), considered=(0, 1, 2))
+    estimates = filters.run(filter_, inputs=data[1][0, :1], measurements=data[2][0, :2])
+    np.testing.assert_array_equal(estimates.means[0, :4], (1.0, 0.0, 0.0, 0.0))
+    assert np.all(estimates.means[1, 4:] != 0.0)
+    with pytest.raises(ValueError, match="considered must"):
+        filters.make_filter("schmidt", attitude_model(), considered=(6,))
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_fixed_lag_in_an_env_takes_rotations():
+    """Its estimate of two steps ago is that of `smooth` with this lag."""
+    model = attitude_model(degrees=20.0)
+    env = filters.EstimateState(Sensor(), model=model, filter="ekf", smoothing_lag=2)
+    _, info = env.reset(seed=1)
+    z = [np.array([*GRAVITY, *FIELD], dtype=np.float32).astype(float)]
+    for _ in range(3):
+        *_, info = env.step(np.array([0.3, -0.2, 0.1]))
+        z.append(z[0])
+    data = {"inputs": np.tile(np.float32([0.3, -0.2, 0.1]).astype(float), (3, 1)), "measurements": np.array(z)}
+    smoothed = filters.smooth(filters.ExtendedKalmanFilter(model=model), lag=2, **data)
+    np.testing.assert_allclose(info["smoothed"], smoothed.means[1], atol=1e-12)
+    np.testing.assert_allclose(info["smoothed_cov"], smoothed.covs[1], atol=1e-12)
 
 
 def with_heading(x, u, c):
@@ -391,13 +476,11 @@ def test_every_other_path_refuses_them():
     refusals = (
         lambda: filters.ExtendedKalmanFilter(model=model, form="square-root").kernels(),
         lambda: filters.ExtendedKalmanFilter(model=model, form="ud").kernels(),
-        lambda: filters.smooth(filters.UnscentedKalmanFilter(model=model), **data),
         lambda: filters.run(filter_, **data).to_frame(),
         lambda: consistency_report(filters.run(filter_, **batch), None),
         lambda: ForeignFilter(model=model, estimator=Estimator()),
         lambda: filters.torch(filter_),
         lambda: write_project(filter_, "a folder"),
-        lambda: filters.EstimateState(Sensor(), model=model, filter="ekf", smoothing_lag=2),
         lambda: posterior_bound(model, data["inputs"][None]),
         lambda: path_bound(model, data["inputs"][None]),
         lambda: simulate(model, np.zeros((1, 2)), data["inputs"][None]),

@@ -199,7 +199,8 @@ def refuse_rotations(model: Any) -> None:
         kinds = " and ".join(dict.fromkeys(f"{turn.kind}s" for turn in model.turns))
         raise ValueError(
             f"states must be numbers and angles here, but {names} {'is' if len(model.turns) == 1 else 'are'} of "
-            f"{kinds}: 'ekf', 'iekf', 'ukf' and 'fading' take these, in filters.run, sessions, wrapped envs and C"
+            f"{kinds}: 'ekf', 'iekf', 'ukf', 'ckf' and their kin take these, in filters.run, sessions, wrapped "
+            "envs and C"
         )
 
 
