@@ -35,7 +35,7 @@ from thruster_env.logs.read import read_log
 from thruster_env.logs.write import EXACT, write_columns, write_log
 from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.simulate import inputs_until, simulate
-from tuning.identification.objective import Objective
+from tuning.identification.objective import likelihood_of
 from tuning.problems.log_problem import LogProblem, as_rows
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Coordinates, Parameter
@@ -299,8 +299,8 @@ def test_blocks_of_logs_and_steps_of_any_length():
     assert np.isnan(data_of_blocks.measurements[:, 0]).all()  # the input until then is in none of their rows
     assert not np.isnan(data_of_blocks.measurements[:, 1:10]).any()
     free = Coordinates([Parameter("series", 0.01, 0.2, default=0.05)])
-    likelihood_of = Objective(logs, lambda series: cell().replace(constants=Cell(series=series)), free)
-    blocks = likelihood_of.data_at(free.start()).measurements
+    likelihood = likelihood_of(logs, lambda series: cell().replace(constants=Cell(series=series)), free)
+    blocks = likelihood.data_at(free.start()).measurements
     assert np.isnan(blocks[:, 0]).all() and not np.isnan(blocks[:, 1:]).any()
     rows = as_rows(read_log(cycled(60)[0], cell(), grid=False))
     z = rows.measurements[None].copy()

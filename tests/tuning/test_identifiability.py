@@ -8,7 +8,7 @@ from filters import KalmanFilter, affine_model, run
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
 from tuning.api.tune import run_tuning
-from tuning.likelihood import family, identifiability
+from tuning.likelihood import identifiability
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import (
     Identifiability,
@@ -142,7 +142,7 @@ def test_fishers_information_gives_the_judgement_of_differences(name, kind, monk
     plan = Plan(kind, (scenario,))
     given = oracle_choice(kind, scenario), plan.scenarios, plan.training_data(), plan.space()
     differences = identify(*given)
-    monkeypatch.setattr(family, "LEAST_NUMBERS", 0)
+    monkeypatch.setattr(identifiability, "LEAST_NUMBERS", 0)
     information = identify(*given)
     assert information.identified.tolist() == differences.identified.tolist()
     widths = [np.log(found.factors) for found in (information, differences)]

@@ -143,7 +143,7 @@ def test_outliers_beyond_a_gate_are_left_out(data, found):
     normal, gated = (
         identify(spoilt, pendulum, FREE, start=TRUTH, starts=1, gate=gate) for gate in (math.inf, 4.5)
     )
-    left_out = gated.objective.data.outliers
+    left_out = gated.objective.parts[0].data.outliers
     assert (left_out & outliers).sum() > 0.97 * outliers.sum() and (left_out & ~outliers).sum() < 5
     for name in ("offset", "r"):
         assert abs(normal.values[name] - found.values[name]) > 3 * found.standard_errors[name]

@@ -12,7 +12,7 @@ from thruster_env.core.streams import filter_keys
 from thruster_env.logs.log import in_any_steps
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.objective import Objective
+from tuning.identification.objective import likelihood_of
 from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates, Parameter
 
@@ -225,7 +225,7 @@ PAIRS = [*((of_module, one) for one in CAPTURED), (of_constants_in_continuous_ti
 def assert_equal(expected, make, data, tolerance=1e-6):
     """Log-likelihood and derivatives of two factories are the same, and no parameter is without sensitivities."""
     coordinates = Coordinates(FREE)
-    one, other = (Objective(data, factory, coordinates) for factory in (expected, make))
+    one, other = (likelihood_of(data, factory, coordinates) for factory in (expected, make))
     assert other.rough == ()
     at = coordinates.of([1.8, 0.9, 0.05])
     for a, b in zip(one(at), other(at), strict=True):
@@ -244,7 +244,7 @@ def test_parameters_in_a_closure_have_the_derivatives_of_constants(as_python, ex
 
 def test_a_factory_that_sets_a_global_for_its_functions_is_refused(as_python):
     with pytest.raises(ValueError, match="must not read values that its factory sets, but 'gain' changes those"):
-        Objective(recorded(steps=30), of_a_global, Coordinates(FREE))
+        likelihood_of(recorded(steps=30), of_a_global, Coordinates(FREE))
 
 
 def test_parameters_in_a_closure_are_constants_of_steps_of_any_length_too(as_python):
@@ -261,14 +261,14 @@ def test_a_number_in_a_function_that_differs_elsewhere_only_is_refused(as_python
         return in_closure(r=r).replace(transition=lambda x, u, c: (other * x[0] - rate * x[0] + gain * u[0],))
 
     coordinates = Coordinates(FREE)
-    objective = Objective(recorded(steps=30), make, coordinates)
+    objective = likelihood_of(recorded(steps=30), make, coordinates)
     with pytest.raises(ValueError, match="transition must differ .* pass the parameters to it as constants"):
         objective(coordinates.of([7.77, 1.0, 0.04]))
 
 
 def test_blocks_have_scores_of_their_own_along_parameters_without_derivatives(as_python):
     data, coordinates = recorded(steps=30), Coordinates(FREE)
-    one, other = (Objective(data, made, coordinates) for made in (of_module, of_floats_alone))
+    one, other = (likelihood_of(data, made, coordinates) for made in (of_module, of_floats_alone))
     assert other.rough == (0, 1)
     at = coordinates.of([2.0, 1.0, 0.04])
     expected, found = one(at), other(at)
@@ -281,7 +281,7 @@ def test_blocks_have_scores_of_their_own_along_parameters_without_derivatives(as
 
 def test_two_parameters_without_derivatives_are_correlated_as_the_log_likelihood_says(as_python):
     data, coordinates = recorded(steps=30), Coordinates(FREE)
-    objective, at = Objective(data, of_floats_alone, coordinates), coordinates.of([2.0, 1.0, 0.04])
-    smooth, step = Objective(data, of_module, coordinates), 1e-3 * np.eye(3)
+    objective, at = likelihood_of(data, of_floats_alone, coordinates), coordinates.of([2.0, 1.0, 0.04])
+    smooth, step = likelihood_of(data, of_module, coordinates), 1e-3 * np.eye(3)
     of_gradients = np.array([(smooth(at - one).gradient - smooth(at + one).gradient) / 2e-3 for one in step])
     np.testing.assert_allclose(objective(at).information[:2, :2], of_gradients[:2, :2], rtol=2e-2)

@@ -19,7 +19,7 @@ from thruster_env.logs.log import Log, in_any_steps, in_steps
 from thruster_env.logs.read import read_log
 from thruster_env.model.continuous import noise_of_densities
 from tuning.evaluation.evaluate import evaluate
-from tuning.identification.objective import Objective
+from tuning.identification.objective import likelihood_of
 from tuning.identification.profiles import validate
 from tuning.logs.problem import family_of
 from tuning.problems.log_problem import LogProblem
@@ -120,7 +120,7 @@ def test_rows_with_step_ratios_have_the_numbers_of_live(name, make, request):
 def objective_of(data, grid):
     log = read_log(data, plant().at(DT), grid=grid, dt=DT)
     family = family_of([log], FREE, model=plant())
-    return Objective(family.data, family.model, Coordinates(family.free))
+    return likelihood_of(family.data, family.model, Coordinates(family.free))
 
 
 @pytest.mark.slow

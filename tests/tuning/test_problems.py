@@ -16,6 +16,7 @@ from tuning.evaluation import held_out as summary
 from tuning.evaluation.baselines import Scaled
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.likelihood.family import Family
+from tuning.likelihood.objective import Objective
 from tuning.problems import model_problem
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
@@ -176,15 +177,15 @@ def test_several_sensors_are_kept_by_a_tuned_file(make, tmp_path, monkeypatch):
 def test_the_gradient_of_correlated_sensors_is_that_of_their_likelihood():
     problem = pair(steps=20, first_scored_step=5)
     data, choice, numbers = problem.data([1]), untuned_choice("ekf", problem), parameters("ekf", problem)
-    family = Family(choice, problem, numbers)
+    family = Family(choice, problem, numbers, data)
+    likelihood = Objective([family])
     point = family.coordinates.of([one.get(choice) for one in numbers])
 
     def log_likelihood(step):
-        return family.derivatives(point + step, data)[0][0, 0]
+        return likelihood.value(point + step)
 
     steps = 1e-4 * np.eye(len(point))
     differences = [(log_likelihood(step) - log_likelihood(-step)) / 2e-4 for step in steps]
-    found = family.derivatives(point, data)[0][0, 1:]
-    np.testing.assert_allclose(found, differences, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(likelihood(point).gradient, differences, rtol=1e-4, atol=1e-5)
     model = family.at(point)[0]
     np.testing.assert_allclose(model.measurement_noise_cov, problem.truth.measurement_noise_cov)

@@ -37,7 +37,7 @@ from tuning.api.read_logs import recorded_runs
 from tuning.api.result import Result, drawn, frame
 from tuning.identification.identify import STARTS, check_excitation
 from tuning.identification.identify import identify as identify_runs
-from tuning.identification.objective import Objective
+from tuning.identification.objective import likelihood_of
 from tuning.identification.profiles import Profile, Validation, profile_figure, profiles, validate
 from tuning.identification.result import Identification
 from tuning.logs.problem import AnyStepFamily, check_offsets, family_of, remarks, split_runs, write_found
@@ -374,7 +374,7 @@ def identify(
     parameters: tuple[Parameter, ...] = with_ranges(family.free, _ranges(ranges), begin)
     check_offsets(parameters, runs)
     coordinates, unseen = Coordinates(parameters), tuple(predicted)
-    objective = Objective(family.data, family.model, coordinates, filter=filter, predicted=unseen)
+    objective = likelihood_of(family.data, family.model, coordinates, filter=filter, predicted=unseen)
     check_excitation(objective, runs, coordinates.start())
     with console.status("identifying ...") as status:
 

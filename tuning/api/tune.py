@@ -45,8 +45,9 @@ from tuning.evaluation.baselines import noise_estimated, same_filter
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import check_keepable
 from tuning.likelihood.family import check_gradient
-from tuning.likelihood.gradient import OF_STATES, tune_by_gradient
+from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import identify
+from tuning.likelihood.objective import OF_STATES
 from tuning.methods.registry import DEFAULT, GRADIENT_METHOD, METHODS, ONLY, find_method
 from tuning.methods.task import Budget, Refused, Task
 from tuning.problems.assumed import AssumedProblem, within

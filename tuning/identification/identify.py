@@ -19,7 +19,7 @@ from thruster_env.core.executors import IN_PROCESS, TaskMap
 from thruster_env.core.streams import START_POINTS, derived_generator
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.objective import Objective
+from tuning.identification.objective import likelihood_of, of_changed, recorded
 from tuning.identification.result import (
     Identification,
     NullTest,
@@ -33,6 +33,7 @@ from tuning.identification.result import (
 )
 from tuning.identification.starts import estimates_of, runs_of, starts_of
 from tuning.likelihood.ascent import Ascent, climb
+from tuning.likelihood.objective import Objective
 from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates, Parameter
 from tuning.search.study import stop_on_interrupt
@@ -83,7 +84,8 @@ class WithoutOutliers:
 
 def without_outliers(objective: Objective, outliers: np.ndarray, gate: float) -> Objective:
     """The same objective without the outliers, which are those beyond a gate."""
-    return objective.with_changes(data=WithoutOutliers(objective.data, outliers, objective.first_model), gate=gate)
+    runs = recorded(objective)
+    return of_changed(objective, data=WithoutOutliers(runs.data, outliers, runs.first_model), gate=gate)
 
 
 # Whether logs excite the free parameters.
@@ -208,7 +210,7 @@ def identify(
     if gate < LEAST_GATE:
         raise ValueError(f"gate must be at least {LEAST_GATE:g} standard deviations, but got {gate}")
     coordinates = Coordinates(free)
-    objective = Objective(data, model, coordinates, filter=filter, degrees=degrees, predicted=predicted)
+    objective = likelihood_of(data, model, coordinates, filter=filter, degrees=degrees, predicted=predicted)
     first = coordinates.start(dict(start or {}))
     points = [first, *_others(coordinates, first, starts, seed)]
     with stop_on_interrupt() as asked:
@@ -261,7 +263,7 @@ def _with_starts(objective: Objective, first: np.ndarray, simulation_first: bool
     At the start of the search a run may seem not to: the model may be far off there. So the model is identified
     with free starts of these runs, and whether they are needed is asked again.
     """
-    if objective.first_model.turns:
+    if recorded(objective).first_model.turns:
         return objective.with_changes(starts=_starts_at(objective, first))
     if not math.isfinite(objective.value(first)) or objective.moves_prior(first):
         return objective
@@ -341,8 +343,9 @@ def from_start(
 
 def _climb_from(objective: Objective, point, simulation_first: bool, stop, tell) -> Ascent:
     bounds = objective.coordinates.low, objective.coordinates.high
-    if simulation_first and not objective.first_model.turns:  # without a filter's correction attitudes drift
-        simulation = objective.with_changes(simulation=True)
+    is_attitude = bool(recorded(objective).first_model.turns)  # without a filter's correction attitudes drift
+    if simulation_first and not is_attitude:
+        simulation = of_changed(objective, simulation=True)
         nearest = climb(simulation, point, *bounds, stop=stop, iterations=15)
         objective.evaluations += simulation.evaluations
         if objective.value(nearest.at) > objective.value(point):

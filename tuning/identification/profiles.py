@@ -20,6 +20,7 @@ from thruster_env.core.text_tables import verbatim
 from thruster_env.logs.log import Log
 from thruster_env.model.simulate import inputs_until
 from thruster_env.model.state_space import StateSpaceModel
+from tuning.identification.objective import of_changed
 from tuning.identification.result import Identification
 from tuning.identification.starts import estimates_of, starts_of
 from tuning.likelihood.ascent import climb
@@ -203,7 +204,7 @@ def validate(
     """
     objective = identification.objective
     if data is not None:
-        objective = objective.with_changes(data=data, starts=None)
+        objective = of_changed(objective, data=data, starts=None)
     points = {
         "start": objective.coordinates.of([identification.start[name] for name in identification.names]),
         "identified": identification.at,

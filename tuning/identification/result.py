@@ -25,9 +25,9 @@ from thruster_env.model.continuous import noise_for_dt, same_dt
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.clocks import CLOCK
 from tuning.identification.family import ModelFamily
-from tuning.identification.objective import Objective, lost_information
 from tuning.likelihood.ascent import Ascent, climb
 from tuning.likelihood.identifiability import COMPANION, KNOWN_WITHIN, TWO_SIDED
+from tuning.likelihood.objective import Objective, lost_information
 from tuning.problems.problem import Coordinates
 
 LEGS = 25  # iterations of the other parameters, at most
@@ -188,7 +188,7 @@ class Identification(NamedTuple):
     @property
     def left_out(self) -> int:
         """Number of samples that were left out as outliers."""
-        return int(np.sum(getattr(self.objective.data, "outliers", 0)))
+        return int(np.sum(getattr(self.objective.parts[0].data, "outliers", 0)))
 
     @property
     def evaluations(self) -> int:
@@ -341,7 +341,8 @@ def covariances_of(objective: Objective, best: Ascent) -> tuple[np.ndarray, np.n
 
     Both include the information lost with the samples beyond a gate (`objective.lost_information`).
     """
-    width, lost = objective.coordinates.high - objective.coordinates.low, lost_information(objective.gate)
+    width = objective.coordinates.high - objective.coordinates.low
+    lost = lost_information(objective.gate)
     information, scores = best.found.information, best.found.scores
     return lost * covariance(information, scores, width), lost * covariance(information, scores[:0], width)
 

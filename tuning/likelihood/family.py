@@ -1,4 +1,4 @@
-"""A filter's model as a function of tuned parameters, and scores of runs with their derivatives along these."""
+"""Runs of a problem, and the model that a filter assumes of them as a function of tuned parameters."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from filters.differentiated.recursion import LIKELIHOOD, Wanted
-from filters.differentiated.runs import KINDS, ModelSlopes, Truth, derivatives, has_derivatives
+from filters.differentiated.runs import KINDS, ModelSlopes, has_derivatives
 from filters.estimators.foreign import is_foreign
-from filters.filter import PageFilter
+from filters.filter import Filter, PageFilter
 from filters.registry import filter_type, make_filter
 from thruster_env.core.checks import one_of
 from thruster_env.model.state_space import StateSpaceModel
+from tuning.likelihood.objective import Part
 from tuning.likelihood.parametric import ParametricModel
 from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates, Parameter, Problem
@@ -27,12 +27,9 @@ from tuning.search.parameters import (
     correlation_slopes,
     correlations_of,
     full_covariance,
-    model_parameters,
     obeying,
 )
-from tuning.search.space import Choice
-
-LEAST_NUMBERS = 8  # number of parameters from which the information is faster than differences
+from tuning.search.space import Choice, neutral
 
 # Q or R as a function of tuned parameters, with exact derivatives.
 
@@ -116,25 +113,29 @@ def check_gradient(name: str, what: str = "filter") -> None:
         one_of(what, name, DIFFERENTIABLE)
 
 
-class Family:
-    """The models that a problem's filter assumes, by the coordinates (p,) of parameters.
+class Family(Part):
+    """Runs of a problem, and the models that its filter assumes, by the coordinates (p,) of parameters.
 
     Args:
         choice: of one of the `DIFFERENTIABLE` filters; its other parameters are held.
         problem: makes the models.
         parameters: the p parameters.
+        data: the runs.
 
     Raises:
         ValueError: if a parameter is a whole number, or changes functions of the model and not its numbers alone.
     """
 
-    def __init__(self, choice: Choice, problem: Problem, parameters: Sequence[Parameter]):
+    def __init__(self, choice: Choice, problem: Problem, parameters: Sequence[Parameter], data: Data):
         """Find out whether all parameters are of Q and R, of which derivatives are known."""
+        self.data, self.leads_in, self.scale = data, problem.leads_in, problem.scale
         self.coordinates, self._choice, self._problem = Coordinates(parameters), choice, problem
+        values = [(parameter.get(choice), neutral(parameter.name)) for parameter in parameters]
+        self.untuned = np.array([other if value is None else value for value, other in values], dtype=np.float64)
         if any(parameter.tied or parameter.held for parameter in parameters):
             self._choice = choice = obeying(choice, parameters)
-        self._filter = make_filter(choice.name, self._model(choice), **choice.numbers)
-        self._base, self._noise = self._filter.model, None
+        self.used = make_filter(choice.name, self.model_of(choice), **choice.numbers)
+        self._base, self._noise, self.states = self.used.model, None, self.used.model.n
         settings = [((parameter.place, 1.0), *parameter.tied) for parameter in parameters]  # by each parameter
         kinds = ProcessVariance, MeasurementVariance, Correlation
         if all(isinstance(position, kinds) for positions in settings for position, _ in positions):
@@ -149,78 +150,23 @@ class Family:
                 f"but {name} changes its functions"
             )
 
-    @property
-    def states(self) -> int:
-        """Number of states of the models."""
-        return self._base.n
-
-    def at(self, point: np.ndarray) -> tuple[StateSpaceModel, ModelSlopes]:
+    def at(self, point: np.ndarray, indices: Sequence[int] | None = None) -> tuple[StateSpaceModel, ModelSlopes]:
         """The model at coordinates, and its derivatives by them: exact of Q and R, else central differences."""
+        chosen = list(range(len(point)) if indices is None else indices)
         if self._noise is not None:
             values, units = self.coordinates.values(point), self.coordinates.units
             (q, by_q), (r, by_r) = (noise.at(values, units) for noise in self._noise)
             model = self._base.replace(process_noise_cov=q, measurement_noise_cov=r)
-            return model, ModelSlopes.of(model, len(point), process_noise_cov=by_q, measurement_noise_cov=by_r)
-        return self._models.at(point), self._models.slopes(point, range(len(point)))
-
-    def derivatives(
-        self,
-        point: np.ndarray,
-        data: Data,
-        *,
-        score: str = LIKELIHOOD,
-        information: bool = False,
-        truth: Truth | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Scores of B runs with their gradients, (B, 1 + p), and Fisher's information, (B, p, p), if wanted.
-
-        The lead-in of runs, in which the filter settles, is left out; so is what a run was padded with.
-        """
-        return self._along(*self.at(point), data, score, information, truth)
-
-    def by_noise(
-        self, choice: Choice, data: Data, *, score: str = LIKELIHOOD, truth: Truth | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Scores of B runs, (B,), and the derivatives of their sum by the matrices Q, (n, n), and R, (m, m).
-
-        d score = tr(G_Q dQ) + tr(G_R dR),   G symmetric
-        """
-        model = self._model(choice)
-        q, r = symmetric_units(model.n), symmetric_units(model.m)
-        still = np.zeros((len(r), model.n, model.n)), np.zeros((len(q), model.m, model.m))
-        moves = {"process_noise_cov": np.concatenate([q, still[0]])}
-        moves["measurement_noise_cov"] = np.concatenate([still[1], r])
-        scores, _ = self._along(model, ModelSlopes.of(model, len(q) + len(r), **moves), data, score, False, truth)
-        total = scores[:, 1:].sum(axis=0)
-        halves = [
-            np.tensordot(gradient, unit, 1) for gradient, unit in ((total[: len(q)], q), (total[len(q) :], r))
-        ]
-        by_q, by_r = (0.5 * (half + np.diag(np.diag(half))) for half in halves)
-        return scores[:, 0], by_q, by_r
-
-    def _along(
-        self, model: StateSpaceModel, slopes: ModelSlopes, data: Data, score: str, information: bool, truth
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """What `derivatives` returns, of a model with its slopes."""
-        wanted = Wanted(information, constants=bool(slopes.constants.any()), tails=False, score=score)
-
-        def of(runs: Data) -> tuple[np.ndarray, np.ndarray]:
-            arguments = model, runs.seen.inputs, runs.seen.measurements, slopes, wanted
-            out, information_of_runs = derivatives(*arguments, truth=truth, used=self._filter)
-            return out[:, 0], information_of_runs
-
-        result = of(data)
-        if truth is not None or not (self._problem.leads_in and data.first_scored):
-            return result
-        before = of(data.beginning)
-        return result[0] - before[0], result[1] - before[1]
+            moves = {"process_noise_cov": by_q[chosen], "measurement_noise_cov": by_r[chosen]}
+            return model, ModelSlopes.of(model, len(chosen), **moves)
+        return self._models.at(point), self._models.slopes(point, chosen)
 
     def choice_at(self, point: np.ndarray) -> Choice:
         """The choice at coordinates."""
         return self._with(self.coordinates.values(point).tolist())
 
     def _made(self, **values: float) -> StateSpaceModel:
-        return self._model(self._with(values.values()))
+        return self.model_of(self._with(values.values()))
 
     def _with(self, values: Iterable[float]) -> Choice:
         choice = self._choice
@@ -228,52 +174,11 @@ class Family:
             choice = parameter.set(choice, value)
         return choice
 
-    def _model(self, choice: Choice) -> StateSpaceModel:
+    def filter_at(self, point: np.ndarray) -> Filter:
+        """The filter at coordinates."""
+        return self.choice_at(point).filter(self._problem)
+
+    def model_of(self, choice: Choice) -> StateSpaceModel:
+        """The model of a choice, as the filter runs on it."""
         model = self._problem.started_for(choice.name, self._problem.model(**choice.model))
         return make_filter(choice.name, model).kernel_model
-
-
-def symmetric_units(size: int) -> np.ndarray:
-    """The symmetric matrices with one entry, or two mirrored ones, of 1: (n (n + 1) / 2, n, n)."""
-    pairs = [(i, j) for i in range(size) for j in range(i + 1)]
-    units = np.zeros((len(pairs), size, size))
-    for unit, (i, j) in zip(units, pairs, strict=True):
-        unit[i, j] = unit[j, i] = 1.0
-    return units
-
-
-def known_information(
-    choice: Choice,
-    scenarios: Sequence[Problem],
-    data: Sequence[Data],
-    names: Sequence[str],
-    values: np.ndarray,
-    where: Sequence[str] = (),
-) -> np.ndarray | None:
-    """Fisher information on the logarithms of a Kalman filter's parameters in each of B runs, (B, p, p).
-
-    None for other filters, and where a parameter changes the model's functions or is on another scale. It takes
-    the time of about fifteen runs of the filter; differences take two runs for each pair of parameters.
-
-    Args:
-        choice: choice of one filter type; its other parameters are held.
-        scenarios: the problems.
-        data: for each scenario, its runs.
-        names: names of the p parameters.
-        values: at which the information is taken, (p,).
-        where: relations among the model's numbers.
-    """
-    if not has_gradient(choice.name) or len(names) < LEAST_NUMBERS:
-        return None
-    matrices = []
-    for scenario, runs in zip(scenarios, data, strict=True):
-        free = model_parameters(scenario, where=where)
-        known = {parameter.name: parameter for parameter in free if parameter.log}
-        if not set(names) <= set(known):
-            return None
-        try:
-            family = Family(choice, scenario, [known[name] for name in names])
-            matrices.append(family.derivatives(np.log(values), runs, information=True)[1])
-        except ValueError:  # more than numbers changes
-            return None
-    return np.concatenate(matrices)

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.consistency.nees import pooled_mean
-from filters.differentiated import recursion
-from filters.differentiated.runs import ModelSlopes, Truth
-from thruster_env.core.checks import one_of
-from thruster_env.core.sources import is_array
-from thruster_env.model.state_space import StateSpaceModel
-from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.ascent import Evaluation, lbfgs
 from tuning.likelihood.family import Family, check_gradient
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
+from tuning.likelihood.objective import Objective
 from tuning.problems.data import Data
 from tuning.problems.problem import Parameter, Problem
-from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
+from tuning.search.objectives import LIKELIHOOD
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
-from tuning.search.space import Choice, neutral, untuned_choice
+from tuning.search.space import Choice, untuned_choice
 
-OF_STATES = {  # objectives on the true states: what of them is summed over steps
-    SCORE: recursion.SQUARES,
-    MSE: recursion.SQUARES,
-    LOG_SCORE: recursion.LOG_SCORE,
-}
 BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from the optimum
 STEP = 1e-3  # in coordinates, of the differences of gradients that give the Hessian
 FLAT = 1e-12  # curvature relative to the largest one, below which a direction counts as flat
@@ -39,157 +28,17 @@ COARSE = 1e-9  # relative decrease of -log L that ends a search for a model of m
 LINEAR_WITHIN = 2.5  # a quarter of the range, in coordinates of parameters on linear scales
 
 
-class RunsObjective:
-    """A function of coordinates that is to be maximised, and its gradient, for each run of some problems.
-
-    It is the log-likelihood of a run; or minus the sum of an objective's terms over the scored steps of a run. Of
-    several problems the mean of their objectives counts, as in a study, and the likelihood of all their runs.
-
-    The score, sum_i sqrt(M_i) / (n s_i) with M_i the mean square error of state i over all runs and s_i its scale,
-    is that of squares with the weights w_i = 1 / (n s_i sqrt(M_i)), and its derivative half of theirs.
-
-    Args:
-        choice: of a Kalman filter.
-        problems: make its models, which have the same parameters.
-        data: of each problem.
-        parameters: the p parameters.
-        objective: "likelihood", "score", "mse" or "log-score".
-        watch: called with this goal, the coordinates and what was found there, after each evaluation.
-
-    Raises:
-        ValueError: for another objective, one on true states without these, or a parameter that has no gradient.
-    """
-
-    def __init__(
-        self,
-        choice: Choice,
-        problems: Sequence[Problem],
-        data: Sequence[Data],
-        parameters: Sequence[Parameter],
-        objective: str = LIKELIHOOD,
-        watch: Callable[[RunsObjective, np.ndarray, Evaluation], None] = lambda goal, point, evaluation: None,
-    ):
-        """Find the truth that counts."""
-        self._watch = watch
-        self.objective = one_of("objective", objective, (LIKELIHOOD, *OF_STATES))
-        self._choice, self._problems, self._data = choice, tuple(problems), tuple(data)
-        self._families = [Family(choice, problem, parameters) for problem in problems]
-        self._truths = [self._truth(*those) for those in zip(problems, data, self._families, strict=True)]
-        self.coordinates = self._families[0].coordinates
-        self.steps = sum(int(runs.scored_counts.sum()) for runs in data)
-
-    def __call__(self, point: np.ndarray, information: bool = False) -> Evaluation:
-        """The sum over all runs at coordinates, with Fisher's information in the innovations if that is wanted."""
-        blocks, matrices = [], []
-        parts = zip(self._problems, self._data, self._families, self._truths, strict=True)
-        for problem, data, family, truth in parts:
-            score = OF_STATES.get(self.objective, recursion.LIKELIHOOD)
-            if truth is not None and self.objective == SCORE:
-                truth = truth._replace(weights=self._of_score(point, problem, data, family))
-            out, of_runs = family.derivatives(point, data, score=score, truth=truth, information=information)
-            blocks.append(out * self._weight(data))
-            matrices.append(of_runs)
-        runs = np.concatenate(blocks)
-        if self.objective == SCORE:
-            runs[:, 1:] *= 0.5
-        values, scores = runs[:, 0], runs[:, 1:]
-        total = np.concatenate(matrices).sum(axis=0)
-        evaluation = Evaluation(float(values.sum()), scores.sum(axis=0), total, scores, values)
-        self._watch(self, point, evaluation)
-        return evaluation
-
-    def by_noise(self, choice: Choice) -> tuple[float, np.ndarray, np.ndarray]:
-        """The sum over all runs at a choice, and its derivatives by the matrices Q (n, n) and R (m, m).
-
-        They are those of `Family.by_noise`, for every objective but the score, which is no sum over runs.
-        """
-        if self.objective == SCORE:
-            raise ValueError(f"an objective whose slopes by matrices are known must not be {SCORE!r}")
-        score, parts = OF_STATES.get(self.objective, recursion.LIKELIHOOD), []
-        for data, family, truth in zip(self._data, self._families, self._truths, strict=True):
-            values, by_q, by_r = family.by_noise(choice, data, score=score, truth=truth)
-            parts.append([self._weight(data) * term for term in (values.sum(), by_q, by_r)])
-        value, by_q, by_r = (np.sum(np.array(of_all), axis=0) for of_all in zip(*parts, strict=True))
-        return float(value), by_q, by_r
-
-    def model_at(self, point: np.ndarray) -> tuple[StateSpaceModel, ModelSlopes]:
-        """The model of the first problem at coordinates, and its derivatives by them."""
-        return self._families[0].at(point)
-
-    def of_few(self, runs: int) -> RunsObjective:
-        """The same of the first runs of each problem."""
-        few = [data.slice(0, runs) for data in self._data]
-        return RunsObjective(self._choice, self._problems, few, self.coordinates.free, self.objective, self._watch)
-
-    def of(self, objective: str) -> RunsObjective:
-        """Another objective of the same runs."""
-        return RunsObjective(
-            self._choice, self._problems, self._data, self.coordinates.free, objective, self._watch
-        )
-
-    @property
-    def is_of_squares(self) -> bool:
-        """Whether squared errors are minimised, in which the covariance does not count."""
-        return self.objective in (SCORE, MSE)
-
-    def choice_at(self, point: np.ndarray) -> Choice:
-        """The choice at coordinates."""
-        return self._families[0].choice_at(point)
-
-    @property
-    def untuned(self) -> np.ndarray:
-        """The parameters of the choice that the goal was made of, (p,)."""
-        values = [(parameter.get(self._choice), neutral(parameter.name)) for parameter in self.coordinates.free]
-        return np.array([other if value is None else value for value, other in values], dtype=np.float64)
-
-    @property
-    def is_large(self) -> bool:
-        """Whether a model has so many states that a run takes long."""
-        return any(is_array(family.states, family.states) for family in self._families)
-
-    @property
-    def runs(self) -> int:
-        """The most runs of a problem."""
-        return max(len(runs.measurements) for runs in self._data)
-
-    def level(self, value: float) -> float:
-        """Log L of all runs for their sum; of other objectives their value, as a study has it."""
-        return value if self.objective == LIKELIHOOD else -value / self.steps
-
-    def unit(self, value: float) -> float:
-        """In what information is counted at an optimum: in a log density, or in the mean square that remains."""
-        if not self.is_of_squares:
-            return 1.0
-        counted = sum(int(np.isfinite(truth.states).sum()) for truth in self._truths if truth is not None)
-        return (-2.0 if self.objective == MSE else -1.0) * value / counted
-
-    def _weight(self, data: Data) -> float:
-        if self.objective == LIKELIHOOD:
-            return 1.0
-        return self.steps / (len(self._data) * int(data.scored_counts.sum()))
-
-    def _truth(self, problem: Problem, data: Data, family: Family) -> Truth | None:
-        """The true states, NaN where the objective does not count them: those that the plant lacks, too."""
-        if self.objective == LIKELIHOOD:
-            return None
-        if data.states is None or problem.scale is None:
-            raise ValueError(f"objective must be {LIKELIHOOD!r} without true states, but got {self.objective!r}")
-        scale = np.asarray(problem.scale, dtype=np.float64)
-        known = np.where(data.scored[..., None] & np.isfinite(scale), data.states, np.nan)
-        states = np.full((*known.shape[:2], family.states), np.nan)
-        states[..., : len(scale)] = known
-        weights = np.zeros(family.states)
-        weights[: len(scale)] = 1.0 / np.square(scale)
-        return Truth(states, weights)
-
-    def _of_score(self, point: np.ndarray, problem: Problem, data: Data, family: Family) -> np.ndarray:
-        """The weights of squares that give the score, (n,), from the filter's mean square errors."""
-        metrics = metrics_of_all(family.choice_at(point).filter(problem), data, nees=False, outputs=False)
-        scale, weights = np.asarray(problem.scale, dtype=np.float64), np.zeros(family.states)
-        deviations = np.sqrt(pooled_mean(np.asarray(metrics.mean_squares), metrics.weights))
-        with np.errstate(divide="ignore"):
-            weights[: len(scale)] = 1.0 / (np.isfinite(scale).sum() * scale * deviations)
-        return weights
+def objective_of(
+    choice: Choice,
+    problems: Sequence[Problem],
+    data: Sequence[Data],
+    parameters: Sequence[Parameter],
+    objective: str = LIKELIHOOD,
+    **options: Any,
+) -> Objective:
+    """The objective of a Kalman filter's parameters on the data of each problem; options are of `Objective`."""
+    pairs = zip(problems, data, strict=True)
+    return Objective([Family(choice, problem, parameters, runs) for problem, runs in pairs], objective, **options)
 
 
 class Optimum(NamedTuple):
@@ -290,21 +139,21 @@ def goal_of(
     data: Data | Sequence[Data],
     objective: str = LIKELIHOOD,
     options: Mapping[str, Any] | None = None,
-) -> RunsObjective:
+) -> Objective:
     """What `tune_by_gradient` maximises, with the parameters of the first problem; arguments are its."""
     listed = [problems] if isinstance(problems, Problem) else list(problems)
     runs = [data] if isinstance(data, Data) else list(data)
     parameters = model_parameters(listed[0], **(options or {}))
-    return RunsObjective(untuned_choice(filter_name, listed[0]), listed, runs, parameters, objective)
+    return objective_of(untuned_choice(filter_name, listed[0]), listed, runs, parameters, objective)
 
 
-def start_at(goal: RunsObjective, factors: Sequence[float]) -> np.ndarray:
+def start_at(goal: Objective, factors: Sequence[float]) -> np.ndarray:
     """Coordinates of a start, given factors on the untuned parameters; those on linear scales stay untuned."""
     log = goal.coordinates.log
     return goal.coordinates.of(np.where(log, goal.untuned * np.asarray(factors), goal.untuned))
 
 
-def optimum(goal: RunsObjective, start: np.ndarray) -> Optimum:
+def optimum(goal: Objective, start: np.ndarray) -> Optimum:
     """The maximum to which one start leads, without the standard errors of `tune_by_gradient`.
 
     Squared errors hardly know the scale of Q and R, nor what of them no estimate depends on: where these are
@@ -320,7 +169,7 @@ def optimum(goal: RunsObjective, start: np.ndarray) -> Optimum:
     """
     prior = 0.0
     if goal.is_of_squares:
-        first = goal.of(LIKELIHOOD)
+        first = goal.with_changes(objective=LIKELIHOOD)
         start = first.coordinates.of(optimum(first, start).parameters)
         prior = goal.unit(goal(start).value) / KNOWN_WITHIN**2
     point, large, evaluations = start, goal.is_large, 0
@@ -354,7 +203,7 @@ def _bad(parameter: Parameter) -> float:
     return BAD_START[parameter.place.index % 2] if isinstance(parameter.place, ProcessVariance) else BAD_START[1]
 
 
-def _minimum(goal: RunsObjective, first: np.ndarray, large: bool, prior: float, centre: np.ndarray):
+def _minimum(goal: Objective, first: np.ndarray, large: bool, prior: float, centre: np.ndarray):
     """L-BFGS-B on the sum over all runs and a prior about a centre, from a start."""
 
     def with_prior(point: np.ndarray) -> Evaluation:
@@ -366,7 +215,7 @@ def _minimum(goal: RunsObjective, first: np.ndarray, large: bool, prior: float, 
     return lbfgs(with_prior, first, goal.coordinates.low, goal.coordinates.high, **options)
 
 
-def _standard_errors(goal: RunsObjective, point: np.ndarray, unit: float = 1.0) -> np.ndarray:
+def _standard_errors(goal: Objective, point: np.ndarray, unit: float = 1.0) -> np.ndarray:
     """Standard errors of coordinates, (p,): from the scatter between runs, or from the Hessian if larger.
 
     The Hessian is counted in a unit of what is maximised, which is 1 where that is a log density. In a direction

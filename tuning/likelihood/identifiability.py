@@ -11,10 +11,11 @@ from optuna.distributions import BaseDistribution
 from filters.registry import filter_type
 from filters.tuned_file import NOISE
 from tuning.evaluation.residuals import heavy_innovations, tails_in_words
-from tuning.likelihood.family import known_information
+from tuning.likelihood.family import Family, has_gradient
+from tuning.likelihood.objective import Objective
 from tuning.problems.data import Data, estimates_in_parts, where_true
 from tuning.problems.problem import Problem
-from tuning.search.parameters import index_pairs, places_in
+from tuning.search.parameters import index_pairs, model_parameters, places_in
 from tuning.search.space import Choice, choice_of, ends_of, parameters_of, untuned_choice
 
 KNOWN_WITHIN = np.log(10.0)  # a parameter with a wider 95 % interval than a factor of ten is not determined
@@ -24,6 +25,7 @@ STEP = np.log(2.0)  # of differences, in logarithms: ensembles need large ones
 CLOSE = 0.02  # tolerance of the maximum, in logarithms
 EVALUATIONS = 100  # at most, in the search of the maximum
 LEAST = -1e6  # in place of a log-likelihood that is not finite
+LEAST_NUMBERS = 8  # number of parameters from which the information is faster than differences
 MOST_NUMBERS = 24  # a curvature takes a run of all data for each pair of parameters
 COMPANION = 0.2  # component of a direction, relative to the largest one, from which a parameter is named
 
@@ -114,6 +116,42 @@ def identify(
         most_likely = {**parameters, **dict(zip(names, np.exp(best).tolist(), strict=True))}
         tails |= heavy_innovations(choice_of(choice.name, most_likely, scenario, where).filter(scenario), [runs])
     return Identifiability(names, tuned, np.exp(best), cov, identified, tails)
+
+
+def known_information(
+    choice: Choice,
+    scenarios: Sequence[Problem],
+    data: Sequence[Data],
+    names: Sequence[str],
+    values: np.ndarray,
+    where: Sequence[str] = (),
+) -> np.ndarray | None:
+    """Fisher information on the logarithms of a Kalman filter's parameters in each of B runs, (B, p, p).
+
+    None for other filters, and where a parameter changes the model's functions or is on another scale. It takes
+    the time of about fifteen runs of the filter; differences take two runs for each pair of parameters.
+
+    Args:
+        choice: choice of one filter type; its other parameters are held.
+        scenarios: the problems.
+        data: for each scenario, its runs.
+        names: names of the p parameters.
+        values: at which the information is taken, (p,).
+        where: relations among the model's numbers.
+    """
+    if not has_gradient(choice.name) or len(names) < LEAST_NUMBERS:
+        return None
+    parts = []
+    for scenario, runs in zip(scenarios, data, strict=True):
+        free = model_parameters(scenario, where=where)
+        known = {parameter.name: parameter for parameter in free if parameter.log}
+        if not set(names) <= set(known):
+            return None
+        try:
+            parts.append(Family(choice, scenario, [known[name] for name in names], runs))
+        except ValueError:  # more than numbers changes
+            return None
+    return Objective(parts, information=True).information_of_runs(np.log(values))
 
 
 def _in_run(data: Data, log_likelihoods: np.ndarray) -> np.ndarray:

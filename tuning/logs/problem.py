@@ -33,7 +33,7 @@ from tuning.problems.find import logs_package, named
 from tuning.problems.log_parts import check_apart, check_times, parts_of
 from tuning.problems.log_problem import MISSING, LogProblem, without_outliers
 from tuning.problems.problem import Parameter, Problem
-from tuning.series.named import Fitted, check_on_grid, is_auto, maker_of, with_numbers
+from tuning.series.named import check_on_grid, is_auto, maker_of, with_numbers
 
 # Of `read_named`.
 OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid", "inputs_act", "stamps")
@@ -92,18 +92,18 @@ def log_problem(
     if not isinstance(offer, NamedMaker):
         content = _content(runs, options, cuts)
         return LogProblem(recorded, read_for(recorded[0], offer)[1](), **cuts, apart=apart, content=content)
-    run, fitted = _learnt(offer, recorded, cuts)
+    run, (maker, parameters, log) = _learnt(offer, recorded, cuts)
     if is_auto(options["model"]):
-        axes = len(fitted.maker.quantities)
-        options["model"] = fitted.maker.name + f":axes={axes}" * (axes > 1)
+        axes = len(maker.quantities)
+        options["model"] = maker.name + f":axes={axes}" * (axes > 1)
     content = _content(runs, options, cuts)
-    recorded[run] = replace(fitted.log, measurements=recorded[run].measurements)
-    assumed, parameters = partial(fitted.maker, dt=recorded[0].dt), fitted.parameters
+    recorded[run] = replace(log, measurements=recorded[run].measurements)
+    assumed = partial(maker, dt=recorded[0].dt)
     return LogProblem(recorded, assumed, parameters=parameters, **cuts, apart=apart, content=content)
 
 
-def _learnt(maker: NamedMaker, logs: Sequence[Log], cuts: Mapping[str, Any]) -> tuple[int, Fitted]:
-    """The run that has most rows in training blocks, and a model by name with the numbers of these."""
+def _learnt(maker: NamedMaker, logs: Sequence[Log], cuts: Mapping[str, Any]) -> tuple[int, tuple]:
+    """The run that has most rows in training blocks, and what `with_numbers` returns of these."""
     check_on_grid(maker, logs)
     logs = list(map(without_outliers, logs)) if cuts.get("outliers") == MISSING else logs
     options = {"hold_gaps": cuts.get("hold_gaps", False), "sizes": True}

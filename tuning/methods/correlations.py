@@ -68,7 +68,7 @@ def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np
     """
     from scipy.optimize import nnls
 
-    family = Family(task.start, task.problems[0], task.free)
+    family = Family(task.start, task.problems[0], task.free, task.data[0])
     coordinates = family.coordinates
     if not coordinates.log.all():
         raise ValueError(

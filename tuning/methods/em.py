@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from tuning.evaluation.baselines import with_covariances
-from tuning.likelihood.gradient import RunsObjective
+from tuning.likelihood.objective import Objective
 from tuning.methods.task import FEW, Task, way_out
 from tuning.search.objectives import LIKELIHOOD
 from tuning.search.parameters import MeasurementVariance, ProcessVariance
@@ -69,7 +69,7 @@ def squarem(task: Task) -> None:
         point = after if value >= before else twice
 
 
-def _start(task: Task, goal: RunsObjective) -> tuple[np.ndarray, np.ndarray]:
+def _start(task: Task, goal: Objective) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates of the start, and of how many terms each variance is the mean, (p,)."""
     transitions, measured = counts_of(task)
     counts: list[float] = []
@@ -96,7 +96,7 @@ def counts_of(task: Task) -> tuple[int, np.ndarray]:
     return transitions, measured
 
 
-def _step(goal: RunsObjective, point: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, float]:
+def _step(goal: Objective, point: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, float]:
     """Coordinates after a step, which are logarithms, and log L before it; a variance of no terms stays."""
     here = goal(point)
     factors = 1.0 + np.divide(2.0 * here.gradient, counts, out=np.zeros_like(counts), where=counts > 0)
@@ -104,7 +104,7 @@ def _step(goal: RunsObjective, point: np.ndarray, counts: np.ndarray) -> tuple[n
     return np.clip(after, goal.coordinates.low, goal.coordinates.high), here.value
 
 
-def _full(task: Task, goal: RunsObjective) -> None:
+def _full(task: Task, goal: Objective) -> None:
     """Steps of matrices: of Q, R or both in full, else of their diagonals."""
     few = goal.of_few(FEW)
     price = task.price("slopes by Q and R", lambda: few.by_noise(task.start))

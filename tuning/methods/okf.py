@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from tuning.evaluation.baselines import with_covariances
-from tuning.likelihood.gradient import RunsObjective
+from tuning.likelihood.gradient import objective_of
+from tuning.likelihood.objective import Objective
 from tuning.methods.scoring import noise_estimation
 from tuning.methods.task import FEW, Task
 from tuning.problems.data import Data
@@ -124,8 +125,8 @@ def _entries(factor: np.ndarray) -> np.ndarray:
     return entries[np.tril_indices(len(factor))]
 
 
-def _goal(task: Task, choice: Choice, data: Sequence[Data]) -> RunsObjective:
-    return RunsObjective(choice, task.problems, data, task.free, MSE)
+def _goal(task: Task, choice: Choice, data: Sequence[Data]) -> Objective:
+    return objective_of(choice, task.problems, data, task.free, MSE)
 
 
 def _filled(indices: np.ndarray, all_: np.ndarray, generator: np.random.Generator) -> np.ndarray:

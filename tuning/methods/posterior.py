@@ -92,7 +92,7 @@ def maximum_a_posteriori(task: Task) -> None:
         nonlocal best
         here = goal(point)
         value, gradient = here.value, here.gradient
-        model, slopes = goal.model_at(point)
+        model, slopes = goal.parts[0].at(point)
         for name, option in matrices:
             prior, by = _log_prior(first, model, getattr(slopes, name), name, bool(task.options.get(option)))
             value, gradient = value + prior, gradient + by

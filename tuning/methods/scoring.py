@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 
 from tuning.evaluation.baselines import with_covariances
@@ -24,7 +22,7 @@ def scoring(task: Task) -> None:
     """
     goal = task.goal(LIKELIHOOD, information=True)
     start, ends = goal.coordinates.of(goal.untuned), (goal.coordinates.low, goal.coordinates.high)
-    climb(partial(goal, information=True), start, *ends, iterations=MOST_STEPS, enough=CLOSE)
+    climb(goal, start, *ends, iterations=MOST_STEPS, enough=CLOSE)
 
 
 def noise_estimation(task: Task) -> None:

@@ -19,7 +19,8 @@ from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.evaluate import compute_metrics
 from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.ascent import Evaluation
-from tuning.likelihood.gradient import RunsObjective
+from tuning.likelihood.gradient import objective_of
+from tuning.likelihood.objective import Objective
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.problem import Parameter, Problem
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORES, NEES, SCORE, VARIANCES, find_objective, penalised
@@ -231,7 +232,7 @@ class Task:
             values.append(penalised(objective.value(evaluation, math.nan), evaluation))
         return float(np.mean(values))
 
-    def goal(self, objective: str, keeps: bool = True, information: bool = False) -> RunsObjective:
+    def goal(self, objective: str, keeps: bool = True, information: bool = False) -> Objective:
         """What gradients of an objective lead to: each evaluation counts; by default the best point is kept.
 
         Args:
@@ -242,7 +243,7 @@ class Task:
         best: dict[tuple, float] = {}
         last = objective, self.passes
 
-        def watch(goal: RunsObjective, point: np.ndarray, here: Evaluation) -> None:
+        def watch(goal: Objective, point: np.ndarray, here: Evaluation) -> None:
             self.charge(prices[goal.objective] * len(here.part_values))
             if not keeps:
                 return
@@ -256,16 +257,17 @@ class Task:
                 self.keep(goal.choice_at(point))
 
         with self.uncounted():
-            goal = RunsObjective(self.start, self.problems, self.data, self.free, objective, watch)
+            arguments = self.start, self.problems, self.data, self.free, objective
+            goal = objective_of(*arguments, information=information, watch=watch)
             needed = {objective, LIKELIHOOD} if goal.is_of_squares else {objective}
-            prices = {objective_: self._price_of_gradients(objective_, information) for objective_ in needed}
+            unwatched = {name: Objective(goal.parts, name, information=information) for name in needed}
+            prices = {name: self._price_of_gradients(plain) for name, plain in unwatched.items()}
         return goal
 
-    def _price_of_gradients(self, objective: str, information: bool) -> float:
-        plain = RunsObjective(self.start, self.problems, self.data, self.free, objective)
+    def _price_of_gradients(self, plain: Objective) -> float:
         few, coordinates = plain.of_few(FEW), plain.coordinates
         point = np.clip(coordinates.of(plain.untuned), coordinates.low, coordinates.high)
-        return self.price("information" if information else objective, lambda: few(point, information))
+        return self.price("information" if plain.informative else plain.objective, lambda: few(point))
 
     def price(self, name: str, call: Callable[[], object]) -> float:
         """What a call over the first 32 runs takes, in passes of the filter, at least 1: measured once a name."""

@@ -22,7 +22,8 @@ from tuning.evaluation.baselines import competing_baselines, noise_estimated
 from tuning.evaluation.held_out import sizes_as_data, stored_sizes
 from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
 from tuning.likelihood.family import has_gradient, keeps_more
-from tuning.likelihood.gradient import OF_STATES, RunsObjective, goal_of, optimum, start_at, starts_of
+from tuning.likelihood.gradient import goal_of, optimum, start_at, starts_of
+from tuning.likelihood.objective import OF_STATES, Objective
 from tuning.problems.data import Data
 from tuning.search.objectives import LIKELIHOOD, SCORE, reported
 from tuning.search.parameters import R, model_parameters
@@ -90,7 +91,7 @@ def noise_by_gradient(study: optuna.Study, plan: Plan, objective: str = LIKELIHO
     return noise
 
 
-def _best_start(goal: RunsObjective) -> np.ndarray:
+def _best_start(goal: Objective) -> np.ndarray:
     """The start of an ascent: of a model with few numbers where the best of three starts leads on a few runs."""
     free, few = goal.coordinates.free, goal.of_few(MAXIMUM_LIKELIHOOD_RUNS)
     if goal.is_large or len(free) > MOST_FOR_STARTS:

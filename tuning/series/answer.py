@@ -22,7 +22,7 @@ from thruster_env.core.text_tables import Table, Unfolded
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.continuous import ContinuousModel
 from tuning.api.result import Result, frame
-from tuning.identification.objective import climb
+from tuning.likelihood.ascent import climb
 from tuning.series.column import Column, seconds_text
 from tuning.series.fit import Candidate, Number, behind, filtered
 from tuning.series.likelihood import ColumnLikelihood, R, model_of

@@ -29,7 +29,7 @@ from filters.models import Scales, Sum, named_model
 from filters.signals import Signal
 from thruster_env.core.streams import filter_keys
 from thruster_env.model.affine import AffineModel
-from tuning.identification.objective import Ascent, climb
+from tuning.likelihood.ascent import Ascent, climb
 from tuning.series.column import Column
 from tuning.series.likelihood import ColumnLikelihood
 from tuning.series.recursion import Beginning, StepTables, filtered_runs

@@ -21,7 +21,8 @@ import numpy as np
 from filters.models import Scales, Sum, in_unit
 from filters.signals import Signal, with_level
 from thruster_env.model.affine import AffineModel
-from tuning.identification.objective import STEP, Evaluation
+from tuning.likelihood.ascent import Evaluation
+from tuning.likelihood.parametric import STEP
 from tuning.problems.problem import Coordinates, Parameter, squared
 from tuning.series.column import Column
 from tuning.series.recursion import Beginning, StepTables, Sums, filtered_runs

@@ -8,7 +8,7 @@ import pytest
 from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
 from tuning.experiments.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study
-from tuning.identification.objective import Objective
+from tuning.identification.objective import likelihood_of
 from tuning.problems.problem import Coordinates
 from tuning.thruster.logs import ThrusterFamily
 
@@ -41,7 +41,7 @@ def test_a_clock_that_is_ahead_is_found_where_it_is_and_not_where_interpolation_
     plant = make_plant(PRESET, sensors=SENSORS, max_voltage=AMPLITUDE)
     names = [name for name in TRUTH if name not in ("Q11", "Q22", "R11", "R22")]
     family = ThrusterFamily(late, plant, Recorder(), (*names, "clock_offset_speed"))
-    objective = Objective(family.data, family.model, Coordinates(family.free))
+    objective = likelihood_of(family.data, family.model, Coordinates(family.free))
 
     def value(offset):
         return objective.value(objective.coordinates.start({**TRUTH, "clock_offset_speed": offset}))

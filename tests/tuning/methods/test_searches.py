@@ -47,7 +47,7 @@ def test_slopes_by_matrices_of_diagonals_are_those_of_coordinates():
     slopes = np.concatenate([np.diag(by_q), np.diag(by_r)]) * goal.untuned
     np.testing.assert_allclose(goal(point).gradient, slopes, rtol=1e-9)
     with pytest.raises(ValueError, match="must not be 'score'"):
-        goal.of(SCORE).by_noise(task.start)
+        goal.with_changes(objective=SCORE).by_noise(task.start)
 
 
 @pytest.mark.slow
