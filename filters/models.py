@@ -23,7 +23,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.gaussian.kalman import KalmanFilter
 from filters.signals import (
     Signal,
     added,
@@ -38,7 +37,7 @@ from filters.signals import (
     seasonal,
     singer,
 )
-from thruster_env.core.checks import at_least, finite, one_of, positive, short_repr
+from thruster_env.core.checks import finite, one_of, positive, short_repr
 from thruster_env.model.affine import AffineModel, affine_model
 from thruster_env.model.quantities import Quantity
 
@@ -419,28 +418,6 @@ def _part(text: str) -> NamedModel:
     if settings:
         raise ValueError(f"settings must be those of {', '.join(WITH_SETTINGS)}, but got {settings!r} for {name}")
     return NAMED[name]
-
-
-def kalman_filter(name: str, dt: float, noise: float, *, axes: int = 1, **values: float) -> KalmanFilter:
-    """The Kalman filter of a named model, for data whose numbers are known.
-
-        from filters.models import kalman_filter
-
-        filter_ = kalman_filter("constant-velocity", dt=0.1, noise=0.25, acceleration=0.04)
-
-    Args:
-        name: of the model (`named_model`).
-        dt: sample time [s].
-        noise: R, the variance of the measurement noise.
-        axes: number of measurements, each of a signal of its own: 2 for a position in a plane.
-        **values: the model's numbers.
-
-    Raises:
-        ValueError: for an unknown name or number.
-    """
-    symbols = ["z"] if at_least("axes", axes, 1) == 1 else [f"z_{i + 1}" for i in range(axes)]
-    quantities = [Quantity("measurement", symbol) for symbol in symbols]
-    return KalmanFilter(model=named_model(name).model(values, noise, dt, quantities=quantities))
 
 
 def in_unit(text: str, unit: str) -> str:

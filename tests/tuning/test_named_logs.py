@@ -5,7 +5,6 @@ import pytest
 
 import tuning
 from filters import make_filter, run
-from filters.models import kalman_filter
 from filters.named import model_named
 from tuning.api.problems import problem_of
 
@@ -42,9 +41,9 @@ def test_numbers_of_a_study_are_those_of_its_training_blocks(log):
 
 
 def test_an_estimate_uses_given_numbers_or_finds_them_and_says_which(log):
-    filter_ = kalman_filter(NAME, dt=0.1, noise=0.3, acceleration=0.5)
+    model = model_named(f"{NAME}:acceleration=0.5,R=0.3")(dt=0.1)
     stated = tuning.estimate((f"{NAME}:acceleration=0.5,R=0.3", log), filter="kf")
-    np.testing.assert_allclose(stated.filter.model.process_noise_cov, filter_.model.process_noise_cov, rtol=1e-9)
+    np.testing.assert_allclose(stated.filter.model.process_noise_cov, model.process_noise_cov, rtol=1e-9)
     assert not any("maximum-likelihood" in sentence for sentence in stated.sentences())
     free, fit = tuning.estimate((NAME, log), filter="kf"), tuning.fit(log, model=NAME)
     assert free.filter.model.measurement_noise_cov[0, 0] == pytest.approx(fit.r, rel=1e-4)

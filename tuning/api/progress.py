@@ -7,6 +7,7 @@ import io
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -14,6 +15,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -102,6 +104,16 @@ def working(text: str, console: Console) -> Iterator[None]:
 
 
 @contextmanager
+def bar(
+    title: str, console: Console, *columns: ProgressColumn, total: float | None = None, **fields: Any
+) -> Iterator[Callable[..., None]]:
+    """A bar of long work, with further columns before the time that remains; the callback changes its fields."""
+    described = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn()
+    with Progress(*described, *columns, TimeRemainingColumn(), console=console) as progress:
+        yield partial(progress.update, progress.add_task(title, total=total, **fields))
+
+
+@contextmanager
 def trial_bar(
     plan: Plan, names: str, total: int, before: Sequence[FrozenTrial], console: Console
 ) -> Iterator[tuple[OnTrial, ShowKinds]]:
@@ -117,25 +129,20 @@ def trial_bar(
     from tuning.search.among_types import filter_types_running
 
     title, named = f"tuning {{}} on {names}", label_of(plan.filter)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("best {task.fields[best]}", markup=False),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
-        done = min(len(before), total)
-        task = progress.add_task(title.format(named), total=total, completed=done, best=_best(before, plan))
-        progress.update(task, completed=done)  # so that no time remains where all trials are done
+    best_column = TextColumn("best {task.fields[best]}", markup=False)
+    done, first_title = min(len(before), total), title.format(named)
+    with bar(first_title, console, best_column, total=total, completed=done, best=_best(before, plan)) as update:
+        update(completed=done)  # so that no time remains where all trials are done
+        finished_trials = done
 
         def show_kinds(kinds: Sequence[str]) -> None:
             if len(plan.filter_types) > 1:
-                progress.update(task, description=title.format(f"{named} ({', '.join(kinds)})"))
+                update(description=title.format(f"{named} ({', '.join(kinds)})"))
 
         def advance(study, finished: int) -> None:
-            trials = study.get_trials(deepcopy=False)
-            progress.update(task, completed=finished, best=_best(trials, plan))
+            nonlocal finished_trials
+            trials, finished_trials = study.get_trials(deepcopy=False), finished
+            update(completed=finished, best=_best(trials, plan))
             if running := filter_types_running(trials):
                 show_kinds(running)
 
@@ -143,9 +150,9 @@ def trial_bar(
 
         def show_rest(far: str) -> None:
             if far == STOPPING:
-                progress.update(task, description=far, refresh=True)
-            elif progress.tasks[task].finished:  # what comes after the last trial
-                progress.update(task, description=f"ensemble sizes, {far}" if far.startswith("N: ") else far)
+                update(description=far, refresh=True)
+            elif finished_trials >= total:  # what comes after the last trial
+                update(description=f"ensemble sizes, {far}" if far.startswith("N: ") else far)
 
         with listening(show_rest):
             yield advance, show_kinds
@@ -167,18 +174,11 @@ def _best(trials: Sequence[FrozenTrial], plan: Plan) -> str:
 @contextmanager
 def row_bar(total: int, console: Console) -> Iterator[Callable[[Problem, str], None]]:
     """The callback before each filter of a comparison runs, with the problem and the filter's label."""
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("comparing ...", total=total)
+    with bar("comparing ...", console, TimeElapsedColumn(), total=total) as update:
         begun: list[str] = []
 
         def on_row(problem: Problem, label: str) -> None:
-            progress.update(task, description=f"{label} on {problem.name}", completed=len(begun))
+            update(description=f"{label} on {problem.name}", completed=len(begun))
             begun.append(label)
 
         from tuning.evaluation.compare import TUNING
@@ -186,8 +186,8 @@ def row_bar(total: int, console: Console) -> Iterator[Callable[[Problem, str], N
 
         def show(far: str) -> None:
             if far == STOPPING or far.startswith(TUNING):
-                progress.update(task, description=far, refresh=True)
+                update(description=far, refresh=True)
 
         with listening(show):
             yield on_row
-        progress.update(task, completed=len(begun))
+        update(completed=len(begun))

@@ -72,7 +72,7 @@ class RecordedRuns:
             return log, offer
         if is_tuned:
             check_on_grid(offer, [log])
-            return log, with_numbers(offer, log).maker
+            return log, with_numbers(offer, log)[0]
         maker, _, log = with_numbers(offer, log)
         return log, maker if log.stamps is None else maker.continuous(dt=log.dt)
 

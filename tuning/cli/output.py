@@ -98,23 +98,13 @@ def progress_of(title: str, out: Path | None = None) -> Iterator[Callable[[str, 
         title: until the callback is called.
         out: a folder or file that keeps what is done, if there is one.
     """
-    from rich.progress import (  # which takes 20 ms
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import TimeElapsedColumn
 
-    text = TextColumn("{task.description}", markup=False)
-    columns = text, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    from tuning.api.progress import bar  # which takes 20 ms
+
     try:
-        with Progress(*columns, console=progress_console) as progress:
-            bar = progress.add_task(title, total=None)
-            yield lambda text, done, count: progress.update(
-                bar, description=text or title, completed=done, total=count
-            )
+        with bar(title, progress_console, TimeElapsedColumn()) as update:
+            yield lambda text, done, count: update(description=text or title, completed=done, total=count)
     except KeyboardInterrupt:
         if out is not None:
             progress_console.print(f"Interrupted: finished work is in {out}, and the same command continues.")

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 import gymnasium as gym
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
@@ -36,6 +35,7 @@ from tuning.api.markers import (
     Option,
     PresetOption,
 )
+from tuning.api.progress import bar
 from tuning.api.result import Printed
 from tuning.cli.output import check_targets, progress_console, warn_beyond
 from tuning.problems.data import held_out_seeds
@@ -209,10 +209,8 @@ def _without_policy(
 
 
 def _drawn(play) -> Played:
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=progress_console) as progress:
-        task = progress.add_task("drawing", total=None)
-        return play(lambda steps, count: progress.update(task, completed=steps, total=count))
+    with bar("drawing", progress_console) as update:
+        return play(lambda steps, count: update(completed=steps, total=count))
 
 
 # Episodes without a learnt policy, drawn: under a PI controller, a sequence of voltages, or as a log has them.

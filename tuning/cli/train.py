@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rich.console import RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import TextColumn
 
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import at_least
 from thruster_env.core.text_tables import Table
 from tuning.api.markers import FILTER, INPUT, LEARNING, OUTPUT, READ, Option, PresetOption
+from tuning.api.progress import bar
 from tuning.api.result import Printed
 from tuning.api.study import INTERRUPTED
 from tuning.api.tune import file_name
@@ -176,22 +177,14 @@ def as_json(setup: TrainingConfiguration, trained: Trained) -> dict:
 
 @contextmanager
 def _bar(title: str, total: int) -> Iterator[Callable[[int, float], None]]:
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[speed]} steps/s  return {task.fields[mean_return]}", markup=False),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=progress_console) as progress:
-        task = progress.add_task(title, total=total, speed="-", mean_return="-")
+    speed = TextColumn("{task.fields[speed]} steps/s  return {task.fields[mean_return]}", markup=False)
+    with bar(title, progress_console, speed, total=total, speed="-", mean_return="-") as update:
         first: list[tuple[int, float]] = []
 
         def advance(steps: int, mean_return: float) -> None:
             first.append((steps, time.perf_counter())) if not first else None
             seconds = time.perf_counter() - first[0][1]
-            progress.update(
-                task,
+            update(
                 completed=min(steps, total),
                 speed=f"{(steps - first[0][0]) / seconds:.0f}" if seconds > 1 else "-",
                 mean_return="-" if isnan(mean_return) else f"{mean_return:.2f}",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,14 +21,6 @@ from tuning.problems.problem import Parameter
 from tuning.series.column import Column, log_of_columns
 
 MODEL = "model"  # kind of a finding
-
-
-class Fitted(NamedTuple):
-    """A named model with all numbers, these as parameters of a study, and the log with a remark on them."""
-
-    maker: NamedMaker
-    parameters: tuple[Parameter, ...]
-    log: Log
 
 
 def is_auto(model: Any) -> bool:
@@ -94,8 +86,12 @@ def check_on_grid(maker: NamedMaker, logs: Sequence[Log]) -> None:
         )
 
 
-def with_numbers(maker: NamedMaker, log: Log, rows: np.ndarray | None = None) -> Fitted:
-    """The model with the numbers that the text gives, the others by maximum likelihood on some rows of a log.
+def with_numbers(
+    maker: NamedMaker, log: Log, rows: np.ndarray | None = None
+) -> tuple[NamedMaker, tuple[Parameter, ...], Log]:
+    """A named model with all numbers, these as parameters of a study, and the log with a remark on them.
+
+    They are those that the text gives, the others by maximum likelihood on some rows of the log.
 
     Args:
         maker: from `read_columns`.
@@ -139,4 +135,4 @@ def with_numbers(maker: NamedMaker, log: Log, rows: np.ndarray | None = None) ->
     )
     mean = tuple(column.mean.tolist()) if maker.mean is None and sum_.about_mean else maker.mean
     first, spread = tuple(column.first.tolist()), column.scales.spread
-    return Fitted(replace(maker, values=known, mean=mean, first=first, spread=spread), parameters, log)
+    return replace(maker, values=known, mean=mean, first=first, spread=spread), parameters, log

@@ -100,6 +100,74 @@ def filtered_runs(
     return Sums(sums[:, 0], sums[:, 1], sums[:, 2:], information, innovations, beliefs)
 
 
+def _read(row, mean, cov):
+    """Take mean and covariance from a row."""
+    n = mean.shape[0]
+    for i in range(n):
+        mean[i] = row[i]
+        for j in range(n):
+            cov[i, j] = row[n + i * n + j]
+
+
+def _write(mean, cov, row):
+    """Put mean and covariance into a row."""
+    n = mean.shape[0]
+    for i in range(n):
+        row[i] = mean[i]
+        for j in range(n):
+            row[n + i * n + j] = cov[i, j]
+
+
+def _copy(mean, cov, mean_to, cov_to):
+    for i in range(mean.shape[0]):
+        mean_to[i] = mean[i]
+        for j in range(mean.shape[0]):
+            cov_to[i, j] = cov[i, j]
+
+
+def _image(matrix, x, out):
+    """A x."""
+    for i in range(x.shape[0]):
+        total = 0.0
+        for j in range(x.shape[0]):
+            total += matrix[i, j] * x[j]
+        out[i] = total
+
+
+def _product(a, b, out):
+    """A B."""
+    n = out.shape[0]
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for m in range(n):
+                total += a[i, m] * b[m, j]
+            out[i, j] = total
+
+
+def _spread(product, f, noise, out):
+    """Symmetric (F P) F' + Q."""
+    n = out.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            total = noise[i, j]
+            for m in range(n):
+                total += product[i, m] * f[j, m]
+            out[i, j] = total
+            out[j, i] = total
+
+
+def _has_settled(cov, before, scale):
+    """Whether no entry has changed, compared with the variances of the scale: 1 or 0."""
+    settled = 1.0
+    for i in range(cov.shape[0]):
+        for j in range(cov.shape[0]):
+            change, size = cov[i, j] - before[i, j], scale[i, i] * scale[j, j]
+            if not change * change <= SETTLED * SETTLED * size:
+                settled = 0.0
+    return settled
+
+
 def _filter(
     z,
     index,
@@ -134,16 +202,12 @@ def _filter(
     product, cov, predicted, before, half = matrices[0], matrices[1], matrices[2], matrices[3], matrices[4]
     mean, ahead, gain = vectors[0], vectors[1], vectors[2]
     for b in range(first, last):
+        _read(begin_beliefs[b], mean, cov)
         for i in range(n):
-            mean[i] = begin_beliefs[b, i]
             for j in range(n):
-                cov[i, j] = begin_beliefs[b, n + i * n + j]
                 before[i, j] = 0.0
         for a in range(p):
-            for i in range(n):
-                vectors[3 + 4 * a, i] = begin_slopes[b, a, i]
-                for j in range(n):
-                    matrices[5 + 4 * a, i, j] = begin_slopes[b, a, n + i * n + j]
+            _read(begin_slopes[b, a], vectors[3 + 4 * a], matrices[5 + 4 * a])
         settled, step_before, s, begin = 0.0, -1.0, 1.0, int(begin_rows[b])
         for k in range(begin, rows):
             is_measured = z[b, k] == z[b, k] and (k > begin or is_prediction > 0.0)
@@ -151,90 +215,47 @@ def _filter(
             if settled > 0.0 and (not is_measured or index[b, k] != step_before):
                 settled = 0.0
             if k > begin:
-                for i in range(n):
-                    total = 0.0
-                    for j in range(n):
-                        total += f[step, i, j] * mean[j]
-                    ahead[i] = total
+                _image(f[step], mean, ahead)
                 if settled == 0.0:
-                    for i in range(n):
-                        for j in range(n):
-                            total = 0.0
-                            for m in range(n):
-                                total += f[step, i, m] * cov[m, j]
-                            product[i, j] = total
-                    for i in range(n):
-                        for j in range(i + 1):
-                            total = q[step, i, j]
-                            for m in range(n):
-                                total += product[i, m] * f[step, j, m]
-                            predicted[i, j] = total
-                            predicted[j, i] = total
+                    _product(f[step], cov, product)
+                    _spread(product, f[step], q[step], predicted)
                 for a in range(p):
-                    dmean, dahead = vectors[3 + 4 * a], vectors[4 + 4 * a]
-                    dcov, dpredicted = matrices[5 + 4 * a], matrices[6 + 4 * a]
-                    for i in range(n):
-                        total = 0.0
-                        for j in range(n):
-                            total += f[step, i, j] * dmean[j]
-                        if f_moves[a] > 0.0:
+                    dahead, dpredicted = vectors[4 + 4 * a], matrices[6 + 4 * a]
+                    _image(f[step], vectors[3 + 4 * a], dahead)
+                    if f_moves[a] > 0.0:
+                        for i in range(n):
                             for j in range(n):
-                                total += f_slopes[a, step, i, j] * mean[j]
-                        dahead[i] = total
+                                dahead[i] += f_slopes[a, step, i, j] * mean[j]
                     if settled == 0.0:
-                        for i in range(n):
-                            for j in range(n):
-                                total = 0.0
-                                for m in range(n):
-                                    total += f[step, i, m] * dcov[m, j]
-                                half[i, j] = total
-                        for i in range(n):
-                            for j in range(i + 1):
-                                total = q_slopes[a, step, i, j]
-                                for m in range(n):
-                                    total += half[i, m] * f[step, j, m]
-                                if f_moves[a] > 0.0:
+                        _product(f[step], matrices[5 + 4 * a], half)
+                        _spread(half, f[step], q_slopes[a, step], dpredicted)
+                        if f_moves[a] > 0.0:
+                            for i in range(n):
+                                for j in range(i + 1):
                                     for m in range(n):
-                                        total += f_slopes[a, step, i, m] * product[j, m]
-                                        total += product[i, m] * f_slopes[a, step, j, m]
-                                dpredicted[i, j] = total
-                                dpredicted[j, i] = total
+                                        dpredicted[i, j] += f_slopes[a, step, i, m] * product[j, m]
+                                        dpredicted[i, j] += product[i, m] * f_slopes[a, step, j, m]
+                                    dpredicted[j, i] = dpredicted[i, j]
             else:
-                for i in range(n):
-                    ahead[i] = mean[i]
-                    for j in range(n):
-                        predicted[i, j] = cov[i, j]
+                _copy(mean, cov, ahead, predicted)
                 for a in range(p):
-                    for i in range(n):
-                        vectors[4 + 4 * a, i] = vectors[3 + 4 * a, i]
-                        for j in range(n):
-                            matrices[6 + 4 * a, i, j] = matrices[5 + 4 * a, i, j]
+                    _copy(vectors[3 + 4 * a], matrices[5 + 4 * a], vectors[4 + 4 * a], matrices[6 + 4 * a])
             if not is_measured:
-                for i in range(n):
-                    mean[i] = ahead[i]
-                    for j in range(n):
-                        cov[i, j] = predicted[i, j]
+                _copy(ahead, predicted, mean, cov)
                 for a in range(p):
-                    for i in range(n):
-                        vectors[3 + 4 * a, i] = vectors[4 + 4 * a, i]
-                        for j in range(n):
-                            matrices[5 + 4 * a, i, j] = matrices[6 + 4 * a, i, j]
+                    _copy(vectors[4 + 4 * a], matrices[6 + 4 * a], vectors[3 + 4 * a], matrices[5 + 4 * a])
             else:
                 counts = 1.0 if k >= counted_from[b] else 0.0
                 v = z[b, k]
                 for i in range(n):
                     v -= output[i] * ahead[i]
                 if settled == 0.0:
+                    _image(predicted, output, gain)
                     s = r
                     for i in range(n):
-                        total = 0.0
-                        for j in range(n):
-                            total += predicted[i, j] * output[j]
-                        gain[i] = total
-                        s += output[i] * total
+                        s += output[i] * gain[i]
                     for i in range(n):
                         gain[i] = gain[i] / s
-                    can_settle = 1.0 if index[b, k] == step_before else 0.0
                     for i in range(n):
                         for j in range(n):
                             before[i, j] = cov[i, j]
@@ -253,52 +274,35 @@ def _filter(
                                     total += product[i, m] * ((1.0 if j == m else 0.0) - gain[j] * output[m])
                                 cov[i, j] = total
                                 cov[j, i] = total
-                    for i in range(n):
-                        for j in range(n):
-                            change, size = cov[i, j] - before[i, j], cov[i, i] * cov[j, j]
-                            if not change * change <= SETTLED * SETTLED * size:
-                                can_settle = 0.0
+                    settled = _has_settled(cov, before, cov) if index[b, k] == step_before else 0.0
                     for a in range(p):
-                        updated_slope, ahead_slope, slope_before = (
-                            matrices[5 + 4 * a],
-                            matrices[6 + 4 * a],
-                            matrices[7 + 4 * a],
-                        )
-                        gain_slope, ds = vectors[6 + 4 * a], r_slopes[a]
+                        dcov, dpredicted, dbefore = matrices[5 + 4 * a], matrices[6 + 4 * a], matrices[7 + 4 * a]
+                        across, gain_slope, ds = vectors[5 + 4 * a], vectors[6 + 4 * a], r_slopes[a]
+                        _image(dpredicted, output, across)
                         for i in range(n):
-                            total = 0.0
-                            for j in range(n):
-                                total += ahead_slope[i, j] * output[j]
-                            vectors[5 + 4 * a, i] = total
-                            ds += output[i] * total
+                            ds += output[i] * across[i]
                         scalars[a] = ds
                         for i in range(n):
-                            gain_slope[i] = (vectors[5 + 4 * a, i] - gain[i] * ds) / s
+                            gain_slope[i] = (across[i] - gain[i] * ds) / s
                         for i in range(n):
                             for j in range(n):
-                                slope_before[i, j] = updated_slope[i, j]
-                                updated_slope[i, j] = (
-                                    ahead_slope[i, j]
-                                    - vectors[5 + 4 * a, i] * gain[j]
-                                    - gain[i] * vectors[5 + 4 * a, j]
-                                    + gain[i] * gain[j] * ds
-                                )
-                        for i in range(n):
-                            for j in range(n):
-                                change, size = updated_slope[i, j] - slope_before[i, j], cov[i, i] * cov[j, j]
-                                if not change * change <= SETTLED * SETTLED * size:
-                                    can_settle = 0.0
-                    settled, step_before = can_settle, index[b, k]
+                                dbefore[i, j] = dcov[i, j]
+                                dcov[i, j] = dpredicted[i, j] - across[i] * gain[j] - gain[i] * across[j]
+                                dcov[i, j] += gain[i] * gain[j] * ds
+                        if settled > 0.0:
+                            settled = _has_settled(dcov, dbefore, cov)
+                    step_before = index[b, k]
                 for i in range(n):
                     mean[i] = ahead[i] + gain[i] * v
                 sums[b, 0] -= 0.5 * counts * (LOG_TWO_PI + math.log(s) + v * v / s)
                 sums[b, 1] += counts * v * v / s
                 for a in range(p):
+                    dmean, dahead, gain_slope = vectors[3 + 4 * a], vectors[4 + 4 * a], vectors[6 + 4 * a]
                     dv = 0.0
                     for i in range(n):
-                        dv -= output[i] * vectors[4 + 4 * a, i]
+                        dv -= output[i] * dahead[i]
                     for i in range(n):
-                        vectors[3 + 4 * a, i] = vectors[4 + 4 * a, i] + vectors[6 + 4 * a, i] * v + gain[i] * dv
+                        dmean[i] = dahead[i] + gain_slope[i] * v + gain[i] * dv
                     scalars[p + a] = dv
                     sums[b, 2 + a] -= counts * (0.5 * scalars[a] / s * (1.0 - v * v / s) + v * dv / s)
                     for c in range(a + 1):
@@ -310,15 +314,9 @@ def _filter(
             if not is_measured:
                 step_before = -1.0
             if each_row > 0:
-                for i in range(n):
-                    beliefs[b, k, i] = mean[i]
-                    for j in range(n):
-                        beliefs[b, k, n + i * n + j] = cov[i, j]
+                _write(mean, cov, beliefs[b, k])
         if each_row == 0:
-            for i in range(n):
-                beliefs[b, 0, i] = mean[i]
-                for j in range(n):
-                    beliefs[b, 0, n + i * n + j] = cov[i, j]
+            _write(mean, cov, beliefs[b, 0])
         for a in range(p):
             for c in range(a):
                 information[b, c, a] = information[b, a, c]
