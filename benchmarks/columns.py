@@ -14,7 +14,7 @@ import numpy as np
 
 import filters
 import tuning
-from filters.models import kalman_filter, named_model
+from filters.models import named_model
 from thruster_env.core.text_tables import markdown_table
 
 SETS, ROWS = 20, 500
@@ -26,7 +26,8 @@ Found = Callable[[str, np.ndarray], filters.KalmanFilter]  # of a model's name a
 def drawn(name: str, seed: int) -> tuple[np.ndarray, filters.KalmanFilter]:
     """Numbers of a model with R = 1 and a density of its noise of 0.01 to 100, and the filter that knows both."""
     generator = np.random.default_rng([seed, len(name)])
-    filter_ = kalman_filter(name, 1.0, 1.0, **{TRUTH[name]: 10.0 ** generator.uniform(-2.0, 2.0)})
+    model = named_model(name).model({TRUTH[name]: 10.0 ** generator.uniform(-2.0, 2.0)}, 1.0, 1.0)
+    filter_ = filters.KalmanFilter(model=model)
     f, _, _, h, _ = filter_.model.matrices()
     values, axes = np.linalg.eigh(filter_.model.process_noise_cov)
     root, x, z = axes * np.sqrt(np.maximum(values, 0.0)), np.zeros(len(f)), np.empty(ROWS)

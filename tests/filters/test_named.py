@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import filters
-from filters.models import NAMED, kalman_filter, named_model
+from filters.models import NAMED, named_model
 from filters.named import axes_named, is_model_name, model_named, text_of
 from filters.plants import pendulum
 from filters.wrappers.arguments import model_for_step
@@ -50,9 +50,10 @@ def test_a_text_of_numbers_gives_the_model_of_these_numbers(name):
     np.testing.assert_allclose(model.measurement_noise_cov, expected.measurement_noise_cov, rtol=1e-5)
 
 
-def test_a_named_model_is_that_of_the_kalman_filter_of_its_numbers():
+def test_a_text_with_numbers_is_the_named_model_of_these():
     model = model_for_step("constant-velocity:axes=2,acceleration=0.04,R=0.25", 0.1)()
-    expected = kalman_filter("constant-velocity", dt=0.1, noise=0.25, axes=2, acceleration=0.04).model
+    axes = axes_named("z", 2)
+    expected = named_model("constant-velocity").model({"acceleration": 0.04}, 0.25, 0.1, quantities=axes)
     for name in ("process_noise_cov", "measurement_noise_cov", "prior_cov", "constants"):
         np.testing.assert_array_equal(getattr(model, name), getattr(expected, name))
     swinging = model_for_step("pendulum:length=0.4", 0.01)(damping=0.2)
@@ -91,7 +92,7 @@ def test_a_signal_about_a_mean_begins_there_with_its_stationary_covariance(text)
         assert model.prior_mean[of["level"]] == 1000.0 and model.prior_mean[of["deviation"]] == 0.0
         assert model.prior_cov[of["deviation"], of["deviation"]] == pytest.approx(4.0)
     with pytest.raises(ValueError, match="partial_1 must be between -1 and 1, but got 1.5"):
-        kalman_filter("ar:1", dt=1.0, noise=1.0, partial_1=1.5, std=1.0)
+        named_model("ar:1").model({"partial_1": 1.5, "std": 1.0}, 1.0, 1.0)
 
 
 def test_every_cosine_of_a_season_has_the_same_noise_and_its_rows_are_a_season_apart():

@@ -5,12 +5,12 @@ import pytest
 
 import filters
 import tuning
-from filters.models import kalman_filter
+from filters.named import model_named
 
 
 @pytest.fixture(scope="module")
 def walk():
-    return kalman_filter("constant-velocity", dt=0.1, noise=0.25, acceleration=0.04)
+    return filters.make_filter("kf", model_named("constant-velocity:acceleration=0.04,R=0.25")(dt=0.1))
 
 
 def driven(m=1):

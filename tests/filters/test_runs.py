@@ -6,13 +6,13 @@ import pytest
 from scipy.linalg import expm
 
 import filters
-from filters.models import kalman_filter
+from filters.named import model_named
 from filters.plants import pendulum
 from tests.filters.test_live import A, oscillator
 
 rng = np.random.default_rng(3)
 Z = np.cumsum(rng.normal(size=30))
-LEVEL = kalman_filter("constant-velocity", dt=0.1, noise=1.0, acceleration=1.0)
+LEVEL = filters.make_filter("kf", model_named("constant-velocity:acceleration=1,R=1")(dt=0.1))
 PLANT, DT = pendulum(), 0.05
 LENGTHS, U = rng.uniform(0.02, 0.13, 29), rng.normal(size=29)
 OSCILLATOR = oscillator(operating_state=[0.0, 0.0], operating_input=[0.0])
