@@ -3,13 +3,11 @@
 import math
 import pickle
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
 from filters import (
     EnsembleKalmanFilter,
-    EstimateState,
     ExtendedKalmanFilter,
     ParticleFilter,
     Unknown,
@@ -133,16 +131,6 @@ def test_it_recovers_the_load_gain_of_the_physical_tunnel():
     squares = [((e.means[..., :2] - drawn.states)[:, 50:] ** 2).mean(axis=1) for e in (plain, found)]
     gain = squares[0] - squares[1]
     assert (gain.mean(axis=0) > 1.96 * gain.std(axis=0, ddof=1) / math.sqrt(runs)).all()
-
-
-@pytest.mark.usefixtures("as_python")
-def test_a_wrapper_runs_on_it_and_draws_its_estimate():
-    model = augmented_model(thruster_model(), {"ambient_velocity": Unknown(std=0.5)})
-    env = EstimateState(gym.make("BowThruster-v0", render_mode="rgb_array"), filter="ekf", model=model)
-    env.reset(seed=1)
-    _, _, _, _, info = env.step(np.array([6.0], dtype=np.float32))
-    assert info["estimate"].shape == (3,) and env.render().ndim == 3
-    env.close()
 
 
 @pytest.mark.parametrize(

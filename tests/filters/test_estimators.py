@@ -2,9 +2,7 @@
 # ruff: noqa: F811 - fixtures come by import and go by name
 
 import copy
-import json
 import math
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -319,28 +317,6 @@ def test_an_object_is_kept_in_the_spec_but_not_as_text():
         only = AtOnce()
         only.reset = None
         EstimateState(gym.make("BowThruster-v0"), filter=only)
-
-
-def test_by_the_command_line(thruster):
-    kinds = ("--filter", "ekf", "--filter", f"{HERE}:AtOnce", "--filter", f"{HERE}:scaled_gain")
-    done = thruster("compare", *kinds, "--seeds", 2, "--json", "board.json")
-    assert done.returncode == 0, done.stderr
-    rows = json.loads(Path("board.json").read_text())["scenarios"]["nominal"]["filters"]
-    assert list(rows) == ["ekf", f"{HERE}:AtOnce", f"{HERE}:scaled_gain"]
-    assert rows[f"{HERE}:AtOnce"]["nees"] is None and rows[f"{HERE}:AtOnce"]["verdict"] == "worse"
-    done = thruster("evaluate", "--filter", f"{HERE}:AtOnce", "--seeds", 2)
-    assert done.returncode == 0 and "rule of thumb" in done.stdout, done.stderr
-    for arguments, line in (
-        (("compare", "--filter", "math:pi"), "estimator 'math:pi' must be an estimator, or make one of a model"),
-        (("evaluate", "--filter", "nosuch_module:x"), "estimator must be 'module:object' that can be imported"),
-        (
-            ("tune", "--filter", f"{HERE}:AtOnce", "--out", "t.json"),
-            "a tuned file must be of a filter of filters.FILTERS",
-        ),
-        (("evaluate", "--filter", f"{HERE}:AtOnce", "--consistency", "a.png"), "of a filter with a covariance"),
-    ):
-        done = thruster(*arguments)
-        assert done.returncode == 2 and line in done.stderr and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(

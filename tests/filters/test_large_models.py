@@ -1,6 +1,5 @@
 """Models of any size: what is written out for small ones is looped over arrays for large ones."""
 
-import linecache
 import sys
 from contextlib import contextmanager
 
@@ -24,7 +23,7 @@ from tests.models import (
 )
 from tests.slow import slow_but
 from tests.thruster_env.core.test_angles import turned, turning, turntable
-from thruster_env.core import equal_functions, matrices, sources
+from thruster_env.core import equal_functions, sources
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import shape
@@ -292,15 +291,6 @@ def test_what_a_large_model_is_and_whether_it_fits_its_data_is_found_with_arrays
     check_model(model, data, "large")
     with pytest.raises(ValueError, match="transition of the model of problem large must be finite"):
         check_model(model.replace(transition=lambda x, u, c: x / u[0]), data, "large")
-
-
-def test_a_traceback_shows_the_source_of_what_was_written_out_and_its_size():
-    with pytest.raises(IndexError) as caught:
-        matrices.multiplier(3, 2, 3)(((1.0, 2.0),) * 3, ((1.0, 2.0),) * 2)
-    place = caught.traceback[-1]
-    assert "multiply" in str(place.path) and "multiplier(3, 2, 3)" in str(place.path)
-    line = linecache.getline(place.frame.code.raw.co_filename, 2)
-    assert "a[0][0] * b[0][0] + a[0][1] * b[1][0]" in line
 
 
 def ring(x, u, c):

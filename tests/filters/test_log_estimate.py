@@ -128,15 +128,3 @@ def test_an_estimate_at_which_h_has_no_value_is_drawn_all_the_same(log):
     own = make_filter("ekf", SEEN.replace(prior_mean=[1.0], observe=root, observe_jacobian=None))
     axes = draw_log(estimate(log, "kf", SEEN)._replace(filter=own), "ekf").axes
     assert not any(dots.get_label() == "measurement" for axis in axes for dots in axis.collections)
-
-
-def test_the_prior_s_band_does_not_widen_the_picture(log, tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr("filters.logs.findings.save_figure", lambda figure, path: drawn.extend(figure.axes))
-    found = estimate(log, "kf", SEEN.replace(prior_cov=[1e6]))
-    log_figure(tmp_path / "est.png", found, "kf on run")
-    speed, innovation = drawn[0], drawn[-1]
-    for axis, line in ((speed, found.means[:, 0]), (innovation, found.innovations[:, 0])):
-        low, high = axis.get_ylim()
-        assert low < np.nanmin(line) and np.nanmax(line) < high
-        assert high - low < 3 * np.nanmax(np.abs(line)) + 6 * found.stds[-1, 0]

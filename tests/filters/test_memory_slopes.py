@@ -1,4 +1,4 @@
-"""Derivatives of filters that keep more than mean and covariance: values of the filter, slopes of differences."""
+"""Derivatives of all filters that have them: values of the filter, slopes of differences."""
 
 import dataclasses
 
@@ -26,7 +26,8 @@ from tuning.problems.data import training_seeds
 from tuning.search.space import untuned_choice
 from tuning.thruster.scenario import find_scenario
 
-NAMES = ("ekf-robust", "sage-husa", "vb")
+KEEPING = ("ekf-robust", "sage-husa", "vb")  # more than mean and covariance
+NAMES = ("iekf", "ukf", "ckf", *KEEPING)
 WRITTEN = ("iterations",)  # parameters that programs are written out for
 
 
@@ -82,7 +83,7 @@ def test_a_score_is_that_of_the_estimates_and_its_gradient_that_of_differences(n
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("score", [None, "log-score", "squares"])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", KEEPING)
 def test_slopes_along_a_filters_own_numbers_are_those_of_differences(name, score):
     model, own = two_channels(), {key: value for key, value in MADE[name].items() if key not in WRITTEN}
     data = data_of(model, steps=12)
@@ -149,25 +150,25 @@ def assert_gradient_on(scenario, name, steps, mixed=None):
     np.testing.assert_allclose(found.gradients, expected, rtol=0, atol=1e-6 * abs(expected).max())
 
 
-@pytest.mark.parametrize("name", slow_but(NAMES, NAMES[:1]))
+@pytest.mark.parametrize("name", slow_but(KEEPING, KEEPING[:1]))
 def test_on_a_scenario_the_gradient_is_that_of_differences(name):
     assert_gradient_on(find_scenario("outliers"), name, 100)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", NAMES[:1])
+@pytest.mark.parametrize("name", KEEPING[:1])
 def test_on_a_vehicle_the_gradient_is_that_of_differences(name):
     assert_gradient_on(find_vehicle("auv:motion"), name, 15, mixed=2)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES[-1:])
+@pytest.mark.parametrize("name", KEEPING[-1:])
 def test_on_a_vehicle_the_compiled_gradient_is_that_of_differences(name):
     assert_gradient_on(find_vehicle("auv:motion"), name, 100)
 
 
-@pytest.mark.parametrize("name", slow_but(NAMES, NAMES[:1]))
+@pytest.mark.parametrize("name", slow_but(KEEPING, KEEPING[:1]))
 def test_gradients_tune_such_a_filter(name):
     scenario = find_scenario("outliers")
     data = scenario.data(training_seeds(0, 2))

@@ -15,7 +15,7 @@ from tests.filters.test_differentiated import units
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.filters.test_sensitivity import turn
-from tests.filters.test_state_scores import WEIGHTS, data_of, textbook
+from tests.filters.test_state_scores import data_of
 from tests.models import plane_model, simulated, wide_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
@@ -60,17 +60,6 @@ def made(name, model):
 
 def with_noise(model, q, r):
     return model.replace(process_noise_cov=q, measurement_noise_cov=r)
-
-
-def central(model, value, q_slopes, r_slopes):
-    """Slopes (B, p) of the values of models by central differences."""
-    q, r = model.process_noise_cov, model.measurement_noise_cov
-    found = []
-    for dq, dr in zip(q_slopes, r_slopes, strict=True):
-        h = 1e-4 * (np.diag(q).min() if dq.any() else np.diag(r).min())
-        above, below = (value(with_noise(model, q + s * dq, r + s * dr)) for s in (h, -h))
-        found.append((above - below) / (2 * h))
-    return np.stack(found, axis=1)
 
 
 def assert_slopes(found, expected, accuracy=1e-6):
@@ -154,38 +143,6 @@ def assert_page_is_the_filter(filter_):
         found = run_page(filter_, inputs[0], z[0])
     for one, other in zip(found, estimates, strict=False):
         np.testing.assert_allclose(one, other[0], rtol=1e-10, atol=1e-11)
-
-
-@pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("make", [two_channels, wide_pendulum])
-@pytest.mark.parametrize("name", NAMES)
-def test_the_likelihood_is_the_filters_and_its_gradient_that_of_central_differences(name, make):
-    model = make()
-    keys, inputs, z, _ = data_of(model, steps=12)
-    q_slopes, r_slopes = map(np.array, directions(model))
-
-    def value(changed):
-        return run(made(name, changed), keys, inputs, z).log_likelihoods.sum(axis=1)
-
-    found = likelihood(model, inputs, z, q_slopes, r_slopes, filter=made(name, make()))
-    np.testing.assert_allclose(found.values, value(model), rtol=1e-10)
-    assert_slopes(found.gradients, central(model, value, q_slopes, r_slopes))
-
-
-@pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("score", ["log-score", "squares"])
-@pytest.mark.parametrize("name", NAMES)
-def test_a_score_is_that_of_the_estimates_and_its_gradient_that_of_central_differences(name, score):
-    model = wide_pendulum()
-    data = data_of(model, steps=12)
-    q_slopes, r_slopes = (np.array(one)[[0, 2, 5]] for one in directions(model))
-
-    def value(changed):
-        return textbook(changed, lambda model: made(name, model), data, score)
-
-    found = state_score(model, *data[1:], q_slopes, r_slopes, score, WEIGHTS, filter=made(name, model))
-    np.testing.assert_allclose(found.values, value(model), rtol=1e-10)
-    assert_slopes(found.gradients, central(model, value, q_slopes, r_slopes))
 
 
 @pytest.mark.usefixtures("as_python")

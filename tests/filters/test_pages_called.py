@@ -6,19 +6,17 @@ from functools import partial
 import numpy as np
 import pytest
 
-from filters import run
 from filters.differentiated import recursion
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.differentiated.runs import differentiable
 from filters.pages.page import called_at_points
-from filters.sensitivity import likelihood, sensitivity, state_score
+from filters.sensitivity import likelihood, state_score
 from tests.filters.test_differentiated import units
 from tests.filters.test_likelihood import directions
 from tests.filters.test_pages import NAMES, assert_slopes, gaze, gaze_slopes, made, whirl, wide_pendulum
-from tests.filters.test_sensitivity import ring, slopes_of
+from tests.filters.test_sensitivity import ring
 from tests.filters.test_state_scores import data_of
 from tests.models import random_affine, simulated
-from thruster_env.core.streams import episode_keys
 
 PLAIN = Wanted(information=False, constants=False, tails=False)
 
@@ -46,29 +44,6 @@ def test_functions_that_are_called_have_the_derivatives_of_those_that_are_traced
         traced, called = (work(one, **given, filter=made(name, one)) for one in (model, decides))
         np.testing.assert_allclose(called.values, traced.values, rtol=1e-11)
         assert_slopes(called.gradients, traced.gradients, 1e-8)
-
-
-@pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("function", [whirl, turn_if])
-@pytest.mark.parametrize("name", ["ukf", "ckf"])
-def test_slopes_along_constants_and_the_prior_are_those_of_central_differences(name, function):
-    values = {"stiffness": 9.0, "damping": 0.3, "drive": 2.0, "start": 3.0, "spread": 0.5}
-    sizes = {"stiffness": 1.0, "damping": 0.1, "drive": 0.5, "start": 0.3, "spread": 0.1}
-
-    def model_of(**changes):
-        return wide_pendulum(**changes).replace(transition=function)
-
-    _, inputs, z, _ = data_of(model_of(**values), steps=12)
-    slopes = slopes_of(model_of, values, sizes)
-    found = sensitivity(model_of(**values), inputs, z, slopes, filter=made(name, model_of(**values)))
-    expected = []
-    for key, size in sizes.items():
-        above, below = (
-            run(made(name, model_of(**values | {key: values[key] + h * size})), episode_keys(range(5)), inputs, z)
-            for h in (1e-4, -1e-4)
-        )
-        expected.append((above.log_likelihoods - below.log_likelihoods).sum(axis=1) / 2e-4)
-    assert_slopes(found.gradients, np.stack(expected, axis=1))
 
 
 @pytest.mark.usefixtures("as_python")

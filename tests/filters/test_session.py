@@ -58,20 +58,6 @@ def test_a_session_goes_on_from_a_belief_of_its_own_filter():
         np.testing.assert_array_equal(session.belief().members, expected.members)
 
 
-def test_a_session_from_a_pickle_calls_machine_code_directly_after_its_first_step(monkeypatch):
-    stored, calls = pickle.dumps(Session(made("enkf", ensemble_size=9))), []
-
-    def operation_on(kernels, memory):
-        calls.append("make")
-        return lambda task: calls.append("call") or 0
-
-    monkeypatch.setattr("filters.engine.session.operation_on", operation_on)
-    session = pickle.loads(stored)
-    for _ in range(3):
-        session.step([5.0], [4.0])
-    assert calls == ["make", "call", "call", "call"]
-
-
 class Timed(NamedTuple):
     """Constants of a model whose sample time may vary."""
 

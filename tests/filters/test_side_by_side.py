@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, SageHusaFilter, UnscentedKalmanFilter, run, thruster_model
-from filters.engine import compile as engine
 from filters.engine.compile import GROUPS
-from filters.registry import FILTERS, make_filter
-from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
@@ -37,15 +34,6 @@ def test_blocks_that_are_full_or_not_hold_the_same_estimates(kind):
         one_by_one = run(kind(model=model), *(array[:5] for array in data))
     for part, of_all in zip(one_by_one, together, strict=True):
         np.testing.assert_allclose(part, of_all[:5], rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", slow_but(FILTERS, ("ekf", "enkf", "pf", "imm")))
-def test_filters_need_no_numba(name, monkeypatch):
-    monkeypatch.setattr("thruster_env.graphs.loops.code_of", lambda module, *names, **options: names)
-    kernels = make_filter(name, thruster_model()).kernels()
-    entries = ("call",) if kernels.vectors else ("call", "run")
-    assert engine._code_one_by_one.__wrapped__(kernels) == entries
-    assert not kernels.vectors or engine._code_side_by_side.__wrapped__(kernels) == ("run",)
 
 
 def test_what_one_trajectory_loses_no_other_misses():

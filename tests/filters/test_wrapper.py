@@ -11,7 +11,6 @@ from gymnasium.utils.env_checker import check_env
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import FILTERS, EstimateState, StateSpaceModel, make_filter, run, thruster_model
-from filters.tuned_file import sealed
 from tests.models import TUNED, affine, state_space
 from thruster_env.thruster.parameters import TUNNEL, derive_constants
 
@@ -417,28 +416,6 @@ def test_a_filter_that_is_made_is_run_as_it_is():
 def test_a_wrong_argument_is_refused_with_rule_and_value(arguments, rule):
     with pytest.raises(ValueError, match=rule) as error:
         EstimateState(bow_thruster(), **arguments)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        json.dumps(TUNED)[:40],
-        json.dumps({**TUNED, "version": 3}),
-        json.dumps({**TUNED, "filter": {**TUNED["filter"], "name": "ekf"}}),
-        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "name": "no filter"}})),
-        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "numbers": {"ensemble_size": 1}}})),
-        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "numbers": {"size": 9}}})),
-        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "numbers": [9]}})),
-        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "model": None}})),
-    ],
-    ids=["truncated", "version", "edited", "filter", "value", "number", "list", "model"],
-)
-def test_a_damaged_tuned_file_is_refused(tmp_path, content):
-    path = tmp_path / "tuned.json"
-    path.write_text(content)
-    with pytest.raises(ValueError) as error:
-        EstimateState(bow_thruster(), tuned=str(path))
     assert "\n" not in str(error.value)
 
 

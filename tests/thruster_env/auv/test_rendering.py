@@ -92,11 +92,6 @@ def test_axes_of_the_body_turn_as_angles_do():
     assert north[0] > 0 > north[1] and east[0] > 0 < east[1] and down[0] == 0 < down[1]
 
 
-def test_numbers_that_are_none_are_left_out():
-    lost = START._replace(x=math.nan, theta=math.inf, u=1e300, measured_depth=None, stern=math.nan)
-    assert frame(lost).shape == frame(START, lost, LATER).shape == (400, 640, 3)
-
-
 def test_straight_paths_are_shown_from_where_the_vehicle_was_to_ahead_of_it():
     path = make_path(STRAIGHT_AHEAD).points
     far = frame(START._replace(x=500.0), LATER._replace(x=501.0), path=path)
@@ -122,18 +117,6 @@ def test_an_env_draws_itself_with_its_filter_and_copies_go_on():
     moment = env.unwrapped.moment_of(env.unwrapped._out.reshape(-1).tolist())
     assert moment.measured_depth is None and moment.thrust == pytest.approx(float(action[0]))
     env.close()
-
-
-@pytest.mark.usefixtures("as_python")
-def test_a_window_opens_and_closes():
-    import pygame
-
-    env = gym.make("SegorogeniAUVDepth-v0", render_mode="human", dt=0.01)
-    env.reset(seed=0)
-    env.step([2.8, 0.0, 0.0])
-    assert pygame.display.get_caption()[0] == "Underwater vehicle"
-    env.close()
-    assert not pygame.display.get_init()
 
 
 def test_importing_the_env_stays_light():

@@ -5,11 +5,9 @@ from thruster_env.core.compiled import function_fingerprint, interpreted, is_int
 from thruster_env.core.sources import (
     column_reader,
     column_writer,
-    matrix_of,
     matrix_reader,
     matrix_writer,
     scaled_sum,
-    tuple_of,
     vector_reader,
     vector_writer,
     written_out,
@@ -18,15 +16,6 @@ from thruster_env.graphs.loops import Loops
 
 ROW = np.arange(10.0, 22.0)
 TABLE = ROW.reshape(3, 4)
-
-
-@pytest.mark.parametrize(("names", "value"), [("", ()), ("a", (1,)), ("ab", (1, 2))])
-def test_source_of_a_tuple_is_a_tuple_at_every_length(names, value):
-    assert eval(tuple_of(names), {"a": 1, "b": 2}) == value
-
-
-def test_source_of_a_matrix_goes_by_rows():
-    assert eval(matrix_of(2, 3, lambda i, j: f"{10 * i + j}")) == ((0, 1, 2), (10, 11, 12))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -75,11 +64,6 @@ def test_written_out_functions_see_the_names_they_were_given():
     plus = written_out("plus", "x", "y = x * factor", "y + 1", factor=3)
     assert plus.__name__ == "plus"
     assert plus(2) == 7
-
-
-def test_one_function_is_made_for_one_shape():
-    assert matrix_reader(2, 2) is matrix_reader(2, 2)
-    assert matrix_reader(2, 2, 1) is not matrix_reader(2, 2)
 
 
 def shuffle(row, table):

@@ -4,9 +4,6 @@ import numpy as np
 import pytest
 
 from tests.thruster_env.logs.test_logs import MODEL, log_of
-from thruster_env.logs import columns as columns_module
-from thruster_env.logs import table
-from thruster_env.logs.columns import parted
 from thruster_env.logs.read import read_log
 from thruster_env.logs.write import write_columns, write_log
 from thruster_env.thruster.model import thruster_model
@@ -91,34 +88,6 @@ def test_a_measurement_goes_before_what_only_has_its_name(tmp_path):
     (tmp_path / "run.csv").write_text("time_s,voltage,thrust,measured_thrust\n0,1,2,4\n1,2,3,5\n2,3,5,7\n")
     log = read_log(tmp_path / "run.csv", model)
     assert log.measurements[:, 0].tolist() == [4.0, 5.0, 7.0] and log.references["output:T"].tolist() == [2, 3, 5]
-
-
-class Names(list):
-    """Names that are counted where one after the other is looked at."""
-
-    looked = 0
-
-    def __contains__(self, one):
-        Names.looked += len(self)
-        return super().__contains__(one)
-
-    def __getitem__(self, place):
-        Names.looked += len(self) if isinstance(place, slice) else 1
-        return super().__getitem__(place)
-
-
-def test_the_columns_of_a_wide_table_are_looked_at_a_few_times_only(monkeypatch):
-    calls = []
-    monkeypatch.setattr(columns_module, "parted", lambda header: calls.append(0) or parted(header))
-    names = Names(f"column_{place}_V" for place in range(2000))
-    Names.looked = 0
-    table._check_header(names, 1, "run.csv")
-    headers = ["time_s", "voltage_V", "tach", *names]
-    found = columns_module.find_columns(columns_module.quantities_of(MODEL), headers, {}, {}, "run.csv")
-    assert len(found) == 3 and len(calls) < 2 * len(headers) and Names.looked < 2 * len(names)
-    with pytest.raises(ValueError, match="column_6_V and 1993 more") as error:
-        columns_module.find_columns(columns_module.quantities_of(MODEL), headers[2:], {}, {}, "run.csv")
-    assert len(str(error.value)) < 600
 
 
 @pytest.mark.parametrize("name", [r"$\frac$", "[/]", "a,b", 'say "V"', "x;y", "n" * 400, "two\nlines", " spaces"])

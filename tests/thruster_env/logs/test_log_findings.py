@@ -9,7 +9,6 @@ from tests.thruster_env.logs.test_logs import MODEL
 from tests.tuning.test_log_problem import logs_of
 from thruster_env.logs.findings import has_outliers, outliers, remarks_on, sentences
 from thruster_env.logs.read import read_log
-from thruster_env.logs.write import draw_findings
 from tuning.problems.find import find_problem
 
 
@@ -179,17 +178,3 @@ def test_many_of_one_kind_are_one_sentence():
     assert both.startswith("a table: a gap: ") and both.endswith(
         f" (the longest of 18 in 2 logs, {2 * rows} rows in all)."
     )
-
-
-def test_the_picture_marks_what_was_found():
-    table = recorded()
-    kept = np.r_[0:300, 340:1000]
-    table["tach"][600:680] = table["tach"][600]
-    table["tach"][[100, 800]] += 5.0
-    _, log = found({name: values[kept] for name, values in table.items()}, name=r"$\frac$ [/].csv")
-    figure = draw_findings(log)
-    figure.canvas.draw()
-    words = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert words == ["input", "gap", "sample", "stuck", "outlier"]
-    assert [axis.get_ylabel().split("\n")[0] for axis in figure.axes] == ["voltage", "tachometer"]
-    assert figure.axes[-1].get_xlabel() == "time [s]" and "[V]" in figure.axes[0].get_ylabel()

@@ -8,8 +8,7 @@ import pytest
 from scipy.io import savemat
 
 from filters.logs.estimate import estimate
-from filters.logs.findings import columns_of, episode_sentence
-from filters.monitoring.monitor import Alarm
+from filters.logs.findings import columns_of
 from tests.fuzz.logs import MODEL
 from thruster_env.logs.findings import sentences
 from thruster_env.logs.read import read_log
@@ -56,16 +55,6 @@ def test_a_finding_says_when_it_was(start, dt):
     assert ("UTC" in said) == (date.year in range(1990, 2099))
     if "UTC" in said:
         assert said.endswith(f" ({date:%Y-%m-%d %H:%M:%S}.{date.microsecond // 1000:03d} UTC).")
-
-
-def test_an_alarm_says_when_it_was():
-    times = 1.7e9 + 0.01 * np.arange(200)
-    alarm = Alarm(step=123, channel=0, test="cusum", size=0.3, since=100)
-    said = episode_sentence([alarm], MODEL.measurements[0], times)
-    assert said == (
-        "z_1: a bias of +0.3 rad/s since 1700000001 s, found at 1700000001.23 s "
-        "(2023-11-14 22:13:21.230 UTC) (cusum)"
-    )
 
 
 K = np.arange(60)

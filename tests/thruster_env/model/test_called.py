@@ -17,8 +17,6 @@ from thruster_env.graphs.tracing import traced
 from thruster_env.model.simulate import seconds_as_python
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.traced import TABLES, _machine_code, called_function
-from tuning.problems import check
-from tuning.problems.model_problem import ModelProblem
 
 GAINS = {"pull": 0.3, "names": ("a", "b")}
 LOGGER = logging.getLogger(__name__)
@@ -204,17 +202,6 @@ def test_the_time_of_python_is_that_of_models_which_are_no_machine_code():
     assert seconds_as_python(model_of(lambda x, u, c: newton(x, c))) == 0.0
     with pytest.warns(UserWarning, match=r"runs as Python, .* catching catches exceptions"):
         assert 0.0 < seconds_as_python(model_of(lambda x, u, c: catching(x, c))) < 0.1
-
-
-def test_a_problem_says_what_python_will_take(monkeypatch):
-    monkeypatch.setattr(check, "seconds_as_python", lambda model: 1e-3)
-    problem = ModelProblem(model_of(newton_step), inputs=np.zeros((400, 1)), scale=(1.0,))
-    with pytest.warns(UserWarning, match="may take 2 min for 100 runs of 400 steps"):
-        check.checked_problem(problem)
-
-
-def newton_step(x, u, c):
-    return newton(x, c)
 
 
 def test_what_fails_otherwise_than_by_a_raise_of_its_own_has_no_outcome():

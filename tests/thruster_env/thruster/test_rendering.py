@@ -3,30 +3,20 @@ import subprocess
 import sys
 import time
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import DependencyNotInstalled
-from gymnasium.wrappers import RecordVideo
 
 from thruster_env.thruster.rendering import ChartEntry, Overlay, Renderer
 
 pygame = pytest.importorskip("pygame")
 
-from thruster_env.render.canvas import BAND, fitting_axis  # noqa: E402
-from thruster_env.render.renderer import Window  # noqa: E402
+from thruster_env.render.canvas import fitting_axis  # noqa: E402
 from thruster_env.thruster.rendering import (  # noqa: E402  # noqa: E402
-    AXIS,
-    BLADES,
     FLOW,
     FORCE,
     FORCE_LENGTH,
-    MARK,
     MIDDLE,
-    OUTSIDE,
-    PORTHOLE,
-    PORTHOLE_RADIUS,
-    end_view,
 )
 
 GEAR_RATIO, DT = 2.0, 0.01
@@ -63,24 +53,6 @@ def pixels_like(picture, colour, tolerance=20):
     return np.abs(picture.astype(int) - colour).max(axis=-1) <= tolerance
 
 
-def porthole(picture):
-    """The propeller seen from port without the rim, where its mark goes round."""
-    (x, y), r = PORTHOLE, PORTHOLE_RADIUS - 5
-    rows, columns = np.ogrid[: picture.shape[0], : picture.shape[1]]
-    inside = (columns + 0.5 - x) ** 2 + (rows + 0.5 - y) ** 2 < r * r
-    return picture[inside].astype(int)
-
-
-def turned(angle):
-    """The porthole after the propeller has turned by an angle [rad] and stands still."""
-    r = renderer()
-    for omega_m in (0.0, angle * GEAR_RATIO / DT, 0.0):
-        r.add(REST._replace(omega_m=omega_m))
-    r.draw()
-    r.add(REST)
-    return porthole(r.draw())
-
-
 # --- pictures ---------------------------------------------------------------------------------------------
 
 
@@ -88,12 +60,6 @@ def test_a_frame_is_an_rgb_array():
     picture = frame(FORWARD)
     assert picture.shape == (400, 640, 3) and picture.dtype == np.uint8
     assert picture.flags["C_CONTIGUOUS"] and picture.flags["WRITEABLE"]
-
-
-def test_no_display_is_needed_off_screen():
-    pygame.display.quit()
-    frame(FORWARD)
-    assert not pygame.display.get_init()
 
 
 def test_the_same_moments_give_the_same_frames():
@@ -131,11 +97,6 @@ def test_charts_forget_what_is_older_than_500_steps():
     np.testing.assert_array_equal(frame(*old, *[REST] * 90, *new)[190:], frame(*[REST] * 120, *new)[190:])
 
 
-def test_drawing_needs_a_moment():
-    with pytest.raises(RuntimeError, match="there must be a moment to draw"):
-        renderer().draw()
-
-
 @pytest.mark.parametrize("other", [FORWARD, REVERSE, REST._replace(voltage=5.0), REST._replace(reference=None)])
 def test_what_happens_is_seen(other):
     assert (frame(other) != frame(REST)).any()
@@ -164,15 +125,6 @@ def test_forward_and_reverse_flow_are_mirror_images():
     assert (forward != reverse).sum() > 0.4 * forward.sum()
 
 
-def test_the_jet_is_as_long_as_the_flow_is_fast():
-    def length(flow):
-        jet = np.flatnonzero(flow_arrows(flow)[AXIS - 55, MIDDLE:])  # on the axis
-        return jet[-1] - jet[0] + 1
-
-    assert length(3.0) == pytest.approx(OUTSIDE * 3.0 / 7.35, abs=3)
-    assert length(6.0) == pytest.approx(OUTSIDE * 6.0 / 7.35, abs=3)
-
-
 @pytest.mark.parametrize("thrust", [20.0, -20.0])
 def test_the_ship_is_pushed_against_the_water_that_is_driven(thrust):
     arrow = pixels_like(frame(REST._replace(thrust=thrust)), FORCE)[:25, : MIDDLE + 80]
@@ -180,12 +132,6 @@ def test_the_ship_is_pushed_against_the_water_that_is_driven(thrust):
     widest = np.argmax(arrow.sum(axis=0))
     assert columns[-1] - columns[0] == pytest.approx(FORCE_LENGTH * 20 / 49.1, abs=4)
     assert (widest < MIDDLE) == (thrust > 0)
-
-
-def test_ambient_flow_has_an_arrow_of_its_own():
-    still, ambient = frame(REST), frame(REST._replace(ambient_velocity=2.0))
-    rows, columns = np.nonzero((still != ambient).any(axis=-1))
-    assert rows.min() > 140 and columns.max() < 140 and rows.max() < 186
 
 
 # --- the propeller ----------------------------------------------------------------------------------------
@@ -202,46 +148,6 @@ def test_blades_turn_with_the_propeller_not_with_the_frames():
     assert r.blade_angle == pytest.approx(by_trapezoids, rel=1e-12)
 
 
-def test_blades_are_where_their_angle_says():
-    start, blade = turned(0.0), 2 * math.pi / BLADES
-    np.testing.assert_allclose(turned(blade), start, atol=1)
-    np.testing.assert_allclose(turned(-3 * blade), start, atol=1)
-    assert np.abs(turned(0.5 * blade) - start).mean() > 10
-
-
-def test_a_blur_is_the_mean_of_what_was_passed():
-    view = end_view(30)
-    whole = view.mean(0.3, 1.1).astype(float)
-    parts = [view.mean(0.3 + 0.2 * k, 0.5 + 0.2 * k).astype(float) for k in range(4)]
-    np.testing.assert_allclose(whole, np.mean(parts, axis=0), atol=1.5)
-    np.testing.assert_array_equal(view.mean(1.1, 0.3), view.mean(0.3, 1.1))
-    np.testing.assert_allclose(view.mean(1000 * math.pi + 0.3, 1000 * math.pi + 1.1), whole, atol=1)
-
-
-def test_a_whole_turn_in_a_frame_is_a_disc_without_blades():
-    view, around = end_view(30), np.linspace(0, 2 * math.pi, 60, endpoint=False)
-    x, y = (30 + 20 * np.sin(around)).astype(int), (30 - 20 * np.cos(around)).astype(int)
-    assert np.ptp(view.mean(0.0, 0.0)[y, x, 3].astype(int)) == 255
-    assert np.ptp(view.mean(0.2, 0.2 + 2 * math.pi)[y, x, 3].astype(int)) < 20
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_the_mark_on_the_rim_trails_the_angle_turned_in_a_frame(sign):
-    r = renderer()
-    for _ in range(2):  # one radian in the step
-        r.add(REST._replace(omega_m=sign * GEAR_RATIO / DT))
-    picture, (x, y) = r.draw(), PORTHOLE
-
-    def on_rim(angle):
-        place = y - (PORTHOLE_RADIUS + 2.5) * math.cos(angle), x + (PORTHOLE_RADIUS + 2.5) * math.sin(angle)
-        return picture[int(place[0]), int(place[1])].astype(int)
-
-    rest = on_rim(math.pi)
-    assert np.abs(on_rim(sign * 1.0) - MARK).max() < 30  # its head, clockwise for a positive speed
-    assert np.abs(on_rim(sign * 0.8) - rest).max() > 60
-    assert np.abs(on_rim(sign * 1.2) - rest).max() < 10
-
-
 # --- estimates --------------------------------------------------------------------------------------------
 
 
@@ -250,19 +156,6 @@ def test_an_overlay_is_seen():
     believed = frame(FORWARD, FORWARD, overlay=BELIEF)
     changed = (plain != believed).any(axis=-1)
     assert changed[190:].any() and not changed[:186].any()
-
-
-@pytest.mark.parametrize("name", Overlay._fields[1:])
-def test_an_overlay_may_leave_things_out(name):
-    partial = frame(FORWARD, FORWARD, overlay=BELIEF._replace(**{name: None}))
-    assert (partial != frame(FORWARD, FORWARD, overlay=BELIEF)).any()
-
-
-def test_a_wider_band_is_wider():
-    wide = frame(*[FORWARD] * 20, overlay=BELIEF._replace(omega_m_std=40.0))
-    narrow = frame(*[FORWARD] * 20, overlay=BELIEF._replace(omega_m_std=10.0))
-    chart = (slice(293, 329), slice(440, 486))
-    assert pixels_like(wide[chart], BAND, 4).sum() > 2 * pixels_like(narrow[chart], BAND, 4).sum()
 
 
 def test_an_estimate_that_comes_after_its_step_stands_at_its_step():
@@ -332,21 +225,6 @@ def test_a_window_keeps_real_time(window):
     assert time.perf_counter() - start > 0.15  # 0.2 s; some of it may be made up for
 
 
-def test_a_window_leaves_out_frames_that_come_late():
-    calls, picture = [], pygame.Surface((640, 400))
-
-    def slow_picture():
-        calls.append(None)
-        time.sleep(0.03)
-        return picture
-
-    slow = Window(0.01, "slow")
-    for _ in range(30):
-        slow.show(slow_picture)
-    slow.close()
-    assert 3 <= len(calls) < 20
-
-
 @pytest.mark.parametrize("kind", [pygame.QUIT, pygame.WINDOWCLOSE])
 def test_a_window_closed_by_hand_stays_closed(window, kind):
     window.draw()
@@ -360,13 +238,6 @@ def test_a_window_closed_by_hand_stays_closed(window, kind):
     assert pygame.display.get_init()
 
 
-def test_other_events_are_left_to_the_caller(window):
-    window.draw()
-    pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_LEFT))
-    window.draw()
-    assert pygame.event.get(pygame.KEYDOWN)
-
-
 def test_another_env_may_end_pygame(window):
     off_screen = renderer()
     off_screen.add(FORWARD)
@@ -376,41 +247,6 @@ def test_another_env_may_end_pygame(window):
     off_screen.add(REVERSE._replace(time=2.0))
     assert (off_screen.draw() != before).any()
     assert window.draw() is None
-
-
-class Turning(gym.Env):
-    """The least env that can be filmed."""
-
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 100}
-    action_space = observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-    render_mode = "rgb_array"
-
-    def __init__(self):
-        self.renderer = renderer()
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.renderer.begin()
-        self.renderer.add(REST)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.renderer.add(FORWARD)
-        return np.zeros(1, np.float32), 0.0, False, False, {}
-
-    def render(self):
-        return self.renderer.draw()
-
-
-def test_an_episode_can_be_filmed(tmp_path):
-    pytest.importorskip("moviepy")
-    env = RecordVideo(Turning(), str(tmp_path / "videos"), disable_logger=True)
-    env.reset()
-    for _ in range(12):
-        env.step(np.zeros(1, np.float32))
-    env.close()
-    (video,) = tmp_path.glob("videos/*.mp4")
-    assert video.stat().st_size > 1000
 
 
 @pytest.mark.parametrize(

@@ -125,7 +125,9 @@ def test_a_bias_without_spread_is_a_constant_and_is_forgotten_at_the_next_episod
 
 @pytest.mark.parametrize("step", [0.05, 3.0, 1e-20])
 def test_quantised_readings_are_the_nearest_multiples(step):
-    raw, rounded = read([NOTHING], r=0.25), read([{"name": "quantisation", "step": step}], r=0.25)
+    raw, rounded = (
+        read([effect], r=0.25, copies=20) for effect in (NOTHING, {"name": "quantisation", "step": step})
+    )
     assert (np.abs(rounded - raw) <= step / 2 + 1e-12).all()
     if step > 1e-3:
         np.testing.assert_allclose(rounded / step, np.round(rounded / step), rtol=0, atol=1e-9)
@@ -189,29 +191,31 @@ def test_validity_is_told_in_the_observation_and_in_info():
 
 @pytest.mark.parametrize("steps", [1, 2, 7])
 def test_a_delay_is_exactly_so_many_steps_late_and_repeats_the_first(steps):
-    raw, late = read([NOTHING], r=0.25), read([{"name": "delay", "steps": steps}], r=0.25)
+    raw, late = (read([effect], r=0.25, copies=20) for effect in (NOTHING, {"name": "delay", "steps": steps}))
     np.testing.assert_array_equal(late[:, steps:], raw[:, :-steps])
     np.testing.assert_array_equal(late[:, :steps], np.repeat(raw[:, :1], steps, axis=1))
 
 
 def test_a_delay_after_dropout_delays_the_flag_too_and_one_before_it_does_not():
     dropout, delay = {"name": "dropout", "probability": 0.3, "mean_length": 3.0}, {"name": "delay", "steps": 4}
-    lost, both = run_of([dropout], r=0.25), run_of([dropout, delay], r=0.25)
+    lost, both = run_of([dropout], r=0.25, copies=20), run_of([dropout, delay], r=0.25, copies=20)
     for late, now in ((both.measurements, lost.measurements), (both.valid, lost.valid)):
         np.testing.assert_array_equal(late[:, 4:], now[:, :-4])
         np.testing.assert_array_equal(late[:, :4], np.repeat(now[:, :1], 4, axis=1))
-    late, lost = read([delay], r=0.25), run_of([delay, dropout], r=0.25)
+    late, lost = read([delay], r=0.25, copies=20), run_of([delay, dropout], r=0.25, copies=20)
     np.testing.assert_array_equal(lost.measurements[..., 0], held(late, lost.valid[..., 0]))
 
 
 def test_effects_act_in_the_order_of_the_list():
     clip, shift = {"name": "saturation", "low": -5.0, "high": 5.0}, {"name": "bias", "value": 2.0}
-    rounding, raw = {"name": "quantisation", "step": 0.7}, read([NOTHING])
-    np.testing.assert_array_equal(read([clip]), np.clip(raw, -5, 5))
-    np.testing.assert_allclose(read([clip, shift]), np.clip(raw, -5, 5) + 2.0, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(read([shift, clip]), np.clip(raw + 2.0, -5, 5), rtol=0, atol=1e-12)
+    rounding, raw = {"name": "quantisation", "step": 0.7}, read([NOTHING], copies=20)
+    np.testing.assert_array_equal(read([clip], copies=20), np.clip(raw, -5, 5))
+    np.testing.assert_allclose(read([clip, shift], copies=20), np.clip(raw, -5, 5) + 2.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(read([shift, clip], copies=20), np.clip(raw + 2.0, -5, 5), rtol=0, atol=1e-12)
     rounded = np.floor((raw + 2.0) / 0.7 + 0.5) * 0.7
-    np.testing.assert_allclose(read([shift, rounding, clip]), np.clip(rounded, -5, 5), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        read([shift, rounding, clip], copies=20), np.clip(rounded, -5, 5), rtol=0, atol=1e-12
+    )
 
 
 def test_two_equal_effects_draw_different_numbers():
