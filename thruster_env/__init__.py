@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from thruster_env.thruster.parameters import PRESETS, ThrusterParameters
 
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "PRESETS",
     "BowThrusterEnv",

@@ -82,7 +82,7 @@ class TaskMap:
             self._executor = self._open()
         # A pool of processes takes more tasks than it has processes, and does not give them back.
         most = self._executor.count if isinstance(self._executor, Processes) else MOST_PROCESSES
-        own = isinstance(self._executor, Processes)
+        closes = isinstance(self._executor, Processes)
         waiting, begun = list(tasks)[::-1], dict[Future, int]()
         try:
             while (waiting and not stop()) or begun:
@@ -90,12 +90,12 @@ class TaskMap:
                     content = packed_task(function, tasks[waiting[-1]])
                     with without_interrupts(), safe_paths():
                         begun[self._executor.submit(run_packed, content)] = waiting.pop()
-                if stop() and not own:
+                if stop() and not closes:
                     begun = {future: index for future, index in begun.items() if not future.cancel()}
                 for future in wait(begun, return_when=FIRST_COMPLETED).done:
                     yield begun.pop(future), future.result()
         finally:
-            if not own:  # processes are ended in `close`
+            if not closes:  # processes are ended in `close`
                 for future in begun:
                     future.cancel()
 

@@ -54,7 +54,7 @@ def test_make_installs_again_where_a_copy_has_taken_the_place_of_the_checkout(tm
         (tmp_path / name).touch()
     site = tmp_path / ".venv" / "lib" / "python3.12" / "site-packages"
     site.mkdir(parents=True)
-    installed = site / "__editable__.thruster_env-0.1.0.pth"
+    installed = site / "__editable__.thruster_env-0.2.0.pth"
     installed.touch()
     stamps = [tmp_path / ".venv" / name for name in (".made", ".base", ".docs")]
     for stamp in stamps:
