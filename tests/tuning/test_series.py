@@ -18,7 +18,7 @@ from filters.named import model_named
 from thruster_env.graphs.loops import machine_code_of
 from tuning.series.answer import _digits
 from tuning.series.column import column_of, seconds_text
-from tuning.series.fit import Number
+from tuning.series.fit import Number, choose
 from tuning.series.likelihood import ColumnLikelihood
 from tuning.series.paste import LANGUAGES, lines_of
 from tuning.series.periods import outstanding_period
@@ -526,6 +526,16 @@ def test_a_daily_course_and_steps_between_numbers():
     assert masked.remarks == ("1 of 240 row is missing, in 1 place.",)  # without an input that is held
 
 
+def test_what_a_chosen_model_misses_is_tried_too():
+    rng, z = np.random.default_rng(6), np.zeros(400)
+    for k in range(2, 400):
+        z[k] = 0.6 * z[k - 1] - 0.7 * z[k - 2] + rng.normal()
+    choice = choose(
+        column_of(z), ("constant",), further=lambda chosen, level: ["ar:2"] * (chosen.name == "constant")
+    )
+    assert choice.chosen.name == "ar:2" and len(choice.candidates) == 2
+
+
 def test_a_day_that_no_model_has_is_named_with_the_model_that_has_it():
     rng, hours = np.random.default_rng(3), np.arange(240.0)
     z = np.cos(2.0 * np.pi * (hours - 9.0) / 24.0) + 0.4 * np.cos(4.0 * np.pi * hours / 24.0)
@@ -536,8 +546,11 @@ def test_a_day_that_no_model_has_is_named_with_the_model_that_has_it():
     assert fit.is_wrong and "one each 3600 s (1 h)" in str(fit)
     assert fit.sentences()[1] == f'A period of 86400 s (24 h) stands out: try --model "{model}".'
     assert f'try --model "{model}".' in str(fit).splitlines()[3]
+    assert fit.missing_models() == [model, "ar:2", "ar:3", "ar:4"]
     better = tuning.fit(z, 3600.0, model=model)
     assert not better.is_wrong and "harmonics=2,constant_drift=" in str(better).splitlines()[-1]
+    week = np.tile([3.0, -1.0, 0.5, 2.0, -2.0, 0.0, 1.0], 40) + 0.2 * np.random.default_rng(5).normal(size=280)
+    assert tuning.fit(week, model="constant").missing_models()[0] == "constant + seasonal:period=7,seasons=7"
     for noise in (rng.normal(size=500), np.cumsum(rng.normal(size=500))):
         assert outstanding_period(column_of(noise)) is None
     period = outstanding_period(column_of(np.cos(2.0 * np.pi * np.arange(500) / 23.7) + rng.normal(size=500)))

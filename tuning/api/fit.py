@@ -11,9 +11,9 @@ from thruster_env.core.files import check_target, save_figure, write_whole
 from thruster_env.logs.write import check_picture
 from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, Argument, Option, Progress, PythonOnly
 from tuning.api.progress import console_for
-from tuning.series.answer import SeriesFit
+from tuning.series.answer import SeriesFit, choose_among_all
 from tuning.series.column import column_of
-from tuning.series.fit import CANDIDATES, choose
+from tuning.series.fit import choose
 from tuning.series.paste import LANGUAGES
 
 
@@ -74,9 +74,14 @@ def fit(
     if not isinstance(model, str):
         raise ValueError(f"model (--model) must be {AUTO}, or a model's name, but got {short_repr(model)}")
     data = column_of(z, dt, times=times, column=column)
-    names = CANDIDATES if model.strip().lower() == AUTO else (model,)
     with console_for(progress).status("fitting ...") as status:
-        fitted = SeriesFit(data, *choose(data, names, lambda name: status.update(f"fitting {name} ...")))
+
+        def fitting(name: str) -> None:
+            status.update(f"fitting {name} ...")
+
+        is_auto = model.strip().lower() == AUTO
+        choice = choose_among_all(data, fitting) if is_auto else choose(data, (model,), fitting)
+    fitted = SeriesFit(data, *choice)
     if plot is not None:
         save_figure(fitted.plot(), plot)
     if code is not None:

@@ -57,7 +57,8 @@ class ModelFamily:
         known = self.known
         wrong = [name for name in names if name not in known]
         if wrong:
-            raise ValueError(f"free parameters must be of {', '.join(known)}, but got {short_repr(wrong[0])}")
+            way = ": a sensor's lag is a state of the model" if wrong[0].startswith("lag_") else ""
+            raise ValueError(f"free parameters must be of {', '.join(known)}, but got {short_repr(wrong[0])}{way}")
         self.free = tuple(known[name] for name in names)
 
     @property

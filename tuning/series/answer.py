@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,7 @@ from thruster_env.model.continuous import ContinuousModel
 from tuning.api.result import Result, frame
 from tuning.likelihood.ascent import climb
 from tuning.series.column import Column, seconds_text
-from tuning.series.fit import Candidate, Number, behind, filtered
+from tuning.series.fit import CANDIDATES, Candidate, Choice, Number, behind, choose, filtered
 from tuning.series.likelihood import ColumnLikelihood, R, model_of
 from tuning.series.paste import ARDUINO, lines_of
 from tuning.series.periods import Period, outstanding_period
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
 
+LONGEST_SEASON = 12  # values of a pattern that is tried, each of which is a state
+MOST_LAGS = 4  # of an autoregression that is tried
 WHITE = 0.001  # probability from which innovations count as white
 HIDDEN = 1e-9  # share of a mode in the measurements, below which they do not show it
 SLOW = 1e-3  # Hz, below which a frequency is also given as a period
@@ -40,6 +43,16 @@ PERIODIC = {"harmonic", "seasonal"}  # models of a period
 OF_PERIOD = "A period of "
 NEVER = "the filter never forgets its start"
 LARGE = 0.05  # correlation of innovations that matters
+
+
+def choose_among_all(column: Column, progress: Callable[[str], None] = lambda name: None) -> Choice:
+    """The choice among `fit.CANDIDATES`; if none leaves white innovations, also among lags and periods."""
+
+    def further(chosen: Candidate, level: np.ndarray | None) -> list[str]:
+        fit = SeriesFit(column, chosen, (chosen,), (), level)
+        return fit.missing_models() if fit.is_wrong else []
+
+    return choose(column, CANDIDATES, progress, further)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -171,6 +184,18 @@ class SeriesFit(Result):
     @cached_property
     def _period(self) -> Period | None:
         return outstanding_period(self.column)
+
+    def missing_models(self) -> list[str]:
+        """Models that may have what this one misses: of a period that stands out, or more lags of equal steps."""
+        names, period, steps, dt = [], self._period, self.column.stamps is None, self.column.dt
+        if period is not None:
+            rows, duration = round(period.seconds / dt), dt * len(self.column.values)
+            is_whole = steps and abs(duration / (rows * dt) - duration / period.seconds) < 0.5  # periods
+            if is_whole and period.harmonics > 1 and rows <= LONGEST_SEASON:
+                names.append(f"constant + seasonal:period={rows * dt:.7g},seasons={rows}")
+            else:
+                names.append(period.model)
+        return names + [f"ar:{lags}" for lags in range(2, MOST_LAGS + 1) if steps]
 
     def axes_differ(self) -> float:
         """Probability of so large a likelihood ratio, if all axes have the same numbers; 1 for one axis."""

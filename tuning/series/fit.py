@@ -89,6 +89,11 @@ class Fitted(NamedTuple):
     in_sample: float = 0.0
 
     @property
+    def mean(self) -> np.ndarray | None:
+        """The mean about which the signal of each axis varies, (axes,), if it does."""
+        return self.objective.level(self.ascent.at) if self.model.about_mean else None
+
+    @property
     def candidate(self) -> Candidate:
         """What is left of it for the answer: plain data."""
         values = self.objective.coordinates.named(self.ascent.at)
@@ -117,7 +122,12 @@ class Choice(NamedTuple):
     level: np.ndarray | None  # the mean about which the signal of each axis varies, (axes,), if it does
 
 
-def choose(column: Column, names: Sequence[str], progress: Callable[[str], None] = lambda name: None) -> Choice:
+def choose(
+    column: Column,
+    names: Sequence[str],
+    progress: Callable[[str], None] = lambda name: None,
+    further: Callable[[Candidate, np.ndarray | None], Sequence[str]] | None = None,
+) -> Choice:
     """Fit named models and choose one: the simplest of those that are not significantly worse than the best.
 
     A record of more than `MOST_ROWS` rows is compared on its middle; the numbers are those of all rows.
@@ -126,25 +136,29 @@ def choose(column: Column, names: Sequence[str], progress: Callable[[str], None]
         column: the numbers.
         names: of the models, as `filters.models.named_model` takes them.
         progress: called with each name before it is fitted.
+        further: names of models to be tried, too, by the chosen one and its mean, because it misses something.
 
     Raises:
         ValueError: for an unknown model, or one that has no likelihood.
     """
     models = [named_model(name) for name in names]
     column.check_noise()
-    part, fitted = column.middle(MOST_ROWS), []
-    for model in models:
-        progress(model.name)
-        fitted.append(_fit(model, part, prove=len(models) > 1))
-    fitted.sort(key=lambda result: -result.held_out.sum())
-    candidates = tuple(result.candidate for result in fitted)
-    tied = [i for i, candidate in enumerate(candidates) if _ties(candidate, candidates[0], len(part.values))]
-    chosen = fitted[min(tied, key=lambda i: candidates[i].size)]
+    part, fitted = column.middle(MOST_ROWS), list[Fitted]()
+    for again in (False, True):
+        for model in models:
+            progress(model.name)
+            fitted.append(_fit(model, part, prove=len(names) > 1 or further is not None))
+        fitted.sort(key=lambda result: -result.held_out.sum())
+        candidates = tuple(result.candidate for result in fitted)
+        tied = [i for i, candidate in enumerate(candidates) if _ties(candidate, candidates[0], len(part.values))]
+        chosen = fitted[min(tied, key=lambda i: candidates[i].size)]
+        if again or further is None:
+            break
+        models = [named_model(name) for name in further(chosen.candidate, chosen.mean)]
     if part is not column:
         progress(f"{chosen.model.name} on all rows")
         chosen = _on_all(chosen, column)
-    level = chosen.objective.level(chosen.ascent.at) if chosen.model.about_mean else None
-    return Choice(chosen.candidate, candidates, _numbers(chosen, column), level)
+    return Choice(chosen.candidate, candidates, _numbers(chosen, column), chosen.mean)
 
 
 def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:

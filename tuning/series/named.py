@@ -101,7 +101,8 @@ def with_numbers(
     Raises:
         ValueError: for data without a likelihood.
     """
-    from tuning.series.fit import CANDIDATES, choose  # with what only a search needs
+    from tuning.series.answer import choose_among_all  # with what only a search needs
+    from tuning.series.fit import choose
     from tuning.series.likelihood import ColumnLikelihood
 
     values = log.measurements if rows is None else np.where(rows[:, None], log.measurements, np.nan)
@@ -114,7 +115,7 @@ def with_numbers(
                 f"{rule}, since noise of interpolated samples is correlated, but log {log.name} has some: leave "
                 "them out, or give the numbers"
             )
-        chosen = choose(column, CANDIDATES if maker.name == AUTO else (maker.name,)).chosen
+        chosen = (choose_among_all(column) if maker.name == AUTO else choose(column, (maker.name,))).chosen
         maker, known = replace(maker, name=chosen.name), {**chosen.values, **known}
         numbers = {name: known[name] for name in maker.names}
         of = "this log" if rows is None else "the training rows"
