@@ -16,7 +16,7 @@ from filters.algebra.points import dot
 from filters.engine.batch import run
 from filters.engine.belief import memory_offsets
 from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
-from filters.filter import Filter, FilterWithPage, with_page
+from filters.filter import Filter, FilterWithPage, PageFilter, with_page
 from filters.pages.kernels import MembersMemory, numbers_of, stages_of
 from filters.pages.kernels import member_stages_of as stages_of_members
 from filters.pages.page import Equations, RowMemory
@@ -146,7 +146,7 @@ def programs_of(filter_: Filter) -> FilterPrograms:
     """
     paged = with_page(filter_, "a filter in C")
     model = paged.kernel_model
-    shape = model.any_shape if getattr(paged, "takes_rotations", False) else model.shape
+    shape = model.any_shape if isinstance(paged, PageFilter) and paged.takes_rotations else model.shape
     f, by_f, h, by_h = model.functions
     try:
         _check_traced("transition", f, by_f, "motion", shape)

@@ -290,7 +290,7 @@ class EnsembleFilter(FilterWithPage):
     @property
     def parameters(self) -> Mapping[str, Any]:
         """Fields that the page reads, and limits of each factor of an adaptive inflation, if it is chosen."""
-        count = np.ones(self.model.n) if self.inflation_by_state else 1.0
+        count = np.ones(self.model.t) if self.inflation_by_state else 1.0
         limits_of_factors = limits(self.adaptive_inflation, self.least_deviation).items()
         return {**super().parameters, **{name: count * limit for name, limit in limits_of_factors}}
 
@@ -317,7 +317,13 @@ class EnsembleFilter(FilterWithPage):
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
-        return members_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
+        shape = self.kernel_model.any_shape if self.takes_rotations else self.kernel_model.shape
+        return members_kernels(self.written_page, self.kernel_model.functions, shape)
+
+    @property
+    def takes_rotations(self) -> bool:
+        """Whether it takes models with rotations: if its update is its page, no radius, no random rotations."""
+        return not (self.by_parts or any(getattr(self, name, 0) for name in ("radius", "rotations")))
 
 
 def check_page_is_all(filter_: EnsembleFilter, where: str) -> None:

@@ -19,9 +19,11 @@ import numpy as np
 
 from filters.algebra.calls import arguments_of, calls_of
 from filters.algebra.matrices import Matrix, Operation, evaluate, in_order, input_matrix
-from filters.algebra.members import covariance, mean, on_branch
-from filters.algebra.operations import present, quotient, slopes_of, wrap
+from filters.algebra.members import on_branch
+from filters.algebra.operations import present, quotient, slopes_of
+from filters.algebra.tangents import moved
 from filters.engine.belief import Kernels, filter_offset, memory_offsets, row_access
+from filters.pages.charts import moments, on_tangent
 from filters.pages.page import Equations, NumbersMemory, Page, PagedModel, RowMemory, acting_places
 from thruster_env.core.sources import matrix_reader, vector_reader
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
@@ -36,7 +38,7 @@ from thruster_env.graphs.programs import (
     cut,
     program_of,
 )
-from thruster_env.model.shape import LANES, Functions, Shape, constants_reader, number_offsets
+from thruster_env.model.shape import LANES, Functions, Shape, constants_reader
 from thruster_env.model.traced import MOST
 
 OF_PARAMETER = ("change", "move")  # arrays that differ between parameters
@@ -399,23 +401,26 @@ class MembersMemory(NumbersMemory):
     """
 
     def __init__(self, shape: Shape, page: Page):
-        row = memory_offsets(shape.n, shape.m)
+        row = memory_offsets(shape.n, shape.m, shape.t)
         x = input_matrix(Place("table", 0), (shape.n,), member=True)
-        p = input_matrix(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, like=x)
+        p = input_matrix(Place("rows", row.cov), (shape.t, shape.t), symmetric=True, like=x)
         super().__init__(shape, page, x, p, filter_offset(shape))
         self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
         self.ratio = self.ratio_in("given", 0)
         self.w, self.e = (
-            input_matrix(Place("draws", 0), (size,), member=True, like=x) for size in (shape.n, shape.m)
+            input_matrix(Place("draws", 0), (size,), member=True, like=x) for size in (shape.t, shape.m)
         )
         self.mean = self.read("rows", row.mean, shape.n)
 
 
 def member_stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str, Stage]:
     """Stages of a page by name: the start, a substep, the end of a step, the update, and the belief's moments."""
-    x, layout = memory.x, memory_offsets(memory.shape.n, memory.shape.m)
+    x, layout = memory.x, memory_offsets(memory.shape.n, memory.shape.m, memory.shape.t)
+    page = on_tangent(page) if model.turns else page
     outputs = layout.innovation, layout.innovation_cov, layout.log_likelihood
-    prior = on_branch(model.prior_mean + model.prior_root @ memory.w, model.state_angles)
+    w = model.prior_root @ memory.w
+    prior = moved(model.prior_mean, w, model.turns) if model.turns else model.prior_mean + w
+    prior = on_branch(prior, model.state_angles)
     started = page.started(model)
     extras = model.extras = memory.keep(started)
     after, *rest, changed = updated(pure(page.update, model, x, memory.z, memory.e), x, m=memory.shape.m)
@@ -428,11 +433,6 @@ def member_stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> di
         "update": stored((after, *rest, *moments(model, after), changed), (x, *outputs, *of_belief), extras),
         "summarise": stored(moments(model, x), of_belief),
     }
-
-
-def moments(model: PagedModel, x: Matrix) -> tuple[Matrix, Matrix]:
-    """The mean and the covariance of the members."""
-    return wrap(mean(x), model.state_angles), covariance(x, x)
 
 
 class Works(NamedTuple):
@@ -521,7 +521,7 @@ def analysis_of(page: Page, functions: Functions, shape: Shape) -> Callable:
 
 
 def _correction(work: Works, shape: Shape) -> Callable:
-    layout, m = memory_offsets(shape.n, shape.m), shape.m
+    layout, m = memory_offsets(shape.n, shape.m, shape.t), shape.m
     correct, _, draws_noise = work
     step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
@@ -544,7 +544,7 @@ def extras_size(page: Page, shape: Shape) -> int:
 
 def predictor(works: dict[str, Works], shape: Shape) -> Callable:
     """Return `predict(memory, u, numbers, size)`: propagate members in all substeps, then add process noise."""
-    layout, substeps = memory_offsets(shape.n, shape.m), number_offsets(shape.n, shape.m).substeps
+    layout, substeps = memory_offsets(shape.n, shape.m, shape.t), shape.offsets.substeps
     advance, (add_process_noise, _, drawn) = works["propagate"].work, works["add_process_noise"]
     step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
@@ -563,7 +563,7 @@ def predictor(works: dict[str, Works], shape: Shape) -> Callable:
 def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     """Kernels of an ensemble's page for a model's functions and shape."""
     n, m, works = shape.n, shape.m, member_works_of(page, functions, shape)
-    draw_prior, moments_of, layout = works["start"].work, works["summarise"].work, memory_offsets(n, m)
+    draw_prior, moments_of, layout = works["start"].work, works["summarise"].work, memory_offsets(n, m, shape.t)
     step, key_0, key_1 = layout.step, layout.key_0, layout.key_1
 
     def start(memory, numbers, size):
@@ -579,4 +579,6 @@ def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     memory = MembersMemory(shape, page)
     acting = acting_places(memory.keep(page.started(PagedModel(memory))))
     parts = start, predictor(works, shape), update, summarise
-    return Kernels(n, m, rows, max(n, m), *parts, extras=extras_size(page, shape), acting=acting)
+    return Kernels(
+        n, m, rows, max(n, m), *parts, extras=extras_size(page, shape), acting=acting, turns=len(shape.turns)
+    )

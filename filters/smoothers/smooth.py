@@ -31,6 +31,7 @@ from thruster_env.core.sources import joiner, vector_part, written_out
 from thruster_env.core.threads import spread
 from thruster_env.model.shape import number_offsets
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import refuse_rotations
 
 # The smoother of filters for several models: each pair of successive modes by a step of Rauch, Tung, Striebel.
 #
@@ -264,6 +265,7 @@ def smooth_ensembles(
         raise ValueError(f"a smoothed filter must have rotations 0, but got {rotations}")
     if getattr(filter_, "radius", 0.0) or filter_.by_parts:
         raise ValueError(f"a smoothed ensemble must have one gain for all states, but got {named(filter_)}")
+    refuse_rotations(filter_.model)
     paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
     kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
     analyse_pair = analysis_of(filter_.plain_page, paired.model.functions, paired.model.shape)

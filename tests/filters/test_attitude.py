@@ -8,6 +8,7 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
+from scipy.linalg import sqrtm
 from scipy.spatial.transform import Rotation as Turned
 
 import filters
@@ -28,6 +29,7 @@ from thruster_env.model.simulate import simulate
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import Rotation
 
+ENSEMBLES = "enkf", "etkf", "letkf", "ensrf", "denkf", "ienkf", "enkf-n"
 DT, GYRO, WALK, SENSOR, BIAS = 0.1, 2e-3, 2e-4, 0.05, 0.02
 GRAVITY, FIELD = (0.0, 0.0, 1.0), (0.0, 0.6, -0.8)
 TAKE_ROTATIONS = {  # each with parameters that make it another one, with others
@@ -328,8 +330,8 @@ def test_every_filter_runs_on_rotations_or_refuses_them(name):
     """In one line, before it computes anything."""
     extra = {"low": -np.ones(7), "high": np.ones(7)} if name == "fuzzy" else {}
     make = lambda: FILTERS[name](model=attitude_model(), **extra)  # noqa: E731
-    if name in TAKE_ROTATIONS:
-        assert make().kernel_model.t == 6
+    if name in TAKE_ROTATIONS or name in ENSEMBLES:
+        assert make().takes_rotations
     else:
         with pytest.raises(ValueError, match="is of rotations|must have an affine model"):
             make().kernels()
@@ -409,6 +411,46 @@ def test_a_fixed_lag_in_an_env_takes_rotations():
     np.testing.assert_allclose(info["smoothed_cov"], smoothed.covs[1], atol=1e-12)
 
 
+@pytest.mark.usefixtures("as_python")
+def test_an_ensemble_is_updated_in_the_tangent_at_its_mean(data):
+    """The transform filter's members and moments are those of matrices and scipy's rotations."""
+    filter_ = filters.EnsembleTransformFilter(model=attitude_model(degrees=20.0), ensemble_size=9)
+    belief = filter_.predict(filter_.init((3, 4)), data[1][0, 0])
+    updated, innovation = filter_.update(belief, data[2][0, 1])
+
+    def moments(members):
+        q, mean = Turned.from_quat(members[[1, 2, 3, 0], :9].T), members[4:7, :9].mean(axis=1)
+        centre = q[0]
+        for _ in range(50):
+            centre = centre * Turned.from_rotvec((centre.inv() * q).as_rotvec().mean(axis=0))
+        return centre, mean, np.column_stack([(centre.inv() * q).as_rotvec(), members[4:7, :9].T - mean])
+
+    q, bias, D = moments(belief.members)
+    Y = np.hstack([(q * Turned.from_rotvec(D[:, :3])).inv().apply(vector) for vector in (GRAVITY, FIELD)])
+    d, R = Y - Y.mean(axis=0), SENSOR**2 * np.eye(6)
+    S, C, v = d.T @ d / 8.0 + R, D.T @ d / 8.0, data[2][0, 1] - Y.mean(axis=0)
+    middle = R @ sqrtm(np.linalg.solve(R, S)).real
+    after = D + np.linalg.solve(S, C.T).T @ v - d @ np.linalg.solve(S + middle, C.T)
+    np.testing.assert_allclose(innovation.value, v, atol=1e-12)
+    np.testing.assert_allclose(updated.members[4:7, :9].T, bias + after[:, 3:], atol=1e-11)
+    error = (q * Turned.from_rotvec(after[:, :3])).inv() * Turned.from_quat(updated.members[[1, 2, 3, 0], :9].T)
+    assert error.magnitude().max() < 1e-8
+    q, bias, D = moments(updated.members)
+    assert (q.inv() * Turned.from_quat(updated.mean[[1, 2, 3, 0]])).magnitude() < 1e-9
+    np.testing.assert_allclose(updated.cov, D.T @ D / 8.0, atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["enkf", "ensrf"])
+def test_ensembles_are_consistent_from_twenty_degrees(name):
+    """From there the extended filter's NEES is 10 at the first measurement."""
+    truth, gyro, z = simulated(16, 40, 20.0)
+    filter_ = filters.make_filter(name, attitude_model(degrees=20.0), ensemble_size=200)
+    nees = nees_of(truth, filters.run(filter_, inputs=gyro, measurements=z))
+    assert 3.0 < nees[:, 0].mean() < 9.6
+    assert 3.0 < nees[:, 20:].mean() < 8.6
+
+
 def with_heading(x, u, c):
     """A heading beside an attitude."""
     return x[0] + u[0], *rotations.product(x[1:], rotations.exponential((0.1, 0.0, 0.0)))
@@ -477,6 +519,9 @@ def test_every_other_path_refuses_them():
         lambda: filters.ExtendedKalmanFilter(model=model, form="square-root").kernels(),
         lambda: filters.ExtendedKalmanFilter(model=model, form="ud").kernels(),
         lambda: filters.run(filter_, **data).to_frame(),
+        lambda: filters.smooth(filters.EnsembleKalmanFilter(model=model), **data),
+        lambda: filters.EnsembleTransformFilter(model=model, rotations=1).kernels(),
+        lambda: c_filter(filters.EnsembleKalmanFilter(model=model), "a"),
         lambda: consistency_report(filters.run(filter_, **batch), None),
         lambda: ForeignFilter(model=model, estimator=Estimator()),
         lambda: filters.torch(filter_),

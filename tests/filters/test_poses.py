@@ -171,4 +171,4 @@ def test_what_is_no_direction_or_pose_is_refused():
     with pytest.raises(ValueError, match="'camera' must begin with a quaternion"):
         camera().replace(prior_mean=[2.0, *[0.0] * 6, 0.0, 0.0, 1.0])
     with pytest.raises(ValueError, match="'camera' and 'field' are of poses and directions: 'ekf'"):
-        filters.EnsembleKalmanFilter(model=camera()).kernels()
+        filters.ParticleFilter(model=camera()).kernels()

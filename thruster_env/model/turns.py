@@ -199,8 +199,8 @@ def refuse_rotations(model: Any) -> None:
         kinds = " and ".join(dict.fromkeys(f"{turn.kind}s" for turn in model.turns))
         raise ValueError(
             f"states must be numbers and angles here, but {names} {'is' if len(model.turns) == 1 else 'are'} of "
-            f"{kinds}: 'ekf', 'iekf', 'ukf', 'ckf' and their kin take these, in filters.run, sessions, wrapped "
-            "envs and C"
+            f"{kinds}: 'ekf', 'iekf', 'ukf', 'ckf', their kin and 'enkf' take these, in filters.run, "
+            "sessions, wrapped envs and C"
         )
 
 
@@ -224,7 +224,7 @@ def tangent_of(values: Sequence, turns: Sequence[Turn], of_rotation: Any) -> lis
 # The steps, on sequences of components: floats, arrays of them, or numbers that are traced.
 
 
-def move(x: Sequence, d: Sequence, turns: Sequence[Turn]) -> list:
+def move(x: Any, d: Any, turns: Sequence[Turn]) -> list:
     """The state x (n) moved by d (t) of its tangent."""
     result: list[Any] = []
     for turn, i, j in _parts(len(x), turns):
@@ -238,7 +238,7 @@ def move(x: Sequence, d: Sequence, turns: Sequence[Turn]) -> list:
     return result
 
 
-def difference(x: Sequence, y: Sequence, turns: Sequence[Turn]) -> list:
+def difference(x: Any, y: Any, turns: Sequence[Turn]) -> list:
     """The d (t) of the tangent at y with move(y, d) = x, of states x and y (n)."""
     result: list[Any] = []
     for turn, i, _ in _parts(len(x), turns):
@@ -253,7 +253,7 @@ def difference(x: Sequence, y: Sequence, turns: Sequence[Turn]) -> list:
     return result
 
 
-def unit(x: Sequence, turns: Sequence[Turn]) -> list:
+def unit(x: Any, turns: Sequence[Turn]) -> list:
     """The state x (n) with quaternions and directions of length 1."""
     result: list[Any] = []
     for turn, i, _ in _parts(len(x), turns):
@@ -275,7 +275,7 @@ def _parts(n: int, turns: Sequence[Turn]) -> list[tuple[Turn | None, int, int]]:
     return result
 
 
-def slopes_of_stored(x: Sequence, turns: Sequence[Turn]) -> list[list]:
+def slopes_of_stored(x: Any, turns: Sequence[Turn]) -> list[list]:
     """The derivative of move(x, d) at d = 0, (n, t): of a rotation q (0, e_i)/2 or (0, e_i) q/2."""
     return _by_parts(len(x), turns, (1, 0), lambda turn: _stored_slopes(turn, turn.of_state(x)))
 
@@ -293,7 +293,7 @@ def _stored_slopes(turn: Turn, x: tuple) -> list[list]:
     return result
 
 
-def slopes_of_tangent(y: Sequence, turns: Sequence[Turn]) -> list[list]:
+def slopes_of_tangent(y: Any, turns: Sequence[Turn]) -> list[list]:
     """The derivative of difference(x, y) by x at x = y, (t, n); a unit vector of y need not have length 1."""
     return _by_parts(len(y), turns, (0, 1), lambda turn: _tangent_slopes(turn, turn.of_state(y)))
 
@@ -348,12 +348,12 @@ def _by_parts(n: int, turns: Sequence[Turn], more: tuple[int, int], of_turn: Cal
     return result
 
 
-def reset_slopes(x: Sequence, d: Sequence, turns: Sequence[Turn]) -> list[list]:
+def reset_slopes(x: Any, d: Any, turns: Sequence[Turn]) -> list[list]:
     """G = d difference(move(x, d + e), move(x, d))/de at e = 0, (t, t): J_r(d) or J_l(d), 1 for numbers."""
     return _by_parts(len(x), turns, (0, 0), lambda turn: _reset(turn, x, d, poses.left_jacobian))
 
 
-def inverse_reset_slopes(x: Sequence, d: Sequence, turns: Sequence[Turn]) -> list[list]:
+def inverse_reset_slopes(x: Any, d: Any, turns: Sequence[Turn]) -> list[list]:
     """The inverse of `reset_slopes`, (t, t)."""
     return _by_parts(len(x), turns, (0, 0), lambda turn: _reset(turn, x, d, poses.inverse_left_jacobian))
 
