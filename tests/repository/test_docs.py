@@ -16,6 +16,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from docs.scripts import filter_gaussian, filter_sampled, made_by
 from docs.scripts import main as make_page
+from filters.gaussian import extended
 from filters.registry import FILTERS
 from filters.wrappers.arguments import OBSERVATIONS
 from thruster_env.effects.sensors import SENSOR_EFFECTS
@@ -194,3 +195,8 @@ def test_what_readme_says_of_tuning_is_what_the_page_on_tuning_says():
     assert re.findall(r"^- (\d+ %) below that of the \*\*", readme, flags=re.MULTILINE) == gains
     assert f"(NEES) is {float(ekf['outliers'][6]):.3g}, where 2 is right" in readme
     assert f"scaled default is {100 * (1 - float(ekf['mismatch'][2].split()[0])):.0f} %" in readme
+
+
+def test_the_page_on_design_has_the_update_of_the_ekf_as_it_is():
+    lines = [line for line in inspect.getsource(extended.update).splitlines() if '"""' not in line]
+    assert "\n".join(f"   {line}" for line in lines) in (ROOT / "docs" / "design.md").read_text()
