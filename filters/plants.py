@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.attitude import attitude
+from filters.heave import heave
 from thruster_env.core.checks import one_of, positive, short_repr
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.model.continuous import ContinuousModel
@@ -483,6 +484,7 @@ def battery(
 # Functions of numbers that make a model in continuous time, or one of a sample time dt.
 PLANTS: Mapping[str, Callable[..., Any]] = {
     "attitude": attitude,
+    "heave": heave,
     "coordinated-turn": coordinated_turn,
     "unicycle": unicycle,
     "bicycle": bicycle,

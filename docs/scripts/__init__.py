@@ -21,6 +21,7 @@ from tuning.experiments import EXPERIMENTS
 
 DOCS = Path(__file__).parents[1]
 SCRIPTS = {  # of this folder, by page; experiments name theirs
+    "attitude": ("attitude",),
     "auv": ("auv",),
     "explore_scenes": ("explore",),
     "filters": ("filters",),

@@ -114,7 +114,7 @@ def run_of(kind, steps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["ekf", "iekf", "ukf"])
+@pytest.mark.parametrize("kind", ["ekf", "ukf"])
 def test_filters_follow_the_loop(kind):
     """The mean NEES of nine errors over 18 s is theirs, within what correlated errors leave."""
     errors, covs = run_of(kind, 400)
