@@ -150,8 +150,3 @@ def heave(
             "pitch": (Quantity("pitch", "pitch", "rad"), _pitch),
         },
     )
-
-
-# What a log in waves determines, if `tuning.identify` is asked without names.
-FREE = "significant_height", "period", "damping", "accelerometer", "magnetometer", "field", "dip"
-heave.free = FREE  # type: ignore[attr-defined]

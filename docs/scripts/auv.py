@@ -15,10 +15,13 @@ from docs.scripts.ranking import leaderboard
 from filters import EstimateState
 from filters.augmented import Unknown
 from filters.consistency.nees import Interval
+from thruster_env.auv.dynamics import ROTATING, angled_state
 from thruster_env.auv.paths import MANOEUVRES, DepthAndCourse
-from thruster_env.core.files import write_whole
+from thruster_env.core.files import new_figure, save_figure, tidy, write_whole
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.env.env import ObserveStateVector
+from thruster_env.model import rotations
+from thruster_env.model.turns import difference
 from tuning.auv.scenario import Scenario, find_scenario
 from tuning.evaluation.compare import Contender, Row, contender
 from tuning.problems.problem import Problem
@@ -42,6 +45,45 @@ def frame(path: Path) -> Path:
     env.close()
     write_whole(path, lambda stream: imsave(stream, picture, format="png"))
     return path
+
+
+def loop(path: Path) -> Path:
+    """Over the top with a quaternion: the path from the side, pitch, and the error of attitude."""
+    arguments = {"attitude": "quaternion", "sensors": "vectors", "max_thrust": 8.0}
+    env = EstimateState(gym.make("SegorogeniAUV-v0", **arguments), "ekf")
+    env.reset(seed=1)
+    states, estimates, covs = [], [], []
+    for _ in range(240):
+        info = env.step([8.0, -np.radians(15.0), 0.0])[-1]
+        for values, name in ((states, "state"), (estimates, "estimate"), (covs, "estimate_cov")):
+            values.append(info[name])
+    truth, time = np.transpose(states), 0.05 * np.arange(1, 241)
+    off = np.array([difference(x, y, ROTATING)[6:9] for x, y in zip(states, estimates, strict=True)])
+    std = np.sqrt(np.array([np.trace(cov[6:9, 6:9]) for cov in covs]))
+    figure = new_figure((7.5, 3.0))
+    side, rise, error = figure.subplots(1, 3)
+    side.plot(truth[10], truth[12], color="0.6")
+    for k in range(0, 240, 12):
+        ahead, _, down = rotations.to_world(truth[6:10, k], (1.0, 0.0, 0.0))
+        side.plot(
+            truth[10, k] + np.array([-0.4, 0.4]) * ahead, truth[12, k] + np.array([-0.4, 0.4]) * down, color="C0"
+        )
+    side.invert_yaxis()
+    side.set_aspect("equal", adjustable="datalim")
+    side.set(xlabel="north [m]", ylabel="depth [m]")
+    level = rotations.to_world(truth[6:10], (0.0, 0.0, 1.0))[2] > 0.0
+    pitch = np.degrees(angled_state(truth)[7])
+    rise.plot(time, np.where(level, pitch, np.nan), color="C0", label="upright")
+    rise.plot(time, np.where(level, np.nan, pitch), color="C3", label="on its back")
+    rise.axhline(90.0, color="0.6", linewidth=0.8)
+    rise.set(xlabel="time [s]", ylabel="pitch [deg]")
+    rise.legend(loc="lower left")
+    error.plot(time, np.degrees(np.linalg.norm(off, axis=1)), color="C0", label="error")
+    error.plot(time, np.degrees(std), color="0.6", label="standard deviation")
+    error.set(xlabel="time [s]", ylabel="attitude [deg]", ylim=(0.0, 0.9))
+    error.legend(loc="upper right")
+    tidy((side, rise, error))
+    return save_figure(figure, path)
 
 
 def returns() -> str:
@@ -177,7 +219,7 @@ def about(value: Interval, decimals: int = 2) -> str:
     return f"{value.value:.{decimals}f} ± {half:.{decimals}f}"
 
 
-FIGURES = {"auv_frame.png": frame}
+FIGURES = {"auv_frame.png": frame, "auv_loop.png": loop}
 SCALED = contender("ekf", knows="scaled")._replace(label="ekf, scaled default")
 JOINT = [contender("ekf", unknown=unknown) for unknown in (AXIAL_DRAG, DRAG)]  # coefficients as further states
 TABLES = {
