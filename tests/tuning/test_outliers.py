@@ -9,13 +9,13 @@ import pytest
 import tuning
 from tests.linear_problem import LinearProblem
 from tests.tuning.test_log_problem import GUESS, MODEL, R, logs_of
+from tuning.api.report import known_table
 from tuning.evaluation.held_out import evaluate_held_out, summarised, summary
 from tuning.evaluation.residuals import estimated_from, heavy_tails, tails_of, uneven_nis
 from tuning.evaluation.worth import uneven_sentence, warnings_of
 from tuning.likelihood.identifiability import as_data, identify, sentences
 from tuning.problems.log_problem import LogProblem
 from tuning.reporting.choice_words import residual_sentences
-from tuning.reporting.tables import known_table
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, untuned_choice
 

@@ -14,13 +14,8 @@ from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import comparison_as_data
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import RunsProblem
-from tuning.reporting.choice_words import (
-    MADE_UP,
-    consistency_of,
-    consistency_sentence,
-    model_doubts,
-    residual_sentences,
-)
+from tuning.reporting.choice_words import MADE_UP, consistency_of, model_doubts, residual_sentences
+from tuning.reporting.tuning_report import consistency_sentence
 from tuning.search.space import Choice
 
 

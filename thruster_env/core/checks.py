@@ -167,6 +167,11 @@ def listed(names: Iterable[str]) -> str:
     return f"{', '.join(shortened[:MANY])} and {len(shortened) - MANY} more"
 
 
+def in_words(parts: Sequence[str]) -> str:
+    """At least one part in a sentence: "a, b and c"."""
+    return " and ".join([*([", ".join(parts[:-1])] if parts[:-1] else []), parts[-1]])
+
+
 def any_case(value, choices: Iterable[str]):
     """The choice that equals a value up to case; the value itself if there is none."""
     if isinstance(value, str):

@@ -65,9 +65,6 @@ from tuning.reporting.leaderboard import as_json, report
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
-# `FilterComparison`: filters on the same held-out seeds, as a value.
-
-
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure

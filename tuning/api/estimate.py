@@ -182,7 +182,6 @@ class LogEstimates(Result):
         return [*parts, *self.sentences(), *self._alarm_sentences(), *(f"wrote {path}" for path in self.files)]
 
     def _alarm_sentences(self) -> list[str]:
-        """The first alarms in words, and the channel at fault."""
         log, alarms = self.log, self.watched
         if alarms is None:
             return []

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
+from filters.consistency.nees import Interval, rmse_ratios
 from filters.registry import filter_type
 from thruster_env.core.checks import short_repr
 from thruster_env.core.executors import task_map
 from thruster_env.core.files import check_target
 from thruster_env.logs.write import check_picture
-from tuning.api.held_out import HeldOut, covariance_check, on_held_out
+from tuning.api.held_out import CovarianceCheck, HeldOut, on_held_out
 from tuning.api.markers import (
     FILTER,
     INPUT,
@@ -31,7 +33,7 @@ from tuning.api.markers import (
 from tuning.api.problems import given_for, is_filter, problem_of
 from tuning.api.progress import console_for, working
 from tuning.api.study import DEFAULT_FILTER, Study, is_own, user_choice
-from tuning.evaluation.baselines import GIVEN, OWN, TUNED, given_noise, rule_of_thumb
+from tuning.evaluation.baselines import GIVEN, ORACLE, OWN, TUNED, given_noise, rule_of_thumb
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.assumed import constants_in, suited
 from tuning.problems.problem import Problem
@@ -157,3 +159,19 @@ def subject_of(
         return choice, chosen, True
     chosen = suited_to(tuned, problem_of(problem, preset))
     return read_choice(tuned, chosen), chosen, True
+
+
+def covariance_check(evaluation: HeldOut, label: str, path: str | Path) -> CovarianceCheck:
+    """Check the covariance of an evaluated filter, called `label`, and draw the checks."""
+    from thruster_env.core.files import save_figure
+    from tuning.reporting.search_figures import draw_consistency
+
+    report, comparison = evaluation.check_consistency(), evaluation.comparison
+    ratios: Sequence[Interval] | None = None
+    against: dict[str, Any] = {}
+    if report.has_truth and comparison.true is not None:
+        ratios = rmse_ratios(comparison.tuned.mean_squares, comparison.true.mean_squares, comparison.tuned.weights)
+        against[f"{label}\nover {ORACLE}"] = ratios
+    title = f"{evaluation.choice.name}, {label}, on {report.runs} seeds of {evaluation.problem.name}"
+    save_figure(draw_consistency(report, title, against, comparison.tuned.scored or None), path)
+    return CovarianceCheck(label, report, ratios, str(path))

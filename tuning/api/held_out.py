@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
 
-from filters.consistency.nees import Interval, SquaresCheck, rmse_ratios
+from filters.consistency.nees import Interval, SquaresCheck
 from filters.consistency.report import MOST_STATES, ConsistencyReport, comparison_sentence, sentences
 from filters.estimators.foreign import label_of
 from filters.filter import Filter
@@ -304,22 +303,6 @@ def _of_squares(check: SquaresCheck) -> dict[str, Any]:
         "distance_from_chi_square": check.distribution.distance,
         "p_value": check.distribution.p_value,
     }
-
-
-def covariance_check(evaluation: HeldOut, label: str, path: str | Path) -> CovarianceCheck:
-    """Check the covariance of an evaluated filter, called `label`, and draw the checks."""
-    from thruster_env.core.files import save_figure
-    from tuning.reporting.search_figures import draw_consistency
-
-    report, comparison = evaluation.check_consistency(), evaluation.comparison
-    ratios: Sequence[Interval] | None = None
-    against: dict[str, Any] = {}
-    if report.has_truth and comparison.true is not None:
-        ratios = rmse_ratios(comparison.tuned.mean_squares, comparison.true.mean_squares, comparison.tuned.weights)
-        against[f"{label}\nover {ORACLE}"] = ratios
-    title = f"{evaluation.choice.name}, {label}, on {report.runs} seeds of {evaluation.problem.name}"
-    save_figure(draw_consistency(report, title, against, comparison.tuned.scored or None), path)
-    return CovarianceCheck(label, report, ratios, str(path))
 
 
 def on_held_out(

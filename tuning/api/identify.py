@@ -35,11 +35,12 @@ from tuning.api.markers import (
 from tuning.api.progress import console_for
 from tuning.api.read_logs import recorded_runs
 from tuning.api.result import Result, drawn, frame
-from tuning.identification.identify import STARTS, check_excitation
+from tuning.identification.identify import STARTS
 from tuning.identification.identify import identify as identify_runs
 from tuning.identification.objective import likelihood_of
 from tuning.identification.profiles import Profile, Validation, profile_figure, profiles, validate
-from tuning.identification.result import Identification
+from tuning.identification.result import Identification, covariance, is_narrow
+from tuning.likelihood.objective import Objective
 from tuning.logs.problem import AnyStepFamily, check_offsets, family_of, remarks, split_runs, write_found
 from tuning.logs.read import pairs
 from tuning.problems.problem import Coordinates, Parameter
@@ -47,9 +48,6 @@ from tuning.search.parameters import index_pairs
 
 DEFAULT_OUT = Path("out/identified.toml")  # of the command
 RANGE, START = "ranges (--range)", "start (--start)"
-
-# `Identified`: parameters identified from recorded runs, as a value.
-
 
 if TYPE_CHECKING:
     import pandas
@@ -419,3 +417,33 @@ def names_of(free: Any) -> list[str]:
             "read_logs(..., model=...), or with the logs as the pair (model, logs)"
         )
     return [name.strip() for name in names if name.strip()]
+
+
+def check_excitation(objective: Objective, logs: Sequence[Log], start: np.ndarray) -> None:
+    """Raise ValueError for logs with constant inputs that do not determine the free parameters.
+
+    Args:
+        objective: log-likelihood of the logs.
+        logs: the logs as recorded.
+        start: coordinates (p,) of the free parameters.
+
+    Raises:
+        ValueError: with the parameters that are not identifiable, by Fisher's information at the start.
+    """
+    levels = [np.ptp(log.inputs, axis=0) for log in logs]
+    if any(level.any() for level in levels):
+        return
+    coordinates, evaluation = objective.coordinates, objective(start)
+    cov = covariance(evaluation.information, evaluation.scores[:0], coordinates.high - coordinates.low)
+    narrow = is_narrow(cov, coordinates)
+    loose = [name for name, known in zip(coordinates.names, narrow, strict=True) if not known]
+    if loose and not levels[0].size:
+        raise ValueError(
+            f"logs must determine the free parameters, but these do not determine {', '.join(loose)}: leave these "
+            "out of free (--free), or record more"
+        )
+    if loose:
+        raise ValueError(
+            f"logs must excite the free parameters, but constant inputs do not determine {', '.join(loose)}: "
+            "hold these, or record steps"
+        )

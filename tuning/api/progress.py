@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     from tuning.search.plan import Plan
     from tuning.search.study import OnTrial
 
-# A line of progress in a notebook without ipywidgets, which rich needs there: one output, redrawn.
-
-
 CONTROLS = re.compile(r"\x1b\[[^@-~]*[@-~]")  # cursor, colours and the like
 ERASED = "\x1b[2K"
 

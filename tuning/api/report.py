@@ -42,7 +42,7 @@ from tuning.evaluation.held_out import (
 )
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.evaluation.tuned import tuned_content
-from tuning.likelihood.identifiability import identify, sentences, too_many
+from tuning.likelihood.identifiability import Identifiability, identify, sentences, too_many
 from tuning.problems.problem import Problem
 from tuning.reporting.page import Pair, Section, Table, Words, html_page, markdown_page, of_sizes
 from tuning.reporting.search_figures import Sketchbook, draw_sizes
@@ -57,7 +57,6 @@ from tuning.reporting.sections import (
     search_section,
 )
 from tuning.reporting.subject import Subject, find_subject, is_file, kept_nis
-from tuning.reporting.tables import known_table
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import SIZE_SEEDS, at_ends
 from tuning.search.storage import quiet_optuna, storage_text
@@ -176,7 +175,6 @@ def page_of(sources: Sequence[Any], name: str, out: str | Path | None) -> Path:
 
 
 def _name_of(source: Any) -> str:
-    """The name of a study, or of its tuned file."""
     if isinstance(source, Study):
         return source.name
     if not isinstance(source, str | Path):
@@ -211,9 +209,6 @@ def _of_value(study: Study) -> Subject:
     consistent, seeds = plan.is_constrained and bool(result.consistent), len(study.comparison.seeds)
     stored = content, content["ensemble_sizes"], content["choice"], kept_nis(content, plan)
     return Subject(study.name, plan, study.choice, trials, seeds, True, consistent, *stored)
-
-
-# The page of one study.
 
 
 class Pages(NamedTuple):
@@ -311,9 +306,6 @@ def _short(name: str) -> str:
     return Path(name).stem if name.endswith(".toml") else name
 
 
-# The report of two studies: their results, section by section and side by side.
-
-
 def two_columns(names: Sequence[str], pages: Sequence[Pages]) -> Pages:
     """The contents of a page on two studies; of the same problem with the paired ratio of their scores."""
     advice = "\n".join(f"{name}: {contents.advice}" for name, contents in zip(names, pages, strict=True))
@@ -380,3 +372,20 @@ def _value(interval: Interval | None) -> str:
     if interval.low == interval.high:
         return rounded(interval.value)
     return f"{rounded(interval.value)} [{rounded(interval.low)}, {rounded(interval.high)}]"
+
+
+def known_table(result: Identifiability) -> Table:
+    """The parameters as the innovations determine them."""
+    identified = result.identified & (not result.tails)
+    columns = result.names, result.tuned, result.most_likely, result.factors, identified
+    rows = [
+        [name, f"{tuned:.4g}", f"{best:.4g}", f"{factor:.3g}" if known else "", "yes" if known else "no"]
+        for name, tuned, best, factor, known in zip(*columns, strict=True)
+    ]
+    if result.tails:
+        rows = [row[:3] for row in rows]
+        return Table("Parameters by maximum likelihood", ["", "tuned", "maximum likelihood"], rows)
+    header = ["", "tuned", "maximum likelihood", "known within a factor of", "determined"]
+    return Table(
+        "Parameters determined by the innovations of the training runs, with 95 % probability", header, rows
+    )

@@ -313,9 +313,6 @@ def _seconds(trial: FrozenTrial) -> float | None:
     return None if trial.duration is None else trial.duration.total_seconds()
 
 
-# A user's own parameters as a choice: those of a filter, or of a model with its own Q and R.
-
-
 DEFAULT_FILTER = "ekf"  # of a model alone
 
 

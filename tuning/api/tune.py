@@ -255,9 +255,6 @@ def tune(
     return run_tuning(plan, trials, console, journal, study, file, method=method, aim=aim, workers=workers)
 
 
-# A method that runs alone, stored as a study: the values on its path are the trials, and its answer is the choice.
-
-
 ANSWER = "answer of the method"  # attribute of a study
 OLD_ANSWER, OLD_NAME = "answer of the way", "-way-"  # the same, and a part of its name, in journals until 2026
 

@@ -172,7 +172,6 @@ def _as_old_as(stored: Any, recomputed: Any) -> Any:
 
 
 def _count(stored, path: str | Path) -> int:
-    """Number of held-out seeds of a scenario's entry."""
     try:
         first, beyond = stored["seeds"]
         return beyond - first

@@ -47,9 +47,6 @@ MINUTE: dict[str, Any] = {"excitation": SAILING, "steps": 1200, "first_scored_st
 DVL = ("u", "v", "w")
 
 
-# Inputs of the vehicle's scenarios: any excitation of thrust and planes, and the manoeuvres of the papers.
-
-
 @EXCITATIONS.register("manoeuvre")
 @dataclass(frozen=True)
 class OfManoeuvre(Excitation):

@@ -24,8 +24,6 @@ from tuning.problems.problem import Problem
 from tuning.search.parameters import GAUSSIANS, KALMAN_SIZES, PARTICLE_SIZES
 from tuning.search.space import untuned_choice
 
-# Which filters fit a problem's model, and the memory of a belief of each: `thruster filters --problem`.
-
 
 class Fit(NamedTuple):
     """Whether a filter fits a problem's model."""

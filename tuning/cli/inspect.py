@@ -199,9 +199,6 @@ def _plain_published(name: str, published: PublishedLinearModel, analysis: Analy
     return {"name": name, **_plain_analysis(analysis), "printed": printed, **words}
 
 
-# Pictures of a thruster's responses, each saved as one PNG file.
-
-
 def response_figure(path: str | Path, model: LinearModel, dt: float, title: str) -> Path:
     """Bode plot of the thrust over the voltage, and the response to a step of 1 V.
 

@@ -28,9 +28,6 @@ from tuning.api.read_logs import recorded_runs
 from tuning.api.result import Printed
 from tuning.problems.find import logs_package
 
-# What `thruster log` shows of a recorder's file: its topics and their fields.
-
-
 BLOCKS = "▁▂▃▄▅▆▇█"
 CLOCKS = {HEADER: "stamps of headers", RECEIPT: "when messages were received"}  # in words
 WIDE = 400  # characters of a line that goes into a file or another program: no name is folded there

@@ -71,7 +71,6 @@ def main() -> None:
 
 
 def _outcome(app, caught: list) -> tuple[int, str]:
-    """Exit code of the command line, and its message."""
     import typer
 
     try:

@@ -213,9 +213,6 @@ def _drawn(play) -> Played:
         return play(lambda steps, count: update(completed=steps, total=count))
 
 
-# Episodes without a learnt policy, drawn: under a PI controller, a sequence of voltages, or as a log has them.
-
-
 POLICIES = ("pi",)
 SEQUENCES = tuple(name for name in EXCITATIONS.effects if name not in POLICIES)
 ENV = "BowThrusterTracking-v0"

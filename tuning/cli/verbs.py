@@ -266,9 +266,6 @@ def files_of(parts: Sequence[Part], values: Mapping[str, Any], role: str) -> lis
     return [path for group in groups for path in (group if isinstance(group, list) else [group])]
 
 
-# What signature and docstring say.
-
-
 def described(function: Callable) -> tuple[str, dict[str, str]]:
     """The text of a Google docstring without programs, and the descriptions of the arguments by name."""
     text, rest, *_ = [*re.split(r"\n\n(?:Args|Attributes):\n", inspect.getdoc(function) or ""), ""]

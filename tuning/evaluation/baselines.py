@@ -12,11 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.consistency.nees import Interval, mean_interval
+from filters.consistency.nees import Interval
 from filters.registry import filter_type
-from thruster_env.core.angles import is_angle
-from thruster_env.model.state_space import StateSpaceModel
-from tuning.evaluation.evaluate import NOTHING, Evaluation, values_of
+from tuning.evaluation.evaluate import values_of
 from tuning.evaluation.residuals import noise_estimation
 from tuning.problems.assumed import as_argument, rows_argument
 from tuning.problems.check import data_of
@@ -320,27 +318,6 @@ def same_filter(a: Choice, b: Choice) -> bool:
 
 def _same_values(a: Mapping, b: Mapping) -> bool:
     return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
-
-
-def gain_over_regression(model: StateSpaceModel, tuned: Evaluation, training: Data, data: Data) -> Interval:
-    """Log-likelihood of a measurement that a filter predicts, minus that of a regression, with paired interval.
-
-    Args:
-        model: with the channels; angles are unwrapped.
-        tuned: the filter on `data`.
-        training: runs that the regression is fitted to.
-        data: runs on which both are compared.
-
-    Returns:
-        The mean over all scored measurements; NaN for a filter without a covariance, or if there are too few rows.
-    """
-    angles = [is_angle(i, model.shape.measurement_angles) for i in range(model.m)]
-    densities = log_densities(training, data, np.array(angles))
-    scored = np.where(data.scored[..., None], densities, np.nan)
-    counts = np.isfinite(scored).sum(axis=(1, 2))
-    if not counts.all() or np.isnan(tuned.log_likelihoods).any():
-        return NOTHING
-    return mean_interval((tuned.log_likelihoods - np.nansum(scored, axis=(1, 2))) / counts.mean())
 
 
 def is_far_below(gained: Interval) -> bool:

@@ -328,7 +328,6 @@ def _choice_with(numbers: Mapping, knowing: Callable[[Problem], Known], scenario
 
 
 def _in_words(value) -> str:
-    """A parameter's value: a word, a number, or several."""
     if isinstance(value, str):
         return value
     return ", ".join(f"{number:g}" for number in np.ravel(value))
@@ -485,9 +484,6 @@ def timed_runs(filter_: Filter, data: Data, scale) -> tuple[RunMetrics, float]:
         metrics.append(metrics_by_run(filter_, estimates, runs, scale=scale))
         started = time.perf_counter()
     return joined(metrics), seconds
-
-
-# Which filters can run on all problems of a comparison, which do so by default, and why others do not.
 
 
 def fitting(names: Iterable[Any], problems: Sequence[Problem]) -> tuple[list[Any], dict[str, str]]:

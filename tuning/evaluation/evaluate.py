@@ -359,9 +359,6 @@ def _check_paired(a: Evaluation, b: Evaluation) -> None:
         )
 
 
-# Whether a filter's model blows up between samples, by its innovations on a problem's data.
-
-
 def blow_up(filter_: Filter, estimates: Estimates, data: Data, dt: float | None) -> str:
     """A sentence on a filter whose model blows up between samples, from its scored innovations; empty otherwise.
 
@@ -374,12 +371,3 @@ def blow_up(filter_: Filter, estimates: Estimates, data: Data, dt: float | None)
     names = [channel.name for channel in filter_.model.measurements]
     innovations, measurements = (data.late_scored(values) for values in (estimates.innovations, data.measurements))
     return blow_up_sentence(innovations, measurements, names, dt)
-
-
-def blow_up_on(filter_: Filter, data: Data, dt: float | None) -> str:
-    """`blow_up` of a filter on the first runs of some data."""
-    first_runs = data.slice(0, BLOW_UP_RUNS)
-    sentences = [
-        blow_up(filter_, estimates, part, dt) for part, estimates in estimates_in_parts(filter_, first_runs)
-    ]
-    return next((sentence for sentence in sentences if sentence), "")

@@ -16,12 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.consistency.nees import Interval
+from filters.consistency.nees import Interval, mean_interval
 from filters.consistency.time_constants import TimeConstants
 from filters.starts import Restarts
+from thruster_env.core.angles import is_angle
 from thruster_env.core.checks import with_progress
 from thruster_env.core.executors import IN_PROCESS, TaskMap
 from thruster_env.model.quantities import Quantity
+from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import (
     BY_IMPORTANCE,
     GIVEN,
@@ -33,7 +35,7 @@ from tuning.evaluation.baselines import (
     Scaled,
     baseline_size,
     baselines,
-    gain_over_regression,
+    log_densities,
     rule_label,
     rule_of_thumb,
     same_filter,
@@ -50,6 +52,7 @@ from tuning.evaluation.evaluate import (
 from tuning.evaluation.residuals import UnevenNis, uneven_nis
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.check import data_of
+from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 from tuning.search.parameters import size_ladder
 from tuning.search.plan import HELD_OUT_SEEDS, SIZE_SEEDS, TRAINING_SEEDS, Plan
@@ -187,9 +190,6 @@ def evaluate_held_out(
 def _index_in(choices: Sequence[Choice], choice: Choice) -> int:
     """The index of the same filter among choices; -1 if it is not among them."""
     return next((index for index, before in enumerate(choices) if same_filter(choice, before)), -1)
-
-
-# Versions of the packages that numerical results depend on.
 
 
 def versions() -> dict[str, str]:
@@ -332,9 +332,6 @@ def _key(output: Quantity) -> str:
     return f"{output.name.replace(' ', '_')}_rmse"
 
 
-# Results of long computations that a study and a tuned file store, so that a report need not repeat them.
-
-
 def sizes_as_data(rows: Sequence[SizeRow], choice: Choice, plan: Plan) -> dict:
     """The table of ensemble sizes of a choice as plain data, with a digest of its inputs."""
     table = [
@@ -439,3 +436,24 @@ def _summarised(role: str, held_out: Mapping, more: Mapping, problem: Problem) -
     if held_out.get(role) is None:  # also of a file that is older than the role
         return None
     return summarised(held_out[role], problem, more["expected_nis"], more["median_nees"][role])
+
+
+def gain_over_regression(model: StateSpaceModel, tuned: Evaluation, training: Data, data: Data) -> Interval:
+    """Log-likelihood of a measurement that a filter predicts, minus that of a regression, with paired interval.
+
+    Args:
+        model: with the channels; angles are unwrapped.
+        tuned: the filter on `data`.
+        training: runs that the regression is fitted to.
+        data: runs on which both are compared.
+
+    Returns:
+        The mean over all scored measurements; NaN for a filter without a covariance, or if there are too few rows.
+    """
+    angles = [is_angle(i, model.shape.measurement_angles) for i in range(model.m)]
+    densities = log_densities(training, data, np.array(angles))
+    scored = np.where(data.scored[..., None], densities, np.nan)
+    counts = np.isfinite(scored).sum(axis=(1, 2))
+    if not counts.all() or np.isnan(tuned.log_likelihoods).any():
+        return NOTHING
+    return mean_interval((tuned.log_likelihoods - np.nansum(scored, axis=(1, 2))) / counts.mean())

@@ -18,9 +18,6 @@ LEAST = -1e6  # log score of a step whose covariance is singular or not finite
 FARTHEST = 1e100  # outputs are clipped to this, so that their squares are finite
 
 
-# The log score of a filter: the log density of its belief at the true state, a proper score.
-
-
 def log_scores_of(
     filter_: Filter, estimates: Estimates, data: Data, scale: np.ndarray | Sequence[float] | None
 ) -> np.ndarray:

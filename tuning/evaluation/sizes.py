@@ -146,13 +146,11 @@ def _ratios_of(results: Mapping[int, Sequence[Evaluation]], among: Sequence[int]
 def _eligible(
     results: Mapping[int, Sequence[Evaluation]], outside: Sequence[float], consistent: bool
 ) -> list[int]:
-    """The eligible sizes among the results."""
     indices, scores = list(results), [_score(evaluations) for evaluations in results.values()]
     return [indices[i] for i in _counting([outside[i] for i in indices], consistent, scores)]
 
 
 def _score(evaluations: Sequence[Evaluation]) -> float:
-    """The mean score over some problems."""
     return float(np.mean([evaluation.score.value for evaluation in evaluations]))
 
 
@@ -163,7 +161,6 @@ def _surely_worse(evaluations: Sequence[Evaluation], best: Sequence[Sequence[Eva
 
 
 def _worst(ratios: Iterable[Interval]) -> Interval:
-    """The interval with the highest end."""
     return max(ratios, key=lambda ratio: ratio.high)
 
 

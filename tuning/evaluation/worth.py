@@ -8,6 +8,7 @@ from math import inf, isfinite, isnan
 from filters.consistency.nees import Interval, slightly, span
 from filters.consistency.report import rounded
 from filters.consistency.time_constants import TimeConstants
+from thruster_env.core.checks import in_words
 from tuning.evaluation.baselines import GIVEN, NO_RANGES, NOISE, ORACLE, RULE, SCALED, called
 from tuning.evaluation.evaluate import Evaluation, farthest, is_beyond
 from tuning.evaluation.held_out import Comparison
@@ -97,7 +98,7 @@ def _nees_warning(evaluation: Evaluation) -> list[str]:
         reason = ": each variance is about right, but P is nearly singular, or its correlations are wrong"
     elif joint_size and not any(part.startswith(joint_size) for part in parts[:-1]):
         reason = ": its correlations are wrong, too"
-    return [f"Do not rely on the covariance, it is {_listed_words(parts)}{reason}."]
+    return [f"Do not rely on the covariance, it is {in_words(parts)}{reason}."]
 
 
 def _size_of(nees: Interval, n: int) -> str:
@@ -105,10 +106,6 @@ def _size_of(nees: Interval, n: int) -> str:
     if isnan(nees.value) or (nees.covers(n) and not is_beyond(nees.value / n)):
         return ""
     return "too small" if nees.value > n else "too large"
-
-
-def _listed_words(parts: Sequence[str]) -> str:
-    return " and ".join([*([", ".join(parts[:-1])] if parts[:-1] else []), parts[-1]])
 
 
 def _memory_warning(evaluation: Evaluation, problem: Problem, forget: float | None) -> list[str]:
@@ -256,7 +253,7 @@ def _likelihood_worth(comparison: Comparison) -> str:
 def _listed(parts: Sequence[tuple[str, str]]) -> str:
     """Verbs and what follows them, with commas and an "and": a verb is not said again after the same."""
     phrases = [rest if i and parts[i - 1][0] == verb else f"{verb} {rest}" for i, (verb, rest) in enumerate(parts)]
-    return _listed_words(phrases)
+    return in_words(phrases)
 
 
 def sized(gained: Interval) -> Interval:

@@ -232,9 +232,6 @@ def against_published(
     return rows
 
 
-# Inflation tuned by a study like any other parameter, on problems whose published scores depend on it.
-
-
 def tune_inflation(
     filter_name: str, problem: ModelProblem, trials: int, runs: int, seed: int = 0
 ) -> tuple[Choice, Interval]:

@@ -122,9 +122,6 @@ def lidar_problem(runs: list[Run], held_out: int) -> RunsProblem:
     )
 
 
-# OKF's lidar: our methods of tuning beside the package that the example is from, in its own filter, on equal data.
-
-
 class Row(NamedTuple):
     """A method on the runs that are held out, of D draws with B runs each."""
 

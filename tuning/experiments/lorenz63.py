@@ -163,9 +163,6 @@ BENCHMARK = Benchmark(
 )
 
 
-# Measured half as often and four times as poorly.
-
-
 SPARSE_SUBSTEPS, SPARSE_BURN_IN = 12, 133  # an analysis every 0.12; again 16 units of time do not count
 
 

@@ -227,7 +227,6 @@ def run_comparison(
 
 
 def _do(run: Run, folder: Path, episodes: int) -> None:
-    """Train and score one policy; write its results."""
     policy: Policy
     curve: list[tuple[int, float]] = []
     seconds = 0.0

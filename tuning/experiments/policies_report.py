@@ -185,9 +185,6 @@ def _ratio_cell(groups: Groups, noise: str, above: tuple[str, str], below: tuple
     return "" if top is None or bottom is None else as_text(as_interval(top / bottom), ".3f")
 
 
-# Sentences that answer the questions of a comparison, as far as its runs allow.
-
-
 GOAL = 0.7  # of the gap between raw and true, at medium noise
 NEAR = 0.02  # of the best controller's cost: tolerance within which a learnt policy reaches it
 LEARNT = ("ppo", "sac", "ppo+mpc", "sac+mpc")

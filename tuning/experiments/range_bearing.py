@@ -44,9 +44,6 @@ SIGMA = Parameter("sigma_a", 0.01, 10.0, unit="m/s^1.5", default=2.0)  # the def
 SCALE = (2.0, 0.5, 2.0, 0.5)  # what errors are measured in: about those of a good filter [m, m/s]
 
 
-# Stone Soup's Kalman filters for a target at nearly constant velocity, seen in range and bearing.
-
-
 def check_installed() -> None:
     """Raise ValueError if Stone Soup is not installed."""
     if importlib.util.find_spec("stonesoup") is None:

@@ -159,9 +159,6 @@ NURHADI2022 = PublishedTable(
 STUDIES = {table.name: table for table in (NURHADI2022, KIKI2020)}
 
 
-# A wrong ensemble Kalman filter that explains published errors: its analysis never updates the ensemble.
-
-
 def unupdated_ensemble_means(
     model: AffineModel, states: np.ndarray, members: int, generator: np.random.Generator
 ) -> np.ndarray:
@@ -336,9 +333,6 @@ def compare_all(
         comparisons.append(compare(case, q, runs=runs, members=members, seed=seed))
         on_progress(len(comparisons), len(grid))
     return comparisons
-
-
-# Published values against ours: their distance in standard deviations of one run, and its reason.
 
 
 class Finding(NamedTuple):

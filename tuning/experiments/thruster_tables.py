@@ -122,9 +122,6 @@ def _span(results: list[Finding], state: int | None = None) -> str:
     return f"{factors.min():.1f} to {factors.max():.1f}"
 
 
-# One run of each linear system at each noise level over time: truth, Kalman and ensemble Kalman filter.
-
-
 class Series(NamedTuple):
     """The first run of a comparison; states are (omega_m [rad/s], U_a [m/s])."""
 
@@ -189,9 +186,6 @@ def series_figure(path: str | Path, runs: list[Series], members: int) -> Path:
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
     figure.suptitle("One run of the published linear systems, Q = R = q I", fontsize=11)
     return save_figure(figure, path)
-
-
-# Tables of the command, and the command.
 
 
 def own_table(case: str, comparisons: list[Comparison], runs: int, members: int) -> Table:

@@ -194,9 +194,6 @@ def _read(file: Path, key: Mapping) -> Case | None:
         raise ValueError(f"{file} must be a whole file of results, but cannot be read: {error}") from None
 
 
-# The significance of losses.
-
-
 def chance_if_no_worse(a: Evaluation, b: Evaluation) -> float:
     """One-sided p-value: the chance of a ratio of scores a/b as large as this one, if a is no worse than b.
 
@@ -260,9 +257,6 @@ def _influences(evaluation: Evaluation) -> tuple[float, np.ndarray]:
         logarithm,
         parts if evaluation.weights is None else parts * evaluation.weights / evaluation.weights.mean(),
     )
-
-
-# Tables and sentences: scores over those of each baseline, and where tuning lost.
 
 
 class Loss(NamedTuple):

@@ -121,9 +121,6 @@ def _arguments(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{name}={value!r}" for name, value in values.items())
 
 
-# A map: score and NIS of a filter over two of its numbers.
-
-
 class Map(NamedTuple):
     """Score and NIS at each pair of values of two knobs."""
 
@@ -159,9 +156,6 @@ def map_of(x: Knob, y: Knob, size: int, case: Callable[[float, float], tuple[Fil
         evaluation = values_of(*case(xs[column].item(), ys[row].item()), scale)
         figures[:, row, column] = objective.value(evaluation, np.nan), nis_ratio(evaluation)
     return Map(x.name, y.name, xs, ys, *figures)
-
-
-# A study of a bench's filter, trial by trial.
 
 
 class Trial(NamedTuple):
@@ -268,7 +262,6 @@ class Bench:
 
     @cached_property
     def _parameters(self) -> tuple[Parameter, ...]:
-        """All numbers that a study may choose."""
         return tuple(parameters(self.filter, self.problem, **everything_of(self.problem)))
 
     def with_filter(self, name: str) -> Bench:

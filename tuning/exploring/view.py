@@ -224,9 +224,6 @@ def _whiteness(estimates: Estimates, data: Data) -> tuple[np.ndarray, float]:
     return np.einsum("lii->il", result.correlations).copy(), float(informative.max(initial=0.0)) or 1.0
 
 
-# Disturbances of a scenario as numbers that one may change: outliers, dropout, bias, a dead band.
-
-
 class Disturbance(NamedTuple):
     """One number of an effect, which is there where the number is positive."""
 
@@ -338,19 +335,16 @@ def _present(disturbance: Disturbance, problem: PlantScenario) -> float:
 
 
 def _sensors(problem: Any) -> dict[str, list[dict]]:
-    """The chain of effects of each channel of a scenario."""
     sensors = plain(problem.sensors)
     by_channel = sensors if isinstance(sensors, Mapping) else {}
     return {channel: list(by_channel.get(channel, [])) for channel in problem.plant.channels}
 
 
 def _amplifier(problem: Any) -> list[dict]:
-    """The chain of effects of a scenario's amplifier."""
     return list(plain(problem.amplifier))
 
 
 def _sensor_deviations(problem: Any) -> list[float]:
-    """Standard deviation of each channel's noise."""
     noise_cov = problem.measurement_noise_cov
     variances = noise_cov if isinstance(noise_cov, list | tuple) else [noise_cov]
     return [math.sqrt(variance) for variance in variances]
@@ -411,7 +405,6 @@ def knobs_of(name: str, problem: Problem, marks: Mapping[str, Mapping[str, float
 
 
 def _called(parameter: Parameter, problem: Problem) -> tuple[str, str]:
-    """Label and group of a parameter."""
     position, quantities = parameter.place, problem.quantities
     if isinstance(position, ProcessVariance):
         return f"Q of the {quantities.states[position.index].name}", "Q"

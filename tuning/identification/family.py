@@ -97,7 +97,6 @@ class ModelFamily:
         return model.replace(**changes) if changes else model
 
     def _variances(self) -> dict[str, tuple[str, int, float]]:
-        """The covariance of each variance, its index, and its value."""
         variances = {}
         for i, variance in enumerate(np.diag(self.base.process_noise_cov).tolist()):
             if variance > 0:

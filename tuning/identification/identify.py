@@ -24,10 +24,8 @@ from tuning.identification.result import (
     Identification,
     NullTest,
     Optimum,
-    covariance,
     covariances_of,
     identification_of,
-    is_narrow,
     null_of,
     null_tests,
 )
@@ -86,39 +84,6 @@ def without_outliers(objective: Objective, outliers: np.ndarray, gate: float) ->
     """The same objective without the outliers, which are those beyond a gate."""
     runs = recorded(objective)
     return of_changed(objective, data=WithoutOutliers(runs.data, outliers, runs.first_model), gate=gate)
-
-
-# Whether logs excite the free parameters.
-
-
-def check_excitation(objective: Objective, logs: Sequence[Log], start: np.ndarray) -> None:
-    """Raise ValueError for logs with constant inputs that do not determine the free parameters.
-
-    Args:
-        objective: log-likelihood of the logs.
-        logs: the logs as recorded.
-        start: coordinates (p,) of the free parameters.
-
-    Raises:
-        ValueError: with the parameters that are not identifiable, by Fisher's information at the start.
-    """
-    levels = [np.ptp(log.inputs, axis=0) for log in logs]
-    if any(level.any() for level in levels):
-        return
-    coordinates, evaluation = objective.coordinates, objective(start)
-    cov = covariance(evaluation.information, evaluation.scores[:0], coordinates.high - coordinates.low)
-    narrow = is_narrow(cov, coordinates)
-    loose = [name for name, known in zip(coordinates.names, narrow, strict=True) if not known]
-    if loose and not levels[0].size:
-        raise ValueError(
-            f"logs must determine the free parameters, but these do not determine {', '.join(loose)}: leave these "
-            "out of free (--free), or record more"
-        )
-    if loose:
-        raise ValueError(
-            f"logs must excite the free parameters, but constant inputs do not determine {', '.join(loose)}: "
-            "hold these, or record steps"
-        )
 
 
 def from_nothing(objective: Objective, start: np.ndarray, stop, tell) -> Ascent | None:
@@ -363,7 +328,6 @@ def _finite_start(objective: Objective, point: np.ndarray, first: np.ndarray) ->
 
 
 def _others(coordinates: Coordinates, first: np.ndarray, starts, seed: int) -> list[np.ndarray]:
-    """The starts after the first: given, or drawn."""
     if not isinstance(starts, (int, np.integer)):
         return [coordinates.start(dict(start)) for start in starts]
     rng, width = derived_generator(seed, START_POINTS), REACH * (coordinates.high - coordinates.low)

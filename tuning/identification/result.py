@@ -245,7 +245,6 @@ class Identification(NamedTuple):
         ]
 
     def _starts_sentence(self) -> str:
-        """Which runs do not begin as the prior says."""
         indices, starts = self.begun_elsewhere, self.objective.starts
         leads = () if starts is None else starts.leads
         numbers = ", ".join(str(index + 1) for index in indices[:MOST_RUNS])
@@ -422,12 +421,6 @@ def read_values(path: str | Path) -> dict[str, float]:
             f"a file of values must have the table [values], but {path} has {short_repr(sorted(content))}"
         )
     return {name: finite(f"{name} in {path}", value) for name, value in values.items()}
-
-
-def clock_offsets_in(path: str | Path) -> dict[str, float]:
-    """Clock offsets [s] by channel among the values in a file."""
-    values = read_values(path).items()
-    return {name.removeprefix(CLOCK): seconds for name, seconds in values if name.startswith(CLOCK)}
 
 
 def values_in(path: str | Path) -> dict[str, float]:

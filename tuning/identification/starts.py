@@ -178,9 +178,6 @@ def _is_elsewhere(model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> 
     return bool(distance > chdtri(int(uncertain.sum()), LEVEL))
 
 
-# Recorded runs as one batch: runs of different lengths are padded with steps in which nothing is measured.
-
-
 def runs_of(data: Data | Log | Sequence[Data | Log], model: StateSpaceModel | None = None) -> Data:
     """Data and logs as one `Data`; keys and seeds are those of the runs' indices 0, 1, ...
 

@@ -60,9 +60,6 @@ class Settings(NamedTuple):
     checks: int = 20
 
 
-# What the training of an estimator minimises: squared errors, or the log density of the truth.
-
-
 class Loss:
     """The loss of a step, of means (B, n) and covariances: zero for runs that are not scored there.
 
@@ -321,9 +318,6 @@ def _size(values: np.ndarray) -> np.ndarray:
 
 def _large(values: np.ndarray) -> np.ndarray:
     return np.maximum(values, SMALLEST)
-
-
-# Held-out runs that differ from those of a training: twice as long, and with a larger measurement noise.
 
 
 def twice_as_long(problem: Problem, seeds: Sequence[int]) -> Data | None:

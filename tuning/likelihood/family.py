@@ -9,7 +9,7 @@ import numpy as np
 
 from filters.differentiated.runs import KINDS, ModelSlopes, has_derivatives
 from filters.estimators.foreign import is_foreign
-from filters.filter import Filter, PageFilter
+from filters.filter import Filter
 from filters.registry import filter_type, make_filter
 from thruster_env.core.checks import one_of
 from thruster_env.model.state_space import StateSpaceModel
@@ -30,8 +30,6 @@ from tuning.search.parameters import (
     obeying,
 )
 from tuning.search.space import Choice, neutral
-
-# Q or R as a function of tuned parameters, with exact derivatives.
 
 
 class TunedCovariance:
@@ -99,12 +97,6 @@ DIFFERENTIABLE = tuple(kind.name for kind in KINDS)  # filters, and those of use
 def has_gradient(name: str) -> bool:
     """Whether a filter, or a user's by "module:class", has exact gradients."""
     return name in DIFFERENTIABLE or (is_foreign(name) and has_derivatives(filter_type(name).filter_class))
-
-
-def keeps_more(name: str) -> bool:
-    """Whether a filter with a page keeps more than mean and covariance, such as an estimate of R."""
-    kind = filter_type(name).filter_class
-    return issubclass(kind, PageFilter) and kind.page.initial is not None
 
 
 def check_gradient(name: str, what: str = "filter") -> None:

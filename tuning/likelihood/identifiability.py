@@ -10,6 +10,7 @@ from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_type
 from filters.tuned_file import NOISE
+from thruster_env.core.checks import in_words
 from tuning.evaluation.residuals import heavy_innovations, tails_in_words
 from tuning.likelihood.family import Family, has_gradient
 from tuning.likelihood.objective import Objective
@@ -295,12 +296,12 @@ def sentences(result: Identifiability) -> list[str]:
             f"normal innovations, and these have heavy tails, {tails_in_words(result.tails)}. A few outliers may "
             "raise Q or R for all samples; --filter ekf-robust gives them less weight."
         ]
-    lines = [f"The innovations of the training runs determine {_listed(known or ['nothing'])} (95 %)."]
+    lines = [f"The innovations of the training runs determine {in_words(known or ['nothing'])} (95 %)."]
     if loose:
         parts = [f"{name} x {factor:.2g}" for name, factor in result.least_determined.items()]
-        trade = f" Least determined is a change of several together: {_listed(parts)}." if len(parts) > 1 else ""
+        trade = f" Least determined is a change of several together: {in_words(parts)}." if len(parts) > 1 else ""
         lines.append(
-            f"They do not determine {_listed(loose)}: a factor of ten makes no significant difference, or "
+            f"They do not determine {in_words(loose)}: a factor of ten makes no significant difference, or "
             f"the maximum of the likelihood lies at the end of the range.{trade}"
         )
     return list(map(index_pairs, lines))
@@ -317,7 +318,3 @@ def as_data(result: Identifiability) -> dict:
         }
         for name, best, factor, known in zip(*columns, strict=True)
     }
-
-
-def _listed(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

@@ -115,9 +115,6 @@ class ParametricModel:
         return models
 
 
-# Parameters that a model's functions hold in their closures, as constants: then derivatives along them are exact.
-
-
 @dataclasses.dataclass(frozen=True)
 class WithConstants:
     """A function whose numbers at some places are the last of its constants.

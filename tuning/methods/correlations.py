@@ -179,9 +179,6 @@ def autocovariances(parts: list[list[np.ndarray]], lags: int) -> np.ndarray:
     return np.array(means)
 
 
-# Autocovariance least squares: Q and R from the autocovariance of a fixed gain's innovations.
-
-
 def als(task: Task) -> None:
     """Least squares of lagged covariances of innovations, with variances not below zero; three times over.
 
@@ -293,9 +290,6 @@ def _responses(linear: Stationary, gain: np.ndarray, lags: int, side: int, size:
     return responses
 
 
-# Mehra's covariance matching: P H', R and Q, one after the other, from lagged covariances of innovations.
-
-
 def mehra(task: Task) -> None:
     """The equations of `mehra_equations`, for numbers that are not below zero; three times over.
 
@@ -351,9 +345,6 @@ def mehra_equations(
     of_q = np.column_stack([lagged_sums(unit) for unit in noise.q])
     r = measured[0] - c @ crossed - noise.rest[1]
     return np.concatenate([of_r, of_q]), np.concatenate([r.ravel(), np.ravel(ends) - lagged_sums(known)])
-
-
-# Desroziers' diagnostics: R and one factor on Q from the innovations before and after updates.
 
 
 def desroziers(task: Task) -> None:

@@ -71,9 +71,6 @@ def posterior(task: Task) -> None:
             task.keep(task.with_values(coordinates.values(np.mean(counted, axis=0)), task.free))
 
 
-# The likeliest Q and R with a prior: maximum a posteriori with inverse Wishart distributions.
-
-
 def maximum_a_posteriori(task: Task) -> None:
     """L-BFGS-B on log L + log p(Q) + log p(R), from the task's start, which is the prior's mean.
 
@@ -122,9 +119,6 @@ def _log_prior(
     relative = np.linalg.solve(cov, slopes)
     gradient = -0.5 * power * np.trace(relative, axis1=1, axis2=2)
     return float(value), gradient + 0.5 * np.einsum("pij,ji->p", relative, ratio)
-
-
-# The posterior of a model's numbers by the no-U-turn sampler, along the exact gradient of the likelihood.
 
 
 def nuts(task: Task) -> None:

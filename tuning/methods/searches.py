@@ -70,9 +70,6 @@ def ascend(objective: str) -> Callable[[Task], None]:
     return run
 
 
-# Searches of an objective without its gradient: the downhill simplex, and one number at a time.
-
-
 class Descent:
     """An objective over the coordinates of what is searched, whose least value is kept."""
 
@@ -188,9 +185,6 @@ def _squares(task: Task, choice: Choice, index: int, hidden: np.ndarray) -> np.n
     return totals / np.maximum(counts, 1)
 
 
-# Methods that ask one of Optuna's samplers for trials, and know of an objective nothing but its values.
-
-
 def sample(sampler: str, objective: str | None = None, slower: int | None = None) -> Callable[[Task], None]:
     """The method that minimises an objective, by default the task's, over trials of a sampler, from the start on.
 
@@ -280,9 +274,6 @@ def _diagonals(task: Task, q: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np
 
 sage_husa = converged("sage-husa", {"forgetting_factor": FORGETTING, "process_forgetting_factor": FORGETTING})
 vb = converged("vb", {"forgetting_factor": FORGETTING})
-
-
-# Adaptive inflation of an ensemble, after Anderson: from each innovation, and then its mean over all steps.
 
 
 def anderson(task: Task) -> None:

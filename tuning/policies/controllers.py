@@ -137,10 +137,3 @@ def _max_voltage(env: gym.Env) -> float:
 
 def _with_gains(controller: PIController, proportional, integral) -> PIController:
     return replace(controller, proportional_gain=proportional, integral_gain=integral)
-
-
-def controller_of(name: str, env: gym.Wrapper, training_returns: TrainingReturns) -> ClassicalPolicy:
-    """A classical policy of the thruster by name; arguments as of `TrainingPlant.classical`."""
-    if name in HORIZONS:
-        return predictive(name, env.env)
-    return lqr(env) if name == "lqr" else pi(env, training_returns)

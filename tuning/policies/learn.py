@@ -57,8 +57,6 @@ VALIDATION_EPISODES = 32  # of an evaluation during training; always the same on
 KEPT = 2  # checkpoints
 OnProgress = Callable[[int, float], None]  # steps, and the mean return of the last evaluation (NaN before it)
 
-# `EpochBuffer`: rollouts that are put into random order once an epoch, and handed out as views.
-
 
 class EpochBuffer(RolloutBuffer):
     """A `RolloutBuffer` with the same minibatches, to the bit, in a third of the time.
@@ -89,9 +87,6 @@ def epoch_minibatches(model: BaseAlgorithm) -> Iterator[None]:
         yield
     finally:
         holder.rollout_buffer = before
-
-
-# tanh, the activation of a policy's hidden layers, by NumPy, whose vector code is fast on all processors.
 
 
 class _Tanh(torch.autograd.Function):

@@ -237,9 +237,6 @@ def run_episodes(
     return returns, np.array(rows).transpose(1, 2, 0), np.array(alive).T
 
 
-# One episode of a saved policy as a video, or in a window.
-
-
 def play(
     folder: Path,
     video: Path | None,

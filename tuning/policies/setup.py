@@ -45,11 +45,9 @@ from tuning.policies.algorithms import (
     find_algorithm,
     find_observation_set,
 )
+from tuning.policies.controllers import lqr, pi, predictive
 from tuning.problems.scenario import PlantScenario, plain
 from tuning.thruster.scenario import SCENARIOS, Scenario, find_scenario
-
-# Checks of a training configuration: known names, and known arguments of env, filter and algorithm, all data.
-
 
 if TYPE_CHECKING:
     from tuning.policies.controllers import ClassicalPolicy
@@ -205,8 +203,6 @@ class Thruster(TrainingPlant):
 
     def classical(self, name: str, env, training_returns):
         """PI, LQR, or a predictive controller."""
-        from tuning.policies.controllers import controller_of
-
         return controller_of(name, env, training_returns)
 
     def corrected(self, name: str, env):
@@ -552,3 +548,10 @@ def in_scenario(setup: TrainingConfiguration, scenario: PlantScenario) -> Traini
         env_arguments={**scenario.plant_arguments, **task},
         assumed_plant=plant if setup.assumed_plant is None else setup.assumed_plant,
     )
+
+
+def controller_of(name: str, env: gym.Wrapper, training_returns: TrainingReturns) -> ClassicalPolicy:
+    """A classical policy of the thruster by name; arguments as of `TrainingPlant.classical`."""
+    if name in HORIZONS:
+        return predictive(name, env.env)
+    return lqr(env) if name == "lqr" else pi(env, training_returns)

@@ -215,9 +215,6 @@ def only(counted: np.ndarray | None, known: Any) -> np.ndarray | None:
     return None if both.all() else both
 
 
-# Estimates of many runs, in parts: the covariances of all steps of a large model need much memory.
-
-
 def estimates_in_parts(filter_: Filter, data: Data) -> Iterator[tuple[Data, Estimates]]:
     """Run a filter on parts of the runs, in order; yield the data of each part and the estimates on them.
 

@@ -34,9 +34,6 @@ from tuning.problems.model_problem import NamedArguments
 from tuning.problems.problem import Parameter
 from tuning.problems.scenario import Excitation, excitation_of
 
-# `Episodes`: the env of an `EnvProblem`, which offers the problem's model and shows what its data hold.
-
-
 Policy = str | Mapping | Excitation | Callable
 RANDOM = "random"
 LARGEST = 1e3  # random action, where the action space has no limit
@@ -105,9 +102,6 @@ def measurement_noise(keys: np.ndarray, steps: np.ndarray, cov: np.ndarray) -> n
     blocks = [normal_block(b, steps[None], ADDED_NOISE, keys[:, :1], keys[:, 1:]) for b in range(-(-size // 4))]
     draws = np.stack([draw for block in blocks for draw in block][:size], axis=-1)
     return draws @ covariance_root(cov).T
-
-
-# Policies of an `EnvProblem`: functions of the observation that choose the same actions for the same seed.
 
 
 def checked_policy(policy: Policy) -> str | Excitation | Callable:

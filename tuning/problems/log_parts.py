@@ -245,15 +245,11 @@ def _check_names(logs: Sequence[Log], held_out: Collection[str] | None) -> None:
 def _mask_of_held_out(
     logs: Sequence[Log], blocks: Sequence[Block], held_out: Collection[str] | None
 ) -> list[bool]:
-    """Whether each block is held out."""
     if held_out is not None:
         return [logs[block.run].name in held_out for block in blocks]
     if len(logs) >= EVERY_THIRD:
         return [block.run % EVERY_THIRD == EVERY_THIRD - 1 for block in blocks]
     return [i % EVERY_THIRD == EVERY_THIRD - 1 for i in range(len(blocks))]
-
-
-# Requirements on the recorded runs of a problem: one sample time, and separate held-out runs.
 
 
 def checked_logs(user_logs: Any) -> tuple[Log, ...]:

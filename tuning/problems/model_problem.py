@@ -37,9 +37,6 @@ if TYPE_CHECKING:
     from thruster_env.graphs.loops import Loops
 
 
-# The posterior Cramer-Rao bound of a problem, stored beside the machine code that computes it.
-
-
 _known: dict[str, tuple[float, ...]] = {}  # of this process
 
 

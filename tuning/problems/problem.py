@@ -153,9 +153,6 @@ def squared(unit: str) -> str:
     return f"({unit})^2" if set(unit) & set("/ ^*") else f"{unit}^2" if unit else ""
 
 
-# Scaled coordinates of free parameters: logarithms of positive parameters, fractions of the range of others.
-
-
 class Coordinates:
     """Map values of p parameters to coordinates (p,) and back; one unit is a sensible change of each parameter.
 

@@ -29,9 +29,6 @@ MOST_STEPS = 1_000_000
 FILE_SEQUENCES = 200  # input sequences for the scale of a file that gives none
 
 
-# Plain data: mappings and lists as immutable values, and as values for JSON.
-
-
 def frozen(value, depth: int = 0):
     """Mappings and lists as an immutable value; ValueError if they are nested too deep."""
     if depth > DEEPEST:

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from filters.consistency.nees import Interval, slightly, span
-from filters.consistency.report import confidence, mean_sentence, rounded
+from filters.consistency.report import confidence, rounded
+from thruster_env.core.checks import in_words
 from thruster_env.model.quantities import Quantity
 from tuning.evaluation.baselines import FULL_Q, FULL_QR, TUNED, called, is_far_below
 from tuning.evaluation.evaluate import is_beyond
@@ -75,7 +76,7 @@ def choice_sentences(validation: Mapping[str, Any] | None, plan: Any) -> list[st
         if lost:
             is_better = over[0] < (0.0 if likely else 1.0)
             without = " without being worse in a log" if is_better else ""
-            but = f", {'but' if is_better else 'and'} it is worse in {_listed(lost)}"
+            but = f", {'but' if is_better else 'and'} it is worse in {in_words(lost)}"
         none_is, its = f"{the} is not", f"its {what}"
         if _is_trial(candidate):
             none_is, its = "no trial is", f"{candidate}'s {what}"
@@ -120,8 +121,8 @@ def _raised_sentence(met: Mapping[str, Mapping], baseline: str, chosen: str, pla
         return []
     have, those = ("has", "that") if len(raised) == 1 else ("have", "those")
     return [
-        f"Here the {_listed(raised)} {have} a larger Q, to forget within {plan.forget:g} s (--forget); {those} of "
-        "the tables may remember longer."
+        f"Here the {in_words(raised)} {have} a larger Q, to forget within {plan.forget:g} s (--forget); {those} "
+        "of the tables may remember longer."
     ]
 
 
@@ -202,13 +203,12 @@ def _failures_sentence(validation: Mapping, word: str, channels: int) -> str:
         named.append(f"{failure['run']} (mean NIS {rounded(channels * failure['nis'])}{other})")
     worst = "" if failed == len(named) else "worst "
     return (
-        f"The {called(tested)} fails in {failed} of {runs} {word}, {worst}in {_listed(named)}; a mean NIS "
+        f"The {called(tested)} fails in {failed} of {runs} {word}, {worst}in {in_words(named)}; a mean NIS "
         f"of {channels} is right."
     )
 
 
 def _price_sentence(validation: Mapping, chosen: Mapping, what: str, channels: int) -> str:
-    """The price of the band, with both sides of the choice."""
     trials = [contender for contender in validation["met"] if contender["name"].startswith("trial ")]
     inside = [trial for trial in trials if trial["consistent"]]
     best = min(inside, key=lambda trial: trial["value"])
@@ -273,15 +273,8 @@ def _what(plan: Any) -> str:
     return named.get(plan.objectives[0], "error")
 
 
-def _listed(parts: Sequence[str]) -> str:
-    return " and ".join([*([", ".join(parts[:-1])] if parts[:-1] else []), parts[-1]])
-
-
 def _range(ends: Sequence[int]) -> range:
     return range(*ends)
-
-
-# The gain of tuning, in sentences.
 
 
 def gains(comparison: Comparison, seed_word: str, name: str = TUNED) -> list[str]:
@@ -328,9 +321,6 @@ def _verdict(ratio: Interval, name: str, seed_word: str) -> str:
     if ratio.low > 1:
         return f"Tuning makes the filter worse than the {name}."
     return f"No significant difference from the {name} on these {seed_word}."
-
-
-# What residuals of the true states, or without these the innovations, say of a model.
 
 
 def residual_sentences(problem: Problem, seed: int = 0) -> list[str]:
@@ -458,17 +448,6 @@ def consistency_of(comparison: Comparison) -> tuple[str, Interval, float, str]:
     if mean.covers(right) and any(map(is_beyond, tuned.scored_nees.values())):
         return name, mean, right, JOINTLY
     return name, mean, right, confidence(mean, right)
-
-
-def consistency_sentence(comparison: Comparison) -> str:
-    """The same in a sentence; a filter that predicts far worse than a regression is never called consistent."""
-    name, mean, right, word = consistency_of(comparison)
-    sentence = mean_sentence(name, mean, right)
-    if word in (MADE_UP, JOINTLY):
-        return f"{word[:1].upper()}{word[1:]}:{sentence.partition(':')[2]}"
-    if not comparison.tuned.has_truth or sentence.startswith("Consistent"):
-        return sentence
-    return f"{sentence} RMSE and NIS do not fully test the covariance."
 
 
 def number_rows(choices: Sequence[Choice], kind: str, problem: Problem, word: Callable) -> list[list[str]]:

@@ -138,7 +138,6 @@ def without(columns: Sequence[str], rows: Sequence[Sequence[str]], head: str) ->
 
 
 def _innovations_table(evaluations: Mapping[str, Evaluation], where: str) -> Table:
-    """Metrics of the innovations, a row per filter."""
     first = next(iter(evaluations.values()))
     rows = [
         [

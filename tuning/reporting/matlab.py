@@ -47,9 +47,6 @@ end
 """
 
 
-# A function of a model as lines of MATLAB, from its graph.
-
-
 def lines_of(function: Callable, arguments: Sequence[Sequence[str]], constants: Any, count: int) -> list[str]:
     """Lines "t1 = a + b;" of a function and, last, "[t7; t9]", its results.
 
@@ -256,7 +253,6 @@ def _written(transition: str, measurement: str, model: StateSpaceModel) -> str:
 
 
 def _matrix(values: np.ndarray) -> str:
-    """A matrix as MATLAB writes it."""
     values = np.asarray(values, dtype=float)
     if values.shape == (1, 1):
         return f"{values[0, 0]:.17g}"

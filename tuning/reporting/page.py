@@ -55,9 +55,6 @@ NO_TRIALS = "No trial was finished."
 TWO_SIDED = 1.96
 
 
-# Figures as SVG within a page: text stays text, colours follow the page's, and a script can read values.
-
-
 def figure_svg(figure: Figure, name: str) -> tuple[str, str]:
     """A figure as an SVG element without its size and its alternative text, and its readable values as JSON.
 

@@ -307,9 +307,6 @@ def _size_axis(axis, sizes: Sequence[int]) -> None:
     axis.set_xticks([], minor=True)
 
 
-# Pictures of a page, each with its own ids.
-
-
 class Sketchbook:
     """Numbers pictures, each with a caption and a text alternative."""
 

@@ -219,9 +219,6 @@ def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Wor
     return book.picture(draw_importance(shares), caption, of_importances(shares))
 
 
-# Sections of a report on the setup: the score, the model, assumed Q and R, and the facts of the study.
-
-
 def score_section(subject: Subject) -> Section:
     """The definition of the score, in words and with its scales."""
     paragraphs = []
@@ -378,9 +375,6 @@ def _nis_words(nis: Sequence[float], plan: Plan) -> str:
     )
 
 
-# Lines of a report to copy: Python, JSON and MATLAB that use the tuned filter.
-
-
 def lines_section(choice: Choice, problem: Problem, file: str | None) -> Section:
     """Lines that use the tuned filter.
 
@@ -419,9 +413,6 @@ def _found_by(problem: Problem) -> str:
         statement = f"from {module} import {name}" + ("" if name == "problem" else " as problem")
         return f"{statement}  # if it is a function: problem = problem()\n"
     return "from your_module import problem  # the object that it was tuned on\n"
-
-
-# Sections of a report on one run over time: estimates, measurements, innovations, gain, consistency.
 
 
 def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) -> str:

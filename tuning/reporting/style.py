@@ -105,9 +105,6 @@ body.two-columns {{ max-width: 84rem; }}
 """
 
 
-# The script of a page: reading values from pictures, zooming in time, copying lines.
-
-
 SCRIPT = r"""
 (() => {
 'use strict';

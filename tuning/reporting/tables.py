@@ -8,7 +8,6 @@ import numpy as np
 
 from thruster_env.core.text_tables import Table
 from tuning.likelihood.gradient import GradientResult
-from tuning.likelihood.identifiability import Identifiability
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import number_rows
 from tuning.search.among_types import TypeResult
@@ -94,20 +93,3 @@ def gradient_table(result: GradientResult, seed_word: str = "seeds") -> Table:
     what = "Maximum of the innovations' likelihood" if likeliest else what
     titles = [f"start {i + 1}" for i in range(len(result.starts))]
     return Table(f"{what} on the training {seed_word}", ["", *titles, "standard error"], rows, caption=caption)
-
-
-def known_table(result: Identifiability) -> Table:
-    """The parameters as the innovations determine them."""
-    identified = result.identified & (not result.tails)
-    columns = result.names, result.tuned, result.most_likely, result.factors, identified
-    rows = [
-        [name, f"{tuned:.4g}", f"{best:.4g}", f"{factor:.3g}" if known else "", "yes" if known else "no"]
-        for name, tuned, best, factor, known in zip(*columns, strict=True)
-    ]
-    if result.tails:
-        rows = [row[:3] for row in rows]
-        return Table("Parameters by maximum likelihood", ["", "tuned", "maximum likelihood"], rows)
-    header = ["", "tuned", "maximum likelihood", "known within a factor of", "determined"]
-    return Table(
-        "Parameters determined by the innovations of the training runs, with 95 % probability", header, rows
-    )

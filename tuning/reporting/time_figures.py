@@ -39,9 +39,6 @@ HEIGHT = 1.5  # of a panel [inch]
 DASHES = ("-", "--", ":", "-.")
 
 
-# Axes of panels over time: limits from the scored steps, so that a start-up does not flatten the rest.
-
-
 def limit_errors(
     axes: Sequence, values: Sequence[np.ndarray], bands: Sequence[np.ndarray], start: int, word: str = "RMSE"
 ) -> None:
@@ -95,7 +92,6 @@ def limit_values(axes: Sequence, plotted: Sequence[np.ndarray], bands: Sequence[
 
 
 def _ends(series: Sequence[np.ndarray]) -> tuple[float, float] | None:
-    """The least and the largest of all finite values."""
     finite = np.concatenate([values[np.isfinite(values)] for values in series])
     return (float(finite.min()), float(finite.max())) if finite.size else None
 
@@ -104,9 +100,6 @@ def _reach(values: np.ndarray, band: np.ndarray, start: int) -> float:
     """The range of a panel: to the largest error, and to the end of a band not far beyond."""
     (_, error), (_, width) = (_ends([np.abs(series[start:])]) or (0.0, 0.0) for series in (values, band))
     return max(error, min(width, WIDEST * error) if error > 0 else width)
-
-
-# Which states have a panel in a figure, and how axes name them.
 
 
 def plotted_states(
@@ -314,9 +307,6 @@ def draw_band(axis, time: np.ndarray, low: np.ndarray, high: np.ndarray, colour:
     axis.fill_between(times, below, above, color=colour, alpha=0.22, linewidth=0, label="95 % band of the filter")
 
 
-# The inputs and measurements of one run, innovations, and gain, over time.
-
-
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -432,7 +422,6 @@ def _slopes(model: StateSpaceModel, mean: np.ndarray, u: np.ndarray) -> np.ndarr
 
 
 def _over(state: Quantity, channel: Quantity) -> str:
-    """Unit of a gain."""
     if state.unit == channel.unit:
         return "-"
     return f"{_whole(state.unit) or '1'}/{_whole(channel.unit)}" if channel.unit else state.unit

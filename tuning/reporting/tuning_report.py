@@ -7,6 +7,8 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from filters.consistency.nees import slightly, span
+from filters.consistency.report import mean_sentence
+from filters.filter import Filter
 from thruster_env.core.modules import is_code
 from thruster_env.core.text_tables import Table
 from tuning.evaluation.baselines import (
@@ -20,7 +22,7 @@ from tuning.evaluation.baselines import (
     called,
     same_filter,
 )
-from tuning.evaluation.evaluate import blow_up_on, likelihood_gain, score_ratio
+from tuning.evaluation.evaluate import BLOW_UP_RUNS, blow_up, likelihood_gain, score_ratio
 from tuning.evaluation.held_out import Comparison, numbers
 from tuning.evaluation.sizes import SIZE_TOLERANCE, left_out
 from tuning.evaluation.tuned import consistency, metrics
@@ -30,8 +32,17 @@ from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.logs.problem import model_named_in
 from tuning.problems.assumed import within
+from tuning.problems.data import Data, estimates_in_parts
 from tuning.problems.find import built_in
-from tuning.reporting.choice_words import apart, consistency_sentence, gains, model_doubts, residual_sentences
+from tuning.reporting.choice_words import (
+    JOINTLY,
+    MADE_UP,
+    apart,
+    consistency_of,
+    gains,
+    model_doubts,
+    residual_sentences,
+)
 from tuning.reporting.tables import front_table, gradient_table, kinds_table
 from tuning.search.among_types import filter_types_tried
 from tuning.search.objectives import LIKELIHOOD, NIS_BAND, PROPER, reported, reported_name
@@ -371,3 +382,23 @@ def _seeds_sentence(result: StudyResult, word: str) -> str:
         f" The others were excluded on the first {min(counts)} {word} before N = {sizes} were run on "
         f"{max(counts)}."
     )
+
+
+def blow_up_on(filter_: Filter, data: Data, dt: float | None) -> str:
+    """`blow_up` of a filter on the first runs of some data."""
+    first_runs = data.slice(0, BLOW_UP_RUNS)
+    sentences = [
+        blow_up(filter_, estimates, part, dt) for part, estimates in estimates_in_parts(filter_, first_runs)
+    ]
+    return next((sentence for sentence in sentences if sentence), "")
+
+
+def consistency_sentence(comparison: Comparison) -> str:
+    """The same in a sentence; a filter that predicts far worse than a regression is never called consistent."""
+    name, mean, right, word = consistency_of(comparison)
+    sentence = mean_sentence(name, mean, right)
+    if word in (MADE_UP, JOINTLY):
+        return f"{word[:1].upper()}{word[1:]}:{sentence.partition(':')[2]}"
+    if not comparison.tuned.has_truth or sentence.startswith("Consistent"):
+        return sentence
+    return f"{sentence} RMSE and NIS do not fully test the covariance."

@@ -17,11 +17,12 @@ import optuna
 from optuna.distributions import BaseDistribution
 from optuna.trial import FrozenTrial, TrialState
 
+from filters.filter import PageFilter
 from filters.registry import filter_type
 from tuning.evaluation.baselines import competing_baselines, noise_estimated
 from tuning.evaluation.held_out import sizes_as_data, stored_sizes
 from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
-from tuning.likelihood.family import has_gradient, keeps_more
+from tuning.likelihood.family import has_gradient
 from tuning.likelihood.gradient import goal_of, optimum, start_at, starts_of
 from tuning.likelihood.objective import OF_STATES, Objective
 from tuning.problems.data import Data
@@ -294,9 +295,6 @@ def enqueue_near_in_race(study: optuna.Study, plan: Plan, number: int) -> None:
         enqueue_new(study, near(best.params, plan.space(), plan, number), {NEAR_BEST: best.number})
 
 
-# The report of a study over several filter types on each type.
-
-
 class TypeResult(NamedTuple):
     """The results of a filter type in a study."""
 
@@ -455,9 +453,6 @@ def _enqueue_minimum(study: optuna.Study, plan: Plan, start: dict) -> None:
         enqueue_new(study, {**start, **noise}, {BY_GRADIENT: objective})
 
 
-# The ensemble size of a study's choice, from a table stored in the study.
-
-
 def sizes_of(
     study: optuna.Study, choice: Choice, plan: Plan, data: Sequence[Data], consistent: bool
 ) -> list[SizeRow]:
@@ -479,3 +474,9 @@ def sized(choice: Choice, plan: Plan, data: Sequence[Data], sizes: Sequence[Size
     if filter_type(choice.name).has_ensemble and len(plan.objectives) == 1 and recorded:
         return choice.with_size(close_size(choice, plan, data))
     return choice
+
+
+def keeps_more(name: str) -> bool:
+    """Whether a filter with a page keeps more than mean and covariance, such as an estimate of R."""
+    kind = filter_type(name).filter_class
+    return issubclass(kind, PageFilter) and kind.page.initial is not None

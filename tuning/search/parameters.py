@@ -128,9 +128,6 @@ def obeying(choice, parameters: Sequence[Parameter]):
     return choice
 
 
-# A full covariance matrix from variances and correlations, which may be chosen independently of one another.
-
-
 def full_covariance(variances: Sequence[float], correlations: Sequence[float]) -> np.ndarray:
     """A covariance (n, n), positive semidefinite by construction: S L L' S, S the standard deviations.
 
@@ -179,7 +176,6 @@ def correlation_slopes(variances: Sequence[float], correlations: Sequence[float]
 
 
 def _lower(n: int, correlations: Sequence[float]) -> np.ndarray:
-    """The Cholesky factor L of the correlations."""
     lower, remaining = np.zeros((n, n)), iter(correlations)
     for i, row in enumerate(lower):
         for j in range(i):
@@ -347,7 +343,6 @@ def _variance(
 
 
 def _correlations(covariance: str, size: int) -> list[Parameter]:
-    """The correlations of Q or R."""
     names = correlation_names(size, covariance)
     locations = [Correlation(covariance, k) for k in range(len(names))]
     return [
@@ -424,9 +419,6 @@ def _with_variance(choice, argument: str, index: int, value: float):
 
 def _replaced(values: Sequence[float], index: int, value: float) -> tuple[float, ...]:
     return (*values[:index], value, *values[index + 1 :])
-
-
-# The parameters of filters besides their model that a study may choose: ranges and untuned values.
 
 
 class Sizes(NamedTuple):

@@ -14,7 +14,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, IntD
 
 from filters.registry import filter_type
 from filters.tuned_file import NOISE
-from thruster_env.core.checks import positive, short_repr
+from thruster_env.core.checks import in_words, positive, short_repr
 from thruster_env.core.modules import is_code
 from tuning.problems.assumed import may_estimate_constants
 from tuning.problems.check import checked_problem, data_of
@@ -233,7 +233,6 @@ class Plan(NamedTuple):
                 )
 
     def _check_full_r(self) -> None:
-        """Raise ValueError unless R may have correlations."""
         if self.hold_r:
             raise ValueError("R must be free to be full, but got hold_r (--hold-r) with full_r (--full-r)")
         if not self._has_covariance:
@@ -403,11 +402,10 @@ def range_warning(choice: Choice, plan: Plan) -> list[str]:
     options = " ".join(reached.wider for reached in high[:MOST_OPTIONS]) + (
         f" and {more} more" if more > 0 else ""
     )
-    listed = " and ".join([*([", ".join(names[:-1])] if names[:-1] else []), names[-1]])
     ends = "the upper end of its range" if len(names) == 1 else "the upper ends of their ranges"
     return [
-        f"{listed} ended at {ends}, given by the Q and R with which the study began. Before you doubt the model, "
-        f"widen the range: {options}."
+        f"{in_words(names)} ended at {ends}, given by the Q and R with which the study began. Before you doubt "
+        f"the model, widen the range: {options}."
     ]
 
 

@@ -257,9 +257,6 @@ def trial_parameters(choice: Choice, space: Mapping[str, BaseDistribution]) -> d
     return values
 
 
-# How long a filter remembers on a problem, and choices whose Q is raised so that it forgets in time.
-
-
 TOLERANCE = 1.001  # of the longest time constant of a steady gain
 MARGIN = 1.1  # of the next time constant that is tried over the one that a larger Q reached
 ATTEMPTS = 8  # to find one that a larger Q reaches
@@ -373,7 +370,6 @@ def reachable(
 
 
 def _two_digits(value: float, rounding: Callable[[float], int]) -> float:
-    """A positive number with two digits."""
     exponent = floor(log10(value)) - 1
     return float(f"{rounding(float(f'{value / 10.0**exponent:.9g}'))}e{exponent}")
 
@@ -390,7 +386,6 @@ def _with_noise(choice: Choice, cov: np.ndarray) -> Choice:
 
 @lru_cache(maxsize=16)
 def _runs(problem: Problem, seed: int) -> tuple[Run, ...]:
-    """Two training runs."""
     return tuple(problem.long_runs(seed))
 
 

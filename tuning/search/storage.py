@@ -123,9 +123,6 @@ def first_line(error: BaseException) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
-# Databases as storages of studies, tolerant of outages, and their proxy.
-
-
 def open_database(url: str, on_lost: OnLost) -> BaseStorage:
     """Open a database, or the proxy of one, "grpc://host:port"; any error that SQLAlchemy or its drivers raise.
 
@@ -279,9 +276,6 @@ class _PatientStorage(_CachedStorage):
         except StorageInternalError as error:
             with contextlib.suppress(ValueError):  # the thread that runs the trial has to end it
                 self.outage.noticed("record_heartbeat", str(error))
-
-
-# A study's journal file, whose lines stay complete after a full disk, a killed process or an interrupt.
 
 
 class Journal(JournalStorage):

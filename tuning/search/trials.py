@@ -185,9 +185,6 @@ def _report(
         trial.report(float(score), first + index)
 
 
-# The outcome of trials: constraints, and the best trial.
-
-
 def best_trial(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:
     """The complete trial with the lowest first objective, among the consistent ones if there are any.
 
@@ -212,9 +209,6 @@ def violation(trial: FrozenTrial) -> float:
 def is_over_budget(trial: FrozenTrial) -> bool:
     """Whether a trial ended because its filter is over the budget."""
     return trial.constraints.get(BUDGET, 0.0) > 0
-
-
-# Trials that are enqueued unless there is one with the same parameters.
 
 
 def enqueue_new(study: optuna.Study, parameters: dict, attributes: dict) -> None:
@@ -265,9 +259,6 @@ LARGEST_STEP = (
 DECADES = 1.5  # ... and the smallest step is so many powers of ten below
 MOVED = 0.5  # probability that a number is moved
 _OPTIMIZERS = ("CMA", "SepCMA", "CMAwM")
-
-
-# Samplers that draw Q and R within a box in their ranges, which grows as the best trial nears a side of it.
 
 
 def box(
@@ -329,9 +320,6 @@ class GpInBox(InBox, optuna.samplers.GPSampler):
 
 class RandomInBox(InBox, optuna.samplers.RandomSampler):
     """Independent draws, within the box."""
-
-
-# Optuna's CMA-ES, which stores its state in the study, made safe for studies of unknown origin.
 
 
 # The classes in the state of an optimizer of `cmaes`. Any pickle may name any function of any module, and call it.
@@ -426,9 +414,6 @@ def _grid(distribution: BaseDistribution) -> list:
     if isinstance(distribution, IntDistribution):
         return sorted({int(round(value)) for value in values})
     return [float(np.clip(value, distribution.low, distribution.high)) for value in values]
-
-
-# Every second trial of the default sampler is near the best one, so that wide ranges do not slow the search.
 
 
 def near(best: Mapping, space: Mapping[str, BaseDistribution], plan: Plan, number: int) -> dict:

@@ -43,8 +43,6 @@ from tuning.search.study import (
 MODULE = "tuning.search.workers"
 POLL_SECONDS = 0.2
 
-# Processes beside this one that work for a study: started, told its plan in a line of JSON, and ended.
-
 
 def orders_of(plan: Plan) -> dict[str, Any]:
     """A plan as JSON holds it; its problems are found again by their names, and logs are sent."""

@@ -250,7 +250,6 @@ def _quantity(header: str) -> Quantity:
 
 
 def _check_numbers(header: str, values: np.ndarray) -> None:
-    """Raise ValueError unless a column has enough numbers."""
     count = int(np.count_nonzero(~np.isnan(values)))
     if count < LEAST_ROWS:
         raise ValueError(f"{header} must have at least {LEAST_ROWS} numbers, but has {count}")

@@ -250,7 +250,6 @@ class ColumnLikelihood:
         return parts
 
     def _moving_rates(self) -> frozenset[int]:
-        """Indices of the parameters that move A."""
         middle = 0.5 * (self.coordinates.low + self.coordinates.high)
         moving = []
         for j in range(len(middle) - 1):

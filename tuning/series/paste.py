@@ -177,7 +177,6 @@ def _less(offset: np.ndarray) -> str:
 
 
 def _c(value: float) -> str:
-    """A number in C, double precision."""
     text = _number(value)
     return text if "." in text or "e" in text else f"{text}.0"
 

@@ -48,9 +48,6 @@ SMALL_ERROR = 0.02  # relative; larger ones are the model's, and are weighted li
 DEAD_BAND = 28.0  # half of the dead band [us]; 24 to 40 in the table of the T200
 
 
-# A thruster's bollard table: thrust, speed and current for pulse widths and supply voltages.
-
-
 class BollardTable(NamedTuple):
     """The rows of a bollard table that are fast enough to be used, arrays of one shape (n,).
 
@@ -113,7 +110,6 @@ def read_table(path) -> BollardTable:
 
 
 def _numbers(row: dict, line: str) -> list[float]:
-    """The values of COLUMNS in a row."""
     try:
         values = [float(row[name]) for name in COLUMNS]
     except (TypeError, ValueError):
@@ -273,9 +269,6 @@ def relative_errors(identified: Identified, table: BollardTable, held_out: Seque
         }
         for quantity, ratio in ratios.items()
     }
-
-
-# The preset `t200`, identified from the bollard table of a Blue Robotics T200 thruster.
 
 
 T200_PULSE_WIDTHS = PulseWidthMap(droop=0.01687, astern_gain=1.0085)

@@ -50,8 +50,6 @@ ROUNDING = 1e-6  # of the untuned noise: anything below is rounding
 PARTS = (0.5, 1.0)  # of the largest voltage, where stability is checked: at rest the quadratic drag vanishes
 LINEAR_NOISE: dict[str, Any] = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5, "steps": 100}
 
-# Voltages of the thruster's scenarios: any excitation of one input, and the closed loop that only it has.
-
 
 def voltages_of(excitation: Excitation, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
     """Voltages (B, steps) [V] for keys (B, 2), not yet clipped to the plant's range."""

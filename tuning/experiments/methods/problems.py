@@ -201,9 +201,6 @@ CASES = (
 QUICK = (Case("walk", "A", walk, "kf", runs=4), Case("walk, blind", "G", walk, "kf", runs=4, truth=False))
 
 
-# How much is done: cases, methods, data sets and budgets.
-
-
 FULL_METHODS = (
     *(f"{method}{WITH_FULL}" for method in ("mse", "log-score", "likelihood", "als")),
     *(f"{method}{FROM_NOISE}" for method in ("mse", "log-score")),
@@ -229,11 +226,8 @@ FAST = Protocol(
 )
 
 
-# What the authors of the methods, and we, would predict of the study; written before its first run.
-
-
 class Prediction(NamedTuple):
-    """A statement that the study can contradict."""
+    """A statement that the study can contradict, written before its first run."""
 
     who: str
     says: str

@@ -263,7 +263,6 @@ def reference(case: Case, protocol: Protocol) -> Result:
 
 
 def _plain(choice: Choice) -> dict[str, Any]:
-    """A choice as JSON has it."""
     content: dict[str, Any] = json.loads(
         json.dumps(choice._asdict(), default=lambda array: np.asarray(array).tolist())
     )
@@ -359,9 +358,6 @@ def _result(content: dict[str, Any]) -> Result:
 
 def _float(value: float | None) -> float:
     return math.nan if value is None else float(value)
-
-
-# Regrets of methods with intervals over data sets, and which methods are significantly worse than the best.
 
 
 def within(kind: str, key: str) -> Callable[[Result], Scored | None]:

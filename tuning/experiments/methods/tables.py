@@ -198,9 +198,6 @@ def tables(results: Sequence[Result], protocol: Protocol) -> dict[str, Callable[
     }
 
 
-# The picture of the study of methods: regrets by group, at each budget of passes.
-
-
 def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> Path:
     """A panel a group: the mean log ratio of each method over the cases, after each budget of passes."""
     groups = [key for key in GROUPS if any(case.group == key for case in protocol.cases)]

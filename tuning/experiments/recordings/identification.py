@@ -178,9 +178,6 @@ def thrusts(model: StateSpaceModel, runs: Sequence[Recording], ambient: bool = F
     return [thrust[i, : len(recording.times)] for i, recording in enumerate(runs)]
 
 
-# Results of all identifications, stored in a file one by one, so that an interrupted study can be continued.
-
-
 class Task(NamedTuple):
     """One identification."""
 
@@ -239,9 +236,6 @@ def identify_all(
     return results
 
 
-# Errors of thrust estimates against the load cell, and their ratios to the recorder's own.
-
-
 class Ratios(NamedTuple):
     """RMSE of an estimate over that of the recorder's own, on one run."""
 
@@ -297,9 +291,6 @@ def ratios(estimate: np.ndarray, run: Recording) -> Ratios:
     )
 
 
-# Estimates of thrust on the recorded runs: ours, the recorder's own, and trivial ones.
-
-
 def estimates_of(runs: Sequence[Recording], held_out: Mapping[str, Mapping] | None = None) -> dict[str, list]:
     """Thrust (K + 1,) on each run by every estimator, by name.
 
@@ -344,9 +335,6 @@ def _lookup(run: Recording) -> np.ndarray:
     command = np.append(0.0, run.command[:-1])
     beyond = np.maximum(abs(command) - LOOKUP_BAND, 0.0)
     return np.sign(command) * np.where(command > 0, *LOOKUP_FACTORS) * beyond**2
-
-
-# The effect of a larger process noise after each reversal of the command on the recordings.
 
 
 class Regime(NamedTuple):

@@ -212,12 +212,6 @@ def model() -> StateSpaceModel:
     return on_line(valued(to_identify(), read_values(IDENTIFIED)))
 
 
-# The recorded runs: logs on the recorder's clock, the load cell on its own, and the recorder's estimates.
-
-
-# The offset between the clocks of two recorders of the same quantity.
-
-
 def clock_offset(times: np.ndarray, here: np.ndarray, other: np.ndarray) -> float:
     """The offset s [s] of least sum of squares of here(t) - other(t + s).
 

@@ -41,9 +41,6 @@ MEASUREMENTS = "measurements, no filter"
 EULER = {"integration": "euler"}  # as in the papers; the truth and our other filters use Runge-Kutta
 
 
-# Position and yaw that follow from velocities over time, by the full transformation or by yaw alone.
-
-
 def next_attitude(phi, theta, before, after, dt):
     """Roll and pitch [rad] a step later, by Heun's rule; p, q, r [rad/s] were before and are after."""
     rolling, pitching, _ = angle_rates(attitude_of(phi, theta), before[0], before[1], before[2])
@@ -109,9 +106,6 @@ def _integral(rates: np.ndarray, dt: float) -> np.ndarray:
     return cumulative_trapezoid(rates, dx=dt, initial=0.0)
 
 
-# An extended Kalman filter of six velocities that takes roll and pitch from its own dead reckoning.
-
-
 @lru_cache(maxsize=64)
 def own_attitude_kernels(functions: Functions, shape: Shape) -> Kernels:
     """Kernels of the extended filter for a model whose last two inputs are roll and pitch."""
@@ -162,9 +156,6 @@ class OwnAttitudeKalmanFilter(ExtendedKalmanFilter):
         """Kernels for the model's functions; see `Filter.kernels`."""
         model = self.kernel_model
         return own_attitude_kernels(model.functions, model.shape)
-
-
-# The ensemble Kalman filter as printed in one paper: every member is predicted from the mean, not from itself.
 
 
 def advance_from_the_mean(model, x, u):

@@ -76,9 +76,6 @@ LEAST_SPAN = 2.0  # of an axis [m]: millimetres of a straight path are no shape
 EVERY = 20  # steps between points of a line
 
 
-# The vehicle's inputs over time on each of the papers' five paths.
-
-
 PATHS = dict(zip(MANOEUVRES, ("turn", "dive", "straight", "three-dimensional", "dynamic"), strict=True))
 """What each path is, by name. The meanings of I, II and III are inferred from the order of a conclusion."""
 
@@ -93,9 +90,6 @@ def path_inputs(name: str, steps: int | None = None) -> np.ndarray:
     if manoeuvre.thrust_period is not None:
         inputs[:, 1] = TORQUE_PER_THRUST * inputs[:, 0]
     return inputs
-
-
-# Scores of a filter: mean squares by run, from which intervals and ratios follow.
 
 
 class Scores(NamedTuple):
@@ -325,9 +319,6 @@ def along_path(world: str, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     return pose[-1], np.sqrt(np.square(gap).mean(axis=0)), outside, bound
 
 
-# The filters of each paper's study, with their paths and worlds.
-
-
 PAPERS: dict[str, Paper] = {paper.name: paper for paper in (NGATINI2017, NGATINI2019)}
 
 
@@ -342,9 +333,6 @@ def tasks_of(paper: str) -> list[Task]:
     ekf8, _, ekf6, _ = kalman(OTHER_WORLD)
     closed = [measured(), ekf8, ekf6, *ensembles(6, OTHER_WORLD), *fuzzy(OTHER_WORLD)]
     return [*paths, Task("dynamic", OTHER_WORLD, closed)]
-
-
-# The paths in three dimensions: one run of each, truth and estimates.
 
 
 class PathRun(NamedTuple):

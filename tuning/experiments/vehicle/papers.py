@@ -26,9 +26,6 @@ Then nothing depends on roll and pitch, so that the papers' six velocities are a
 COUNTS = {"velocities": 6, "motion": 8, "navigation": 12}
 
 
-# The runs of the papers on the vehicle: the form of a table, and the settings of both papers.
-
-
 class PrintedRow(NamedTuple):
     """One filter on one path."""
 

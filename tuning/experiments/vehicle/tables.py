@@ -66,9 +66,6 @@ SHOWN = [0, 3, 4]  # of the velocities: u, whose errors those of v, w and r equa
 RUNS_OF = {"ngatini2019": 50, "ngatini2017": 10}
 
 
-# Printed values beside ours, and why they differ.
-
-
 class Finding(NamedTuple):
     """One filter on one path: the printed values, if there are any, and ours."""
 
@@ -149,9 +146,6 @@ def _by_component(printed: PrintedRow, scores: Scores) -> dict[str, str]:
         else:
             components.setdefault("unlike any of ours", []).append(name)
     return {", ".join(names): words for words, names in components.items()}
-
-
-# Formats of numbers in tables and statements.
 
 
 def digits(value: float) -> str:
@@ -329,9 +323,6 @@ def _rates(scores: Scores) -> str:
     return f"{digits(p)} and {digits(q)} mrad/s"
 
 
-# Tables, of the command and of docs/appendix/auv.md.
-
-
 def members(iv: PathResult) -> Table:
     """Table III beside ours."""
     labels = [MEASUREMENTS, "EKF8", *(f"EnKF8 N={count}" for count in TABLE_III)]
@@ -416,9 +407,6 @@ def _row(values: Iterable[float]) -> str:
     return ", ".join(digits(value) for value in values if not np.isnan(value))
 
 
-# The command.
-
-
 def reproduce(
     name: Annotated[str, PythonOnly()],
     runs: Annotated[int, Option(RUNS_PANEL)] = RUNS,
@@ -489,9 +477,6 @@ def plain_result(result: PathResult, findings: list[Finding]) -> dict:
         }
     plain = result._asdict() | {"bound": result.bound._asdict(), "filters": filters}
     return {key: value for key, value in plain.items() if key != "scores"}
-
-
-# Of the page: some minutes on two cores.
 
 
 @cache

@@ -92,9 +92,6 @@ def as_sent(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(short), short, np.float32(np.nan)).astype("<f4", copy=False)
 
 
-# Fewer points than steps: what a screen of so many pixels can show of a long run.
-
-
 def drawn_steps(steps: int, width: int) -> np.ndarray:
     """Which steps are drawn on so many pixels: all, or evenly spaced ones from the first to the last."""
     if steps <= width:
@@ -132,9 +129,6 @@ def corners(*lines: np.ndarray) -> np.ndarray:
     return np.flatnonzero(~(np.append(False, same) & np.append(same, False)))
 
 
-# Colours of the page's pictures on a light and on a dark ground, told apart by all kinds of colour vision.
-
-
 class Colours(NamedTuple):
     """Of one ground."""
 
@@ -170,9 +164,6 @@ def paint(picture: figure, colours: Colours) -> None:
             renderer.glyph.line_color = colours.ink
     for box in picture.select(BoxAnnotation):
         box.fill_color = colours.band
-
-
-# The picture of one quantity over time, or over lags: a line in its band.
 
 
 def new_figure(name: str, height: int = HEIGHT, **options: Any) -> figure:
