@@ -229,9 +229,6 @@ class Filter:
         return object_named(LIVE, "class")(self, **options)
 
 
-# A filter that has a page: a class with its parameters.
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class FilterWithPage(Filter):
     """Base of filters that have a page; subclasses set `page`, and add their parameters as fields.

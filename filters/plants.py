@@ -32,9 +32,6 @@ FINE = 0.05  # longest Runge-Kutta step, in time constants or in turns of a radi
 HEADING = ("heading", "psi", "rad", True)
 
 
-# Vehicles in a plane.
-
-
 class Plane(NamedTuple):
     """Numbers of a vehicle and its sensor."""
 
@@ -191,9 +188,6 @@ def bicycle(
     prior, inputs = ([0.0, 0.0, 0.0], [1e2, 1e2, 2.0]), [("speed", "v", "m/s"), ("steering angle", "delta", "rad")]
     stds, sensor = (position_std, bearing_std), (sensor_x, sensor_y)
     return _vehicle(_steered, [slip, slip, turn_slip], prior, [HEADING], inputs, sensors, stds, sensor, wheelbase)
-
-
-# Machines.
 
 
 class Swing(NamedTuple):

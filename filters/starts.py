@@ -29,9 +29,6 @@ FAINT = 1e-6  # part of the strongest direction, below which a direction is not 
 STEPS, DAMPINGS, MOST_STARTS = 30, 1e9, 4  # of Gauss and Newton, at most, the most damping, and starts
 
 
-# Restarts from the prior, in words: how many, the first step and state, and the likely cause.
-
-
 class RestartWarning(RuntimeWarning):
     """A filter restarted from the prior, so its estimate so far is lost."""
 
@@ -315,9 +312,6 @@ def _called(function, shape, *arguments) -> np.ndarray:
 
 def _kind(values: np.ndarray) -> str:
     return "NaN" if np.isnan(values).any() else "infinite, it overflows"
-
-
-# Where the trajectories of a batch begin, if that is not the model's prior; and a prior that is wide.
 
 
 class Starts(NamedTuple):

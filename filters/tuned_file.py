@@ -38,9 +38,6 @@ OPTION_NAMES = {"sensors": "sensor", "columns": "column", "clock_offset": "clock
 MODEL_KEYS = (*NOISE, PRIOR, FACTORS, STATES, AUGMENTED)  # what every plant with data of its own knows
 
 
-# The model of a tuned file, as data, and its comparison with another one.
-
-
 def model_data(model: StateSpaceModel, dt: float | None) -> dict:
     """A model's digest, sample time [s] and quantities, as JSON can hold them; of any steps, of one of dt."""
     model = of_one_step(model)
@@ -88,8 +85,6 @@ def _listed(entries: list) -> str:
     quantities = [Quantity(*entry) for entry in entries]
     return ", ".join(f"{q.symbol} [{q.unit}]" if q.unit else q.symbol for q in quantities) or "none"
 
-
-# The tuned file as every program reads it: data, checked entry by entry, that can name no code.
 
 OPTION_NAMES |= {"grid": "no-grid", "hold_gaps": "hold-gaps"}
 

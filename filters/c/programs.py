@@ -54,9 +54,6 @@ MACROS = re.compile(
 )
 
 
-# Which names a filter in C may have: none that C, C++, their libraries or the files themselves use.
-
-
 def is_name(text: str) -> bool:
     """Whether text is letters, digits and _, begins with a letter, and is no keyword of C or C++."""
     return bool(re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", text, flags=re.ASCII)) and text not in KEYWORDS
@@ -66,8 +63,6 @@ def is_macro(text: str) -> bool:
     """Whether headers of C replace a name by something else."""
     return bool(MACROS.fullmatch(text))
 
-
-# A page's stages as programs in C: a model's numbers are constants in them, so that zeros and ones vanish.
 
 NIS = -1  # its place in a row, where machine code has none
 RESERVED = frozenset(  # names in the struct of every filter in C, and of its tests
@@ -286,9 +281,6 @@ def _program(
         for k, entry in enumerate(np.ravel(np.array(value, dtype=object))):
             stores.append((lies(Place(array, first + k)), graph.number(entry)))
     return program_of(stores, {})
-
-
-# How far single precision moves the estimates of a filter in C: its programs, run as Python with float32.
 
 
 class _Single:

@@ -104,9 +104,6 @@ loops over members, and leaves the numbers as they are.
 """
 
 
-# NAME.hpp: a filter in C as a class of C++.
-
-
 def class_of(name: str, programs: FilterPrograms, *, single: bool = False, tested: bool = False) -> str:
     """The header of a class, NameFilter, around the filter in C of this name, which may test its innovations."""
     words = "".join(word.capitalize() for word in name.split("_"))
@@ -126,9 +123,6 @@ def class_of(name: str, programs: FilterPrograms, *, single: bool = False, teste
         by_key="key_0, key_1" * drawn,
         and_key=", key_0, key_1" * drawn,
     )
-
-
-# NAME.h and NAME.c of a filter.
 
 
 class CFilter(NamedTuple):
@@ -232,9 +226,6 @@ def c_filter(
     return called(name)
 
 
-# Bytes of a filter in C according to gcc: its struct, its stack and its code.
-
-
 class Sizes(NamedTuple):
     """Bytes of a filter."""
 
@@ -282,8 +273,6 @@ def sizes_of(generated: CFilter, compiler: str = "gcc") -> Sizes | None:
     return Sizes(struct, max(of_calls) + max(within), code + data + bss)
 
 
-# A Cortex-M4 that QEMU emulates, for a program that filters a log: start-up code, memory map, and commands.
-
 BOARD = """\
 extern void _start(void);
 
@@ -320,8 +309,6 @@ SECTIONS
 }
 """
 
-
-# A folder with a filter in C: NAME.h, NAME.c, NAME.hpp, a program that filters a log, and how to build them.
 
 CMAKE = """\
 cmake_minimum_required(VERSION 3.10)

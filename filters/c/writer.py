@@ -30,9 +30,6 @@ TEST_ANEW = "    {name}_test_anew(filter);\n"
 TEST_UPDATE = "    test_update(filter, z);\n"
 
 
-# NAME.h and NAME.c of a filter of mean and covariance.
-
-
 class Writer:
     """Writes the files of one filter.
 
@@ -275,8 +272,6 @@ def _indented(text: str) -> str:
 def _plain(text: str) -> str:
     return text.encode("ascii", "replace").decode().replace("*/", "* /").replace("/*", "/ *")
 
-
-# NAME.h and NAME.c of an ensemble filter: loops over its members, and the normals that they are moved by.
 
 DRAW = """\
 /* Philox4x32-10 of a counter and a key (Salmon, Moraes, Dror, Shaw 2011). */

@@ -16,9 +16,6 @@ from scipy.special import chdtr, chdtrc, chdtri
 from thruster_env.core.checks import at_least
 from thruster_env.core.threads import spread
 
-# Intervals by bootstrap over runs, tests of uniformity, and scores of probabilistic estimates.
-
-
 RESAMPLES = 2000  # bootstrap resamples of whole runs
 SLIGHT = 0.005  # difference of a ratio from 1 that makes practically none
 MORE_DIGITS = 3  # for an interval whose ends would else be the same number
@@ -26,9 +23,6 @@ POINTS = 200  # where distribution functions are compared
 BARS = 20  # bars of the histogram, but one a step for up to twice as many steps
 FEWEST_RUNS = 20  # fewer resample too coarsely for a test
 LEVELS = np.arange(0.05, 1.0, 0.05)  # of intervals whose coverage is looked at
-
-
-# Estimates with 95 % intervals, by bootstrap over whole runs: steps of one run are not independent, runs are.
 
 
 class Interval(NamedTuple):
@@ -203,9 +197,6 @@ def uniformity(values: np.ndarray, steps: int = POINTS) -> Uniformity:
     return Uniformity(float(distance), p_value, edges, bars.sum(axis=0) / totals.sum() / widths, band.T)
 
 
-# Scores of probabilistic estimates: coverage, CRPS (continuous ranked probability score) and ranks.
-
-
 def covered(errors: np.ndarray, deviations: np.ndarray, level: float = 0.95) -> np.ndarray:
     """1 where an error lies in its Gaussian interval of a level, else 0; NaN without a positive deviation."""
     from scipy.special import ndtri  # which takes a third of a second
@@ -289,9 +280,6 @@ SINGULAR = 1e-12  # a pivot of P below this part of its variance counts as zero
 LARGEST_BY_ENTRIES = 12  # beyond, operations on single entries take longer than copies of columns
 LAGS = 20
 BLOW_UP = 1e3  # spreads of a channel: no Q or R explains a prediction that is so far off
-
-
-# NEES and NIS of many runs against their chi-square distributions.
 
 
 def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
@@ -433,9 +421,6 @@ def band_of_means(freedom: np.ndarray) -> np.ndarray:
     return np.where(runs[:, None] > 0, limits / np.maximum(runs, 1)[:, None], np.nan)
 
 
-# Do innovations contain anything that the filter could have predicted? Their correlation over time.
-
-
 class Whiteness(NamedTuple):
     """Correlations of normalised innovations over time, pooled over runs; all zero for a consistent filter."""
 
@@ -510,9 +495,6 @@ def _lagged_sums(x: np.ndarray, lags: int) -> np.ndarray:
 def _all_pairs(mask: np.ndarray, lags: int) -> np.ndarray:
     runs, steps, m = mask.shape
     return np.broadcast_to(runs * (steps - np.arange(1.0, lags + 1.0))[:, None, None], (lags, m, m))
-
-
-# Does a model blow up between samples? Then its predictions are off by more than any Q or R explains.
 
 
 def root_mean_square(values: np.ndarray) -> float:

@@ -312,9 +312,6 @@ def _kurtosis(whitened_ones: np.ndarray, present: np.ndarray | None) -> tuple[fl
         return tuple((fourth / second**2).tolist())
 
 
-# Symptoms in the innovations that no Q and R can cure, and their remedies.
-
-
 def symptoms(report: ConsistencyReport) -> list[str]:
     """A remedy for each symptom of a report, without a full stop."""
     remedies = []

@@ -117,9 +117,6 @@ class Memory(NumbersMemory):
         return value
 
 
-# The sum over a filter's steps, with its slopes: densities of innovations, or scores of true states.
-
-
 class Wanted(NamedTuple):
     """The outputs of a recursion: a score with its gradient, and options."""
 

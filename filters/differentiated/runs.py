@@ -28,8 +28,6 @@ from thruster_env.core.threads import spread
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import refuse_rotations
 
-# The filters that have derivatives: those with a page, but for a schedule of gains and the steady one.
-
 KINDS: tuple[type[PageFilter], ...] = (
     KalmanFilter,
     ExtendedKalmanFilter,

@@ -98,9 +98,6 @@ def relaxed(update: Callable) -> Callable:
     return update_relaxed
 
 
-# Functions that the pages of ensemble filters share.
-
-
 def propagate(model, x, u):
     """Propagate a member by one substep."""
     return model.f(x, u)
@@ -129,9 +126,6 @@ def compare(model, x, z):
         C, A = C * model.own.taper, sym(A * model.own.between)
     S = A + R
     return y - mean(y), C, v, S, R, log_density(v, S, measured)
-
-
-# Inflation that adapts to the innovations.
 
 
 def slopes(model, x, z, v, S):

@@ -147,9 +147,6 @@ class SerialSquareRootFilter(LocalisedByParts):
     moves_of: ClassVar[Callable | None] = staticmethod(gaussian_moves)
 
 
-# The finite-size ensemble Kalman filter: inflation that follows from the innovation and the number of members.
-
-
 def variance_factor(parameters, A, R, v):
     """The factor t on the covariance A of y that minimises J(t)."""
     L = root(A)
@@ -348,9 +345,6 @@ class RankHistogramFilter(LocalisedByParts):
     def by_parts(self) -> bool:
         """Always."""
         return True
-
-
-# The members of an ensemble filter after every step, which `filters.run` does not keep.
 
 
 class Members(NamedTuple):

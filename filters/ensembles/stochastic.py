@@ -28,9 +28,6 @@ from thruster_env.model.shape import Functions, Shape
 SUPPORT = (10.0 / 3.0) ** 0.5  # half the range of a taper, over its radius
 
 
-# Localisation: distant states and channels count as uncorrelated, so few members are enough for many states.
-
-
 def gaspari_cohn(distance: np.ndarray, radius: float) -> np.ndarray:
     """A taper of distances: nearly exp(-(distance/radius)^2/2), by up to 0.034 more, and 0 from 3.66 radii on.
 
@@ -128,9 +125,6 @@ class EnsembleKalmanFilter(LocalisedFilter):
         switch("centred_perturbations", self.centred_perturbations)
 
 
-# Random rotations of an ensemble about its mean, which change neither mean nor covariance.
-
-
 def reflect(table, rows, first, size, vector):
     """Reflect each of the first `rows` rows x in the plane normal to v: x -= 2 (x'v / v'v) v.
 
@@ -203,9 +197,6 @@ def with_rotation(kernels: Kernels) -> Kernels:
         rotate(memory, size)
 
     return kernels._replace(update=update)
-
-
-# Ensemble filters without perturbed measurements, and the deterministic EnKF.
 
 
 def update_deterministic(model, x, z, e):

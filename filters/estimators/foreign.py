@@ -23,9 +23,6 @@ from thruster_env.model.continuous import same_dt
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import refuse_rotations
 
-# The interface of an estimator, which maps inputs and measurements to means and covariances, and its checks.
-
-
 PARTS = {"mean": "n", "cov": "nn", "innovation": "m", "innovation_cov": "mm"}
 NAMES = {
     "mean": "mean",
@@ -477,9 +474,6 @@ def _copied(estimator: Any, seed: int) -> Any:
         return seeded_copy(estimator, seed)
     except Exception:
         return estimator
-
-
-# Estimators that a user gives: an object, what makes one for a model, "module:object", or a trained file.
 
 
 TRAINED = ".safetensors"  # the end of the name of a trained estimator's file

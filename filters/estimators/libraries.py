@@ -16,8 +16,6 @@ from thruster_env.model.state_space import StateSpaceModel, refuse_feed
 
 START = datetime(2000, 1, 1)  # of every trajectory: states carry a time, and only differences of it count
 
-# FilterPy's filters as estimators: linear, extended, unscented and their like.
-
 
 class FilterPyEstimator(Estimator):
     """A filter of FilterPy, or any object with `predict`, `update`, `x`, `P`, `y`, `S` and `R` like its.
@@ -183,9 +181,6 @@ def unscented(model: StateSpaceModel, alpha=1.0, beta=2.0, kappa=0.0) -> FilterP
     filter_.x, filter_.P = model.prior_mean.copy(), model.prior_cov.copy()
     filter_.Q, filter_.R = model.process_noise_cov.copy(), model.measurement_noise_cov.copy()
     return FilterPyEstimator(filter_, name="filterpy ukf")
-
-
-# Stone Soup's predictors and updaters as an estimator.
 
 
 class StoneSoupEstimator(Estimator):

@@ -46,9 +46,6 @@ def update_information(model, x, P, z):
 INFORMATION = Page(propagate, add_process_noise, update_information)
 
 
-# A Kalman filter whose affine model follows the input: gain scheduling.
-
-
 def constants_at(model, u):
     """Constants of the affine model at an input."""
     return model.own.models.T @ hats(u, model.own.inputs)
@@ -165,9 +162,6 @@ class KalmanFilter(AffineFilter):
         """The page of the form, or of a schedule."""
         page = super().written_page
         return SCHEDULED._replace(own=page.own) if self.schedule > 1 else page
-
-
-# The steady-state Kalman filter: one gain for all steps, from Riccati's equation.
 
 
 def update_steady(model, x, P, z):

@@ -449,9 +449,6 @@ class GaussianSumFilter(MixtureFilter):
         return self.standard_split[0]
 
 
-# The Takagi-Sugeno fuzzy Kalman filter: one Kalman filter a rule, blended by memberships of the state.
-
-
 def initial_weights(model, x, P):
     """Weights of the rules, at the last estimate."""
     return memberships(x, model.own.low, model.own.high, model.own.premises)

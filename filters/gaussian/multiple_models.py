@@ -499,9 +499,6 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
         return {"transition": powers / powers.sum(axis=1, keepdims=True)}
 
 
-# Multiple model adaptive estimation: which one of several models is right.
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MultipleModelAdaptiveEstimator(MultipleModelFilter):
     """Multiple model adaptive estimation (MMAE): one of K models is right at all times; the data determine which.

@@ -103,9 +103,6 @@ class GainNetwork(nn.Module):
         return output, (q, self.back_to_p(torch.cat([p, back], -1)), s)
 
 
-# `gru`: a recurrent network that estimates without a model.
-
-
 class GatedRecurrentUnit(LearnedEstimator):
     """A recurrent network from inputs and measurements to the states, without a model and without a covariance.
 

@@ -154,9 +154,6 @@ def new_state(channels: int, window: int) -> np.ndarray:
     return np.zeros((channels, RING + window))
 
 
-# Thresholds of tests on innovations, from how many steps shall lie between two false alarms of each.
-
-
 def chi_square(steps: float, degrees: int) -> float:
     """What chi^2 of so many degrees of freedom exceeds once in so many steps."""
     from scipy.special import chdtri  # here, as below, because SciPy takes long to import
@@ -455,9 +452,6 @@ class Watch:
         ok = not dead and (self._last is None or self._k - self._last >= self.monitor.memory)
         self._k += 1
         return Health(ok, alarms)
-
-
-# A monitor in a tuned file: its attributes as data, and the thresholds that follow from them.
 
 
 def monitor_for(measurements: np.ndarray, monitor: Monitor | None = None) -> Monitor:

@@ -182,9 +182,6 @@ def as_calls(
     return StageWork(of_values, calls_of(slopes, known | rows, functions, arrays), first)
 
 
-# Stages of a page as programs, or, of models that cannot be traced, as calls.
-
-
 class Programs(NamedTuple):
     """Stages as functions (rows, given, numbers)."""
 

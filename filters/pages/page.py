@@ -196,9 +196,6 @@ class RowMemory(NumbersMemory):
         self.ratio = self.ratio_in("given", 0)
 
 
-# Slopes of functions that are called, by central differences.
-
-
 @cache
 def called_parts(functions: Functions, shape: Shape, which: str, constants_move: bool) -> tuple[Callable, ...]:
     """An equation y(x, ..., c), its Jacobian Y(x, scales, ..., c), and the slopes of both.

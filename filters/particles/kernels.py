@@ -147,9 +147,6 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
     return {**stages, "update": stored(results, targets, extras)}
 
 
-# Systematic resampling of columns of a table, by weights in one of its rows.
-
-
 @cache
 def systematic_resampler(rows: int, weights: int, scratch: int) -> Callable:
     """Return `resample(table, size, u)`: rows 0 ... rows - 1 of N columns drawn by weight, for u in (0, 1).
@@ -307,9 +304,6 @@ def nothing(memory, numbers, size):
 
 def nothing_foreseen(memory, z, numbers, size):
     """Do nothing, in place of a page's lookahead."""
-
-
-# Rejuvenation: functions that separate resampled particles, from mean and covariance P of the sample.
 
 
 def spread(model, x, mean, P, e):

@@ -44,8 +44,6 @@ from thruster_env.model.shape import padded
 
 PROPOSALS, RESAMPLINGS = ("prior", "optimal"), ("systematic", "gaussian")
 
-# The auxiliary particle filter: it resamples by how well noise-free predictions fit the measurement.
-
 
 def initial_auxiliary(model, w):
     """Draw a particle from the prior; its noise is zero."""
@@ -117,9 +115,6 @@ class AuxiliaryParticleFilter(WeightedFilter):
         lookahead=lookahead,
         per_particle=("noise",),
     )
-
-
-# The optimal proposal: particles are drawn given the measurement, and weighted by its predicted density.
 
 
 def initial_optimal(model, w):
@@ -274,9 +269,6 @@ class ParticleFilter(ResampledFilter):
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
         model, resample = self.kernel_model, self.resampling == "systematic"
         return particle_kernels(self.written_page, model.functions, model.shape, resample)
-
-
-# The Rao-Blackwellised particle filter: some states are sampled, a Kalman filter per particle has the others.
 
 
 def sample(x, P, e, sampled):

@@ -80,9 +80,6 @@ ASKING = frozenset("__bool__ __float__ __int__ __index__ __complex__ item".split
 LEAVING = frozenset("tolist numpy __array__".split())
 
 
-# Graphs of numbers evaluated on tensors: one operation of torch for each number, for a whole batch.
-
-
 def with_finite_slope(operation: str, function: Callable, arguments: Sequence[Tensor | float]) -> Tensor:
     """The result of an operation; a constant where it has no finite slope."""
     known = [a.detach() if isinstance(a, Tensor) else a for a in arguments]

@@ -27,8 +27,6 @@ MADE = ("_model", "_own", "_stages", "_traced", "_programs")  # again of a copy
 SYNCHRONOUS = {"cpu"}
 """Devices that answer at once whether a trajectory is lost; of others it is asked once a run, not in each step."""
 
-# What filters on tensors return.
-
 
 class TensorBelief(NamedTuple):
     """The estimates of a batch at one time.
@@ -82,9 +80,6 @@ class TensorEstimates(NamedTuple):
     innovation_covs: Tensor
     log_likelihoods: Tensor
     divergences: Tensor
-
-
-# The log-likelihood of the compiled recursion as a function that torch differentiates.
 
 
 def compiled_likelihood(filter_: Filter, inputs: Any, measurements: Any, q: Tensor, r: Tensor) -> Tensor:

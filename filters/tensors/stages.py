@@ -42,9 +42,6 @@ MULTIPLIERS, WEYL, LOW = (0xD2511F53, 0xCD9E8D57), (0x9E3779B9, 0xBB67AE85), 0xF
 FULL_TURN, TWO_TO_MINUS_32 = 2.0 * np.pi, 2.0**-32
 
 
-# Values of a page's matrices: a batch of tensors (..., rows, columns) for each matrix.
-
-
 def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tensor) -> dict[Matrix, Any]:
     """Values of matrices of a graph, in an order of `matrices.in_order`, given those that are known.
 

@@ -290,9 +290,6 @@ def _coupled(row: int) -> list[tuple[int, str]]:
     return [(column, "XYZKMN"[column]) for column in ((0, 2, 4) if row in (0, 2, 4) else (1, 3, 5))]
 
 
-# The parameters of a slender vehicle from its main sizes: a spheroid, strips and four tail fins.
-
-
 GRAVITY = 9.81  # [m/s^2]
 CROSS_FLOW_DRAG = 1.1  # c_dc, of a cylinder (Prestero)
 FIN_DRAG = 0.56  # c_df, of a fin across the flow (Prestero)

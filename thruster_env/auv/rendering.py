@@ -38,8 +38,6 @@ from thruster_env.render.canvas import (
 )
 from thruster_env.render.renderer import PlantRenderer
 
-# The contents of a picture: moments, and a filter's estimates of them.
-
 
 class ChartEntry(NamedTuple):
     """The truth at the end of a step, one entry of the strip charts."""
@@ -284,9 +282,6 @@ def _part_in_view(path: np.ndarray, visited: np.ndarray) -> np.ndarray:
 def _runs(points: np.ndarray) -> list[np.ndarray]:
     """Runs of points (K, 3) without NaN."""
     return [points[run] for run in runs(np.isfinite(points).all(axis=1))]
-
-
-# Right of path and charts: the attitude on three dials, and the action of propeller and planes.
 
 
 LEFT = 498  # of the dials' panel [px]

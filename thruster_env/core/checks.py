@@ -287,8 +287,6 @@ def _root(entries: bytes, size: int) -> np.ndarray:
     return lower * signs * units[:, None]
 
 
-# Arguments that are defined once: a function takes the arguments of other functions, names and defaults.
-
 Function = Callable[..., Any]
 
 

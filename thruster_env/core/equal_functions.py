@@ -392,9 +392,6 @@ def _content(cell: types.CellType) -> Any:
         return _content
 
 
-# Numbers that functions hold in their closures, defaults and objects: listed, and replaced by others.
-
-
 def captured_numbers(function: Any) -> list[float]:
     """The floats that a function holds, in a fixed order, without those of its module and its code."""
     numbers: list[float] = []
@@ -489,9 +486,6 @@ class _Copy:
         for name, attribute in attributes_of(value).items():
             object.__setattr__(copy, name, self.of(attribute))
         return copy
-
-
-# Generated functions remember what made them, so that models that hold them can be pickled.
 
 
 def makes_functions(maker: Callable) -> Callable:

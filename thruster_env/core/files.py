@@ -139,9 +139,6 @@ def _refusal(path: Path, error: OSError) -> ValueError:
     return ValueError(f"a file must be where it can be written, but {path} is not: {error.strerror}")
 
 
-# TOML files: read with one clear line for what is wrong, and written, which the standard library does not.
-
-
 def read_toml(path: str | Path, what: str) -> dict:
     """The content of a TOML file; ValueError, with the path and what it is ("a preset file"), if there is none."""
     try:

@@ -23,9 +23,6 @@ NEGLIGIBLE = 1e-13  # a pivot below this part of its variance counts as zero in 
 RESOLUTION = 1e-15  # of the difference of two float64, relative to them
 
 
-# Parameters multiplied by factors, for a filter that assumes another plant than the true one.
-
-
 def scaled(parameters: Parameters, factors: Mapping[str, float], names: Iterable[str]) -> Parameters:
     """Parameters with some fields multiplied by positive factors; ValueError unless these are among the names."""
     if not isinstance(factors, Mapping):
@@ -35,9 +32,6 @@ def scaled(parameters: Parameters, factors: Mapping[str, float], names: Iterable
         raise ValueError(f"parameter_factors must name fields of {', '.join(names)}, but got {unknown}")
     changed = {name: getattr(parameters, name) * positive(name, factor) for name, factor in factors.items()}
     return parameters._replace(**changed)
-
-
-# Linear systems in discrete time: discretisation and observability.
 
 
 def zero_order_hold(a: np.ndarray, b: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -53,9 +47,6 @@ def observability(a: np.ndarray, c: np.ndarray) -> tuple[int, float]:
     """Rank and condition number of the observability matrix [C; C A; ...] of a discrete pair (A, C)."""
     matrix = np.vstack([c @ np.linalg.matrix_power(a, k) for k in range(len(a))])
     return int(np.linalg.matrix_rank(matrix)), float(np.linalg.cond(matrix))
-
-
-# Products and quotients of large matrices, as loops over arrays of float64 that run along contiguous memory.
 
 
 def _products_of_rows(a, b, lower):
@@ -186,9 +177,6 @@ def solve_rows(b, factor):
         for r in range(rows):
             turned[i, r] /= factor[i, i]
     return turned.T.copy()
-
-
-# Triangular factors of matrices of every size, and solutions with them.
 
 
 def pivoted_factor(size: int, diagonal: str, **names: float) -> Callable:

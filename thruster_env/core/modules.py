@@ -25,9 +25,6 @@ OF_ONE_PACKAGE = {
 }
 
 
-# Objects by "module:object": code, which only a user's own command line or call may have imported.
-
-
 def is_code(name) -> bool:
     """Whether a name is "module:object", code that only the user may run."""
     return isinstance(name, str) and ":" in name and not name.endswith(".toml")
@@ -191,9 +188,6 @@ class _Import:
 
             loader.exec_module = execute_and_act
         return spec
-
-
-# How to install what is not in a plain installation: the optional dependencies of pyproject.toml.
 
 
 def to_install(extra: str) -> str:

@@ -29,9 +29,6 @@ from thruster_env.core.checks import short_repr
 HALVINGS = 60  # of an interval of 80 standard deviations, to rounding
 
 
-# The normal distribution, for compiled code.
-
-
 def below(z):
     """The normal distribution at z."""
     return 0.5 * math.erfc(-z / 2.0**0.5)
@@ -48,8 +45,6 @@ def quantile(share):
             high = middle
     return 0.5 * (low + high)
 
-
-# Moments of a truncated normal distribution.
 
 FAR = 5.0  # standard deviations, from which a continued fraction is used
 VERY_FAR = 100.0  # from which the moments are series, whose next terms are 1e-10 of them
@@ -94,8 +89,6 @@ def truncated_normal(low, high):
     return sign * mean, max(1.0 + end / d - mean * mean, 0.0)
 
 
-# e^x of logarithms of weights, without branches and calls, so that loops over it become vector code.
-
 LOWEST = -46.0  # e^-46 = 1e-20 is nothing beside 1, and still tells how far the others are off
 LN_2, PER_LN_2 = math.log(2.0), 1.0 / math.log(2.0)
 ROUNDER = 1.5 * 2.0**52  # adding it leaves a whole number in the last bits
@@ -129,8 +122,6 @@ def exponential(x):
     bits = np.float64(k + ROUNDER).view(np.int64) - ROUNDER_BITS  # k itself, which becomes the exponent
     return series * np.int64((bits + 1023) << 52).view(np.float64)
 
-
-# Sine and cosine in operators: vector code in loops, and the same source for floats, arrays and tensors.
 
 _PI, _PER_TURN = math.pi, 0.5 / math.pi
 

@@ -16,8 +16,6 @@ from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType,
 from rich.table import Table as RichTable
 from rich.text import Text
 
-# Tables in Markdown, and pages whose tables are computed.
-
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in Markdown."""
@@ -38,8 +36,6 @@ def with_tables(page: str, tables: Mapping[str, Callable[[], str]]) -> str:
 
     return re.sub(r"(<!-- table ([^\n]+?) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)
 
-
-# Characters that a terminal lacks, in others that it has: no table ends in its middle.
 
 HANDLER = "thruster: other characters"  # name among Python's error handlers of encodings
 OTHERS = {"±": "+-", "×": "x", "µ": "u", "ω": "w", "–": "-", "—": "-", "−": "-", "•": "*", "‘": "'", "’": "'"}
@@ -88,8 +84,6 @@ def _in_ascii(character: str) -> str:
         return "."
     return unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode() or "?"
 
-
-# Tables of text: for the terminal, pages, notebooks, Markdown and JSON.
 
 BEST = "bold green"  # style of rows that win
 RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")

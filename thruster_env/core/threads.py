@@ -23,8 +23,6 @@ from thruster_env.core.checks import one_of
 VARIABLE = "THRUSTER_WAIT_POLICY"
 ACTIVE, PASSIVE = "active", "passive"
 
-# How many threads torch uses for small networks.
-
 
 @contextmanager
 def one_thread() -> Iterator[None]:
@@ -40,9 +38,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-# How worker threads wait for the next call: "active", spinning for half a millisecond, or "passive", asleep.
 
 
 _policy: str | None = None  # None: the environment has not been asked yet
@@ -83,8 +78,6 @@ def waiting(policy: str) -> Iterator[None]:
         else:
             os.environ[VARIABLE] = inherited
 
-
-# Work on all cores in parts.
 
 _of_thread = threading.local()  # whether a thread of the pool is at work on a part
 

@@ -25,8 +25,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-# What a function computes, as text: its byte code, its constants and the values that it finds under its names.
-
 
 def is_plain(value: Any) -> bool:
     """Whether a value is a number, a text, an array of these, a tuple of such, or None."""
@@ -363,8 +361,6 @@ def stands_for(value: Any) -> Any:
     except TypeError:  # nothing that a weak reference or a hash can be had of
         return value
 
-
-# Recipes of functions that a maker returned: what is compared and pickled in their place.
 
 _MADE: WeakKeyDictionary[Callable, Made] = WeakKeyDictionary()
 

@@ -200,9 +200,6 @@ class Registry:
             raise ValueError(f"{rule}, but got {short_repr(arguments)}") from None
 
 
-# Chains of effects that act one after the other: kinds, for which a plant's step is traced, and parameters.
-
-
 class Kind(NamedTuple):
     """What a program is made for: the type of an effect, its parameters known now, and the names of the others."""
 

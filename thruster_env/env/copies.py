@@ -461,9 +461,6 @@ class PlantCopies:
         return self._advance(self.memory, self.numbers, False)
 
 
-# What pages are written with.
-
-
 def root_of(cov: np.ndarray) -> tuple[tuple[float | None, ...], ...]:
     """The lower triangular root of a covariance by rows; None for zeros, with which nothing is computed."""
     root = covariance_root(cov)
@@ -480,9 +477,6 @@ def clipped(value, low, high):
     """A number within low ... high."""
     value = where(value < low, low, value)
     return where(value > high, high, value)
-
-
-# Channels: a sensor's measurement of a plant, defined once for the plant's step and for a filter's model.
 
 
 class Channel(NamedTuple):

@@ -22,9 +22,6 @@ from thruster_env.env.copies import REWARD, TERMINATED, TIME, Page, PlantCopies
 from thruster_env.env.plant_data import as_json, of_copies, one_number, some_numbers
 from thruster_env.model.quantities import Quantity
 
-# Rendering, common to all envs of plants.
-
-
 if TYPE_CHECKING:
     from thruster_env.render.renderer import PlantRenderer
 
@@ -43,9 +40,6 @@ def checked_size(size: Sequence[int] | None) -> tuple[int, int] | None:
         for side, value in zip(("width", "height"), size, strict=True)
     )
     return width, height
-
-
-# The parts of a step's report that an env shows: its rows for the observation and the info.
 
 
 FLOAT32_ENDS = 3e38  # casting beyond 3.4e38 would warn on its way to infinity
@@ -142,9 +136,6 @@ def infos_of(report: np.ndarray, rows: ReportRows, mask: np.ndarray) -> dict[str
     if rows.dropping:
         info["measurement_valid"] = report[rows.valid].T > 0.0
     return info | {f"_{key}": mask for key in info}
-
-
-# The mechanics of a plant's Gymnasium env: seeds, steps, observations, infos, copies, pickles and its spec.
 
 
 # What `_set_views` makes.
@@ -357,9 +348,6 @@ class PlantEnv(gym.Env):
         return observation_of([report[row] for row in self._observed])
 
 
-# The vector env: all copies advanced by one compiled call, noise included.
-
-
 MOST_ENVS = 1_000_000  # of some kilobytes each
 
 
@@ -492,9 +480,6 @@ def _autoreset_mode(mode_or_name) -> AutoresetMode:
     except ValueError:
         names = ", ".join(repr(mode.value) for mode in AutoresetMode)
         raise ValueError(f"autoreset_mode must be one of {names}, but got {mode_or_name!r}") from None
-
-
-# The true state as observation: the reference for policies that must work with estimates.
 
 
 class ObserveState(gym.Wrapper, gym.utils.RecordConstructorArgs):

@@ -315,9 +315,6 @@ def _bounds(low, high, count: int) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-# The interface of a plant's env or vector env for filters: its model, and checks of tuned files.
-
-
 class ModelledEnv:
     """An env with a `plant`, which offers the plant's model to filters.
 
@@ -363,9 +360,6 @@ class ModelledEnv:
                 warnings.warn(f"{file} was tuned for {', '.join(differences)}", stacklevel=5)
 
 
-# A policy's memory between two steps of its env.
-
-
 def remembered(state, episode_start, at_start: np.ndarray) -> np.ndarray:
     """The state (..., k) of the last call, or its initial value at the start of an episode."""
     if state is None:
@@ -374,9 +368,6 @@ def remembered(state, episode_start, at_start: np.ndarray) -> np.ndarray:
         return np.asarray(state)
     starts = np.reshape(episode_start, at_start.shape[:-1]).astype(bool)
     return np.where(starts[..., None], at_start, state)
-
-
-# Channels of an env that a model takes as inputs, such as an attitude from an AHRS, and as measurements.
 
 
 class Split(NamedTuple):

@@ -193,9 +193,6 @@ def _alike(first, other) -> bool:
     return first == other
 
 
-# Actions of an env as the commands of a plant, checked before the step.
-
-
 def one_number(action, quantity: Quantity) -> float:
     """The command of a plant with one input; ValueError unless an action is one number and not NaN."""
     if type(action) is ndarray and action.size == 1:  # the frequent case has to be quick

@@ -23,8 +23,6 @@ from thruster_env.logs.read import read_log
 from thruster_env.model.continuous import ContinuousModel, continuous_of, in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
 
-# Trajectories of many copies of a plant: the reports of a batch stepped through given inputs.
-
 
 def record(
     copies_of: Callable[[int], PlantCopies], keys: np.ndarray, inputs: np.ndarray, name: str, count: int
@@ -66,9 +64,6 @@ def check_finite(what: str, *parts: np.ndarray) -> None:
             f"{what} must stay finite, but it is not from step {np.argmin(finite)} of {len(finite) - 1} on: "
             "check dt and the noise covariances"
         )
-
-
-# `ReplayEnv`: a recorded run as a Gymnasium env, for filter wrappers as any other env.
 
 
 ANY_DT = 0.01  # [s], of a model that is asked for its quantities before the sample time of the log is known

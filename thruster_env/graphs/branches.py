@@ -166,8 +166,6 @@ def _is_raised_there(error: Exception) -> bool:
     return trace.tb_frame.f_code.co_code[trace.tb_lasti] == dis.opmap["RAISE_VARARGS"]
 
 
-# Derivatives of graphs of Numbers, forwards: how results change as the numbers change that they are made of.
-
 Slope = Number | None  # None of a number that does not move
 
 

@@ -21,8 +21,6 @@ import numpy as np
 if TYPE_CHECKING:
     from thruster_env.graphs.graphs import Number
 
-# What is known of the size of a number when a graph gets it: whether it may be infinite, whether it can be zero.
-
 GROWING = frozenset("exp exp2 expm1 log log2 log10 log1p sinh cosh arctanh pow".split())
 """Operations whose results may be infinite for numbers of usual size."""
 UNKNOWN, NEVER_NEGATIVE, POSITIVE = range(3)
@@ -196,8 +194,6 @@ def _folded_choice(condition: Number | bool, a: Number, b: Number) -> Number:
         return a if condition else b
     return a if a is b else a.graph.make("where", condition, a, b)
 
-
-# Constants of a graph in single precision.
 
 SMALLEST = float(np.finfo(np.float32).tiny)  # normal
 

@@ -240,8 +240,6 @@ def _declared(module: ir.Module, name: str, kind: ir.Type, count: int) -> ir.Fun
     return module.globals.get(name) or ir.Function(module, ir.FunctionType(kind, [kind] * count), name)
 
 
-# Loops over the members of an ensemble as instructions of LLVM, for eight members at a time.
-
 INT = ir.IntType(32)
 
 

@@ -99,9 +99,6 @@ class InParts:
             return self._work(*arguments)
 
 
-# The instructions with which several threads share a call.
-
-
 def _at(builder: ir.IRBuilder, address: ir.Value, index: ir.Value) -> ir.Value:
     return builder.gep(builder.inttoptr(address, LONG.as_pointer()), [index], source_etype=LONG)
 

@@ -67,9 +67,6 @@ DATE_NAMES = ("timestamp", "datetime", "date_time", "date time", "date", "datum"
 COUNTERS = {"micros": "us", "millis": "ms"}  # columns of times whose name is the unit, as Arduino's functions
 
 
-# Units of columns: as headers have them, and converted to those of a model, rare ones by the package pint.
-
-
 def parted(header: str) -> tuple[str, str | None]:
     """The header of a column without its unit, and the unit, None if it has none.
 

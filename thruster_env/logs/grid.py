@@ -247,9 +247,6 @@ def _lies_on_grid(times: np.ndarray) -> bool:
     return bool((abs(times - np.round(times)) <= CLOSE_TO_GRID * np.maximum(1.0, abs(times))).all())
 
 
-# Time stamps: dates, as seconds since the first one, and the digits in which times are written.
-
-
 def seconds_of(cells: Sequence[str]) -> np.ndarray | None:
     """Seconds since the first date of some texts, (rows,), NaN where one is none; None where no cell is a date.
 

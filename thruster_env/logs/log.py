@@ -285,12 +285,6 @@ def _with_column(rows: np.ndarray, column: int, values: np.ndarray) -> np.ndarra
     return rows
 
 
-# Inputs that are held over a log, or over its end, because they have no samples there.
-
-
-# Whether two recorded runs have rows in common, so that one cannot be held out of training on the other.
-
-
 def shared_by(first: Sequence[Log], second: Sequence[Log]) -> tuple[Log, Log] | None:
     """The first pair of logs, one from each group, that share consecutive rows; None if there is none.
 

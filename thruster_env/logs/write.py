@@ -183,8 +183,6 @@ def _pyarrow():
     return pyarrow
 
 
-# A picture of a recorded run: every channel over time, with findings marked.
-
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 

@@ -28,9 +28,6 @@ from thruster_env.core.sources import tuple_of, written_out
 from thruster_env.model.state_space import StateSpaceModel, takes_input
 from thruster_env.model.turns import Turn, move, runge_kutta_munthe_kaas, slope_of_rates, with_rotations
 
-# Process noise at another sample time.
-
-
 SAME_DT = 1e-6  # relative: sample times of logs that are read off stamps
 
 

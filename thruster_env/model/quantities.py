@@ -162,9 +162,6 @@ def _mathtext(symbol: str) -> str:
     return letter + (f"_{{{','.join(indices)}}}" if indices else "")
 
 
-# Where the states and the measurements of a model lie: what localisation measures distances between.
-
-
 class Positions(NamedTuple):
     """Positions of n states and m measurements, in any unit.
 
@@ -233,9 +230,6 @@ def checked_bounds(user_bounds: Any, states: Sequence[Quantity], rotations: Any 
         if low > -math.inf or high < math.inf:
             result.append(Bound(index, low, high))
     return tuple(sorted(result))
-
-
-# Scales of a model's states, in which steps of central differences and regions about a mean are measured.
 
 
 def scales_of(model) -> np.ndarray:

@@ -107,9 +107,6 @@ def for_any_input(function: Callable, shape: Shape, arguments: str = "x") -> Cal
     return written_out("seen", f"{arguments}, u, c", lines, function=function)
 
 
-# Places of a model's numbers in the float64 row that compiled code reads.
-
-
 LANES = 8  # float64 in the widest vector register: ensembles are padded, so that loops have no remainder
 
 

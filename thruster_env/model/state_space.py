@@ -523,9 +523,6 @@ def _count(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-# A short hash that identifies a model: its quantities, and its functions' values at fixed points.
-
-
 LENGTH = 12  # hexadecimal digits
 MAGNITUDES = (0.0, 0.1, 1.0, 1.0, 10.0, 100.0)  # of states and inputs at the points
 DIGITS = 10  # of a value: further ones differ from one machine to another

@@ -353,8 +353,6 @@ def _evaluation(program: Program, arguments: str, sizes: Sequence[int], shape: S
     return written_out("of_graph", arguments, *lines, result, evaluate=evaluate, np=np)
 
 
-# Functions that numba compiles.
-
 _known: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that others may call
 
 
@@ -408,8 +406,6 @@ def _reason(error: Exception) -> str:
     unmatched = reason.lower().startswith(("no match", "raised from"))  # where only the call itself is telling
     return f"it has no {calls[0]}" if unmatched and calls else reason
 
-
-# Why a function is not traced, for those whom that costs time.
 
 TABLES = "look values up by np.interp, of at most a hundred points, or choose by if"
 REMEDIES = {  # words of a reason, and what to write instead

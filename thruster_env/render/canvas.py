@@ -179,9 +179,6 @@ def with_band(value: float, std: float, digits: int) -> str:
     return number(value, digits) + (f" \u00b1 {number(SIGMAS * std, digits)}" if math.isfinite(std) else "")
 
 
-# Vertical axes with round ends.
-
-
 ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)  # ends of an axis, up to powers of ten
 LEAST = 0.02  # ends of an axis, of full scale, where nothing happens
 MOST = 3.0  # ends of an axis, of full scale, whatever happens
@@ -244,9 +241,6 @@ def draw_gauge(canvas: Canvas, title: str, x: float, axis: Axis, value: float) -
         y = min(max(axis.y(value), axis.top), axis.top + axis.height)
         canvas.box(x - 5, min(y, zero), 10, abs(y - zero), (158, 172, 185))
         canvas.box(x - 9, y - 1.25, 18, 2.5, INK)
-
-
-# The last time steps of an episode, with the estimates of a filter.
 
 
 STEPS = 500  # that are remembered

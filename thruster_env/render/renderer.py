@@ -145,9 +145,6 @@ class PlantRenderer:
         return self._canvas.finish()
 
 
-# A window that shows pictures in real time.
-
-
 LEAST_RATE = 20.0  # frames a second that are shown even if the steps come late [1/s]
 
 
@@ -195,9 +192,6 @@ class Window:
         if self._screen is not None:
             pygame.display.quit()
             self._screen = None
-
-
-# Films of an episode, .mp4 or .gif; needs moviepy, of the extra `render`.
 
 
 FRAME_RATES = {".mp4": 50, ".gif": 25}  # frames a second, at most: browsers show no faster gif

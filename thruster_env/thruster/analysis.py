@@ -25,9 +25,6 @@ from thruster_env.thruster.dynamics import (
 )
 from thruster_env.thruster.parameters import ThrusterParameters, derive_constants
 
-# Operating points of the thruster: steady states, ranges, Jacobians, and the integration they need.
-
-
 ONE_STEP_ACCURACY = 1e-4  # of each state's range, over the whole voltage range
 
 

@@ -31,8 +31,6 @@ from thruster_env.thruster.equations import step_cost
 from thruster_env.thruster.linear import OperatingPoints, operating_points, sampled_plant, slopes, thrust_of
 from thruster_env.thruster.plant import Plant, Task, thrust_scale
 
-# The gains of classical controllers, from the plant about an operating point.
-
 
 def lambda_gains(
     plant: Plant, operating_voltage: float | None = None, time_constant: float | None = None
@@ -472,9 +470,6 @@ def improve_plans(states, last, references, plans: np.ndarray, problem: Problem)
 
 def _arrays(*arrays):
     return tuple(np.ascontiguousarray(array, dtype=np.float64) for array in arrays)
-
-
-# Nonlinear controllers: the voltage that costs least by the equations of motion, over one step or a few.
 
 
 HORIZON = 5  # steps; more change no digit of a return

@@ -33,15 +33,9 @@ from thruster_env.graphs.draws import Draws
 from thruster_env.graphs.graphs import where
 from thruster_env.thruster.parameters import ThrusterParameters
 
-# Ambient flow U_0 along the thruster's axis [m/s]: signals that add to the constant `ambient_velocity`.
-
-
 FLOW_SIGNALS = Registry(
     "flow", {"sinusoid": Sinusoid, "gauss-markov": GaussMarkov, "gusts": Gusts, "recorded": RecordedSignal}
 )
-
-
-# The context of effects on a thruster.
 
 
 @dataclass(frozen=True)
@@ -50,9 +44,6 @@ class ThrusterContext(Context):
 
     thrust_scale: float  # steady thrust at max_voltage [N]
     back_emf: float  # motor speed to back-EMF, K1/K2 [V s/rad]
-
-
-# The amplifier between the commanded voltage and the motor.
 
 
 AMPLIFIER_EFFECTS = Registry("amplifier")
@@ -355,9 +346,6 @@ class RecordedReference(RecordedSeries):
     def act(e, value, memory, t):
         """Add a recorded series."""
         return value + recorded_value(e, t.step * t.dt), memory
-
-
-# Uncertain parameters: factors on a preset's values, drawn once per episode from its key.
 
 
 UNCERTAIN = tuple(name for name in ThrusterParameters._fields if name not in ("angles", "thrust_asymmetry"))

@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from thruster_env.thruster.rendering import Overlay
 
 
-# What every env and vector env offers to filters.
-
-
 def overlay_of(label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
     """Overlay of a belief on a rendered thruster: the state and its thrust, each with a standard deviation."""
     # A model may have more states, such as parameters, behind these two.
@@ -68,9 +65,6 @@ class ModelledThruster(ModelledEnv):
         return overlay_of(label, model, mean, cov)
 
 
-# How a bow thruster env draws itself.
-
-
 def renderer_of(
     plant: Plant, mode: str, frames_per_second: float, size: tuple[int, int] | None = None
 ) -> Renderer:
@@ -89,9 +83,6 @@ def renderer_of(
         frames_per_second=frames_per_second,
         size=size,
     )
-
-
-# `BowThruster-v0`: voltage in, noisy thrust out, the state hidden.
 
 
 def half_thrust(plant: Plant) -> float:
@@ -206,9 +197,6 @@ class BowThrusterEnv(ModelledThruster, PlantEnv):
         return drawn._replace(**values)
 
 
-# The other envs: tracking, reversal, and the published linear systems.
-
-
 class BowThrusterTrackingEnv(BowThrusterEnv):
     """A ship's bow thruster: follow a reference thrust that changes, ahead.
 
@@ -271,9 +259,6 @@ class BowThrusterLinearEnv(BowThrusterEnv):
         """Build the plant; see the class for the arguments."""
         plant = make_linear_plant(**arguments_of(make_linear_plant, arguments))
         self._build(plant, (render_mode, render_size), arguments)
-
-
-# The vector envs: all copies advanced by one compiled call, noise included.
 
 
 class BowThrusterVectorEnv(ModelledThruster, PlantVectorEnv):

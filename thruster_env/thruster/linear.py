@@ -102,9 +102,6 @@ def published_for(preset: str) -> tuple[str, PublishedLinearModel] | None:
     return None
 
 
-# The published linear systems as plants, where the Kalman filter is optimal.
-
-
 PUBLISHED_NOISE = 0.5  # variance of each state a step, and of the measurement, in the published runs
 
 

@@ -486,9 +486,6 @@ def _functions(channels: tuple[str, ...], lagging: tuple[bool, ...]) -> tuple[Ca
     )
 
 
-# The thruster in continuous time: its rates and spectral densities, from which follows a model for any dt.
-
-
 def voltage_rates(x, u, c):
     """Time derivatives [rad/s^2, m/s^2] under voltage u = (V_s,), in the ambient flow of the constants."""
     return rates(x, (u[0], c.ambient_velocity), c)

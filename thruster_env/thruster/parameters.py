@@ -343,9 +343,6 @@ def _product(quadratic, linear) -> tuple:
     return a * d, a * e + b * d, b * e + c * d, c * e
 
 
-# Names, symbols and units of the thruster's states, inputs and outputs.
-
-
 STATES = (Quantity("motor speed", "omega_m", "rad/s"), Quantity("flow velocity", "U_a", "m/s"))
 INPUTS = (Quantity("voltage", "V_s", "V"),)
 THRUST = Quantity("thrust", "T", "N")

@@ -264,9 +264,6 @@ def _sensors(sensors) -> dict[str, tuple[Effect, ...]]:
     return sensor_effects(sensors, CHANNELS, SENSOR_EFFECTS, MAX_CHANNELS)
 
 
-# A thruster as data for JSON, for files that record their plant.
-
-
 # What makes it another plant, on which Q and R mean nothing. The rest disturbs or bounds the same plant.
 ESSENTIAL = ("preset", "system", "dt", "sensors")
 BOUNDS_AND_NOISE = "parameters", "max_voltage", "ambient_velocity", "process_noise_cov", "measurement_noise_cov"
@@ -295,9 +292,6 @@ def check_same_plant(tuned_for: Mapping, plant: Plant, file: str | Path) -> list
 def differences(then: Mapping, now: Mapping) -> tuple[list[str], list[str]]:
     """What two plants' data differ in: what makes them other plants, and what does not; ValueError for others."""
     return data_of_plants.differences(ENTRIES, then, now)
-
-
-# The task of an env: a reference thrust, and the weights of the reward's terms.
 
 
 DEFAULT_WEIGHTS = (1.0, 0.0, 0.01)  # tracking, energy, voltage rate

@@ -44,8 +44,6 @@ from thruster_env.render.canvas import (
 )
 from thruster_env.render.renderer import PlantRenderer
 
-# Contents of a picture: the truth at each step, and the estimate of a filter.
-
 
 class ChartEntry(NamedTuple):
     """The truth at the end of a step, one entry of the strip charts."""
@@ -134,9 +132,6 @@ class Renderer(PlantRenderer):
         moment = moment._replace(**{name: b for name, b in believed.items() if math.isnan(getattr(moment, name))})
         self._scene.draw(moment, self._angle_of_last_frame, self._angle_of_frame)
         self._gauges.draw(columns, self._charts.draw(columns, count - 1, label)[0])
-
-
-# The upper half of the picture: the hull cut through at the thruster, and the propeller seen from port.
 
 
 HEIGHT = 186  # [px]
@@ -294,9 +289,6 @@ def _section(top: float, bottom: float, inset: float) -> np.ndarray:
 def _limited(part: float) -> float:
     """A part of full scale within plus and minus 1.15; zero if it is not a number."""
     return max(-1.15, min(1.15, part)) if math.isfinite(part) else 0.0
-
-
-# Gauges of thrust and voltage, right of the strip charts.
 
 
 TOP, GAUGE_HEIGHT = 210, 122  # of the gauges [px]

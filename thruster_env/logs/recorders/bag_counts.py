@@ -32,9 +32,6 @@ NEWEST = 9  # version of the metadata
 PACKED = ("", "none", "file", "message")
 
 
-# The number of messages that a bag states, read apart from the messages.
-
-
 def is_ros1(path: Path) -> bool:
     """Whether a file is a bag of ROS 1, by its first bytes."""
     if not path.is_file():
@@ -266,9 +263,6 @@ def _check_whole(path: Path) -> None:
         count = int.from_bytes(head[28:32])
         if path.stat().st_size < count * (page if page > 1 else 65536):
             raise ValueError(f"{path.name} is cut off")
-
-
-# The files of a bag: one, or those that the metadata.yaml of a folder names, unpacked where they are packed.
 
 
 class Bag(NamedTuple):

@@ -37,9 +37,6 @@ LEAST, GREATEST, RANGE = "valid_min", "valid_max", "valid_range"
 UNSIGNED = "_unsigned"
 
 
-# Arrays by name, as MATLAB and HDF5 keep them: which are channels, and which vector has their times.
-
-
 def topics_of(
     arrays: Mapping[str, Any],
     path: Path,

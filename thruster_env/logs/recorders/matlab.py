@@ -201,9 +201,6 @@ def _text(data: bytes | bytearray, part: tuple[int, int, int]) -> str:
     return data[at : at + count].partition(b"\0")[0].decode("latin-1")
 
 
-# MATLAB's .mat files: version 5 to 7 by ourselves, version 7.3 by h5py.
-
-
 def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     """The numeric arrays of one or two dimensions, by structure: STRUCT.FIELD; see `arrays.topics_of`.
 

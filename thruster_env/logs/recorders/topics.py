@@ -169,9 +169,6 @@ def columns_of(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     return {f"{name}[{index}]": values[:, index].astype(np.float64) for index in range(values.shape[1])}
 
 
-# Transforms between frames: messages that hold arrays of them give one topic for each pair of frames.
-
-
 class Pairs:
     """Names of the topics of pairs of frames: TOPIC/PARENT/CHILD, without slashes at the beginning of a frame."""
 
@@ -204,9 +201,6 @@ class Pairs:
     def _doubled(self, name: str) -> Refused:
         rule = "pairs of frames must have names of their own, TOPIC/PARENT/CHILD"
         return Refused(f"{rule}, but two topics of {self._path} are {name[:200]!r}")
-
-
-# Files that are read in another process, because their libraries, in C, crash on some damaged files.
 
 
 SCRIPT = Path(__file__).with_name("process_script.py")
