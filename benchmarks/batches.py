@@ -120,9 +120,6 @@ def _floor_functions() -> tuple[Callable, Callable]:
     return Loops(propagate), Loops(draw)
 
 
-# Filters over many trajectories at once; the ensemble filter beside one written in JAX.
-
-
 def trajectory_rows(seed: int, quick: bool) -> Iterator[Row]:
     """Measure, one row after the other."""
     scenario = find_scenario("nominal")

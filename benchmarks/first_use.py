@@ -117,9 +117,6 @@ def processor_time(source: str) -> Measure:
     return measure
 
 
-# The first use of each filter by the size of the model.
-
-
 def lorenz_96(x, u, c):
     """One step of Euler's method; c = (step, forcing)."""
     after = np.empty(len(x))
@@ -176,9 +173,6 @@ def measured(*arguments: str) -> tuple[float, float]:
         environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     return tuple(json.loads(done.stdout.splitlines()[-1]))
-
-
-# The same on each model of the vehicle.
 
 
 def vehicle_filter_of(name: str, states: str) -> Filter:

@@ -117,9 +117,6 @@ def data_of(kind: str) -> Data:
     return Data(inputs, z, estimates.log_likelihoods.sum(axis=1))
 
 
-# The programs: each returns a function that runs it once and waits, and returns log-likelihoods (DISTINCT,).
-
-
 def machine_code(case: Case) -> Callable:
     """`filters.run` on all cores, or `log_likelihood` of tensors with its gradient."""
     filter_, (inputs, z) = filter_of(case.kind, case.members), data_of(case.kind).batch(case.batch)

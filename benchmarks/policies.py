@@ -14,9 +14,6 @@ from tuning.policies.setup import TrainingConfiguration
 from tuning.problems.data import training_seeds
 from tuning.thruster.scenario import find_scenario
 
-# A short training by PPO: as `thruster train` learns, and by Stable-Baselines3 as its documentation has it.
-
-
 if TYPE_CHECKING:
     from tuning.policies.setup import TrainingConfiguration
 

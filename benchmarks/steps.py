@@ -98,9 +98,6 @@ def peer_ensemble(plant: Plant, model, voltages, measurements, seed: int) -> Mea
     return seconds_a_call(step, recorded, step.reset)
 
 
-# Moving-horizon estimation, beside do-mpc's of the same model and window.
-
-
 def horizon_rows(seed: int, quick: bool) -> Iterator[Row]:
     """The step, beside do-mpc's where that is installed."""
     wrapped = EstimateState(gym.make("BowThruster-v0"), filter="mhe", horizon=HORIZON, loss="quadratic")
@@ -154,9 +151,6 @@ def do_mpc_step(model: StateSpaceModel) -> tuple[Callable[[float, float], np.nda
         return estimator.make_step(np.array([[z], [voltage]]))
 
     return step, reset
-
-
-# Thousands of thrusters at once: the native vector env, and a Runge-Kutta step of its equations of motion.
 
 
 def vector_rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -224,9 +218,6 @@ def _propagate() -> Callable:
                     states[b, 0, j], states[b, 1, j] = substep((states[b, 0, j], states[b, 1, j]), (12.0, 0.0), c)
 
     return Loops(propagate)
-
-
-# A filter on every copy of a vector env.
 
 
 def vector_filter_rows(seed: int, quick: bool) -> Iterator[Row]:

@@ -86,9 +86,6 @@ def seconds_a_call(function: Callable, arguments: Iterable[tuple], prepare: Call
     return measure
 
 
-# What the benchmark prints: rows of measured times with their goals, and the machine they were taken on.
-
-
 class Row(NamedTuple):
     """A timing and the most that its ratio to the peer, or its time, may be."""
 
@@ -188,9 +185,6 @@ def machine_lines(facts: dict) -> list[str]:
         f"Machine: {machine_name(facts)}, {facts['system']}; {facts['architecture']}{avx512}.",
         f"Python {facts['python']}, {packages}.",
     ]
-
-
-# The computed parts of docs/speed.md: a section for each machine, with the table of all rows.
 
 
 def check_page(path: Path) -> None:

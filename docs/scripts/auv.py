@@ -117,9 +117,6 @@ def mean_return(env, controller: DepthAndCourse | None) -> float:
     return total
 
 
-# Filters on held-out seeds: some ten minutes on two cores.
-
-
 RUNS, FEW = 50, 20  # 1 kHz runs of 5 s are few: each is 5000 steps of every member
 EKF, ROBUST, UKF = (contender(name) for name in ("ekf", "ekf-robust", "ukf"))
 ENKF, ETKF = contender("enkf", ensemble_size=100), contender("etkf", ensemble_size=50)

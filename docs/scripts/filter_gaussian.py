@@ -104,9 +104,6 @@ def times(count: int) -> np.ndarray:
     return DT * np.arange(count)
 
 
-# Filters whose belief is a Gaussian or a sum of Gaussians.
-
-
 FLOW = "flow velocity $U_a$ [m/s]"
 FLOW_RMSE = "RMSE of $U_a$ [m/s]"
 
@@ -250,9 +247,6 @@ def _over_the_bound(names: tuple[str, ...], std: float) -> list[float]:
 def _smoothed_rmse(filter_, runs, lag: int) -> float:
     errors = smooth(filter_, *runs.arguments, lag=lag).means[..., 1] - runs.states[..., 1]
     return float((errors[:, FIRST_SCORED_STEP:] ** 2).mean() ** 0.5)
-
-
-# The fuzzy filters: how rules are blended, beside `kf` and `ekf`.
 
 
 CENTRE = 12.0  # [V]

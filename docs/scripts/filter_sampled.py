@@ -106,9 +106,6 @@ def _mean(filter_, runs: Runs) -> np.ndarray:
     return run(filter_, *runs.arguments).means[0, :, 0]
 
 
-# Particles for all states or for one, drawn blindly or aimed.
-
-
 SIZES = (20, 50, 100, 200, 500, 1000, 2000, 5000)
 PARTICLE_RUNS = 200
 SENSORS = ((0.1, "R = 0.1"), (1e-3, "R = 0.001"))
@@ -148,9 +145,6 @@ def particles(path: Path) -> Path:
     return save_figure(figure, path)
 
 
-# Moving-horizon estimation in a batch reactor.
-
-
 BATCHES, LENGTHS = 50, (1, 2, 5, 10, 20, 30)
 
 
@@ -181,9 +175,6 @@ def reactor(path: Path) -> Path:
     right.set(xlabel="horizon L of mhe [steps]", ylabel="RMSE from step 20 on")
     legend_below(figure, left)
     return save_figure(figure, path)
-
-
-# A thruster that switches between models, and filters for a model that is wrong.
 
 
 LOST_FROM, LOST_TO, STEPS, LEVEL = 150, 350, 500, 12.0  # steps; [V]

@@ -192,9 +192,6 @@ def _last_valid(measurements: np.ndarray) -> np.ndarray:
     return np.where(last < 0, 0.0, values)
 
 
-# Tables.
-
-
 class Words(NamedTuple):
     """Properties of a filter that are not computed."""
 

@@ -196,9 +196,6 @@ def _small(error: float) -> str:
     return f"{error:.1e}".replace("e-0", "e-").replace("e+00", "")
 
 
-# The pictures.
-
-
 # Presets are told apart by colour and by dashes; open_bladed hardly turns and is left out of the pictures.
 STYLES = {
     "tunnel": (BLUE, "-"),

@@ -180,9 +180,6 @@ def marked(ratio: Interval) -> str:
     return f"**{text}**" if ratio.high < 1 else text if ratio.low > 1 else f"({text})"
 
 
-# Kinds of particles: fewer states sampled, or sampled better.
-
-
 Numbers = dict[str, object]
 PRINTED = 3  # of four states the first and the last
 KINDS: list[tuple[str, Numbers]] = [
@@ -235,9 +232,6 @@ def particle_errors(problem: ModelProblem, filters: list[tuple[str, Numbers]]) -
         cells = [about(part) for part in parts[::PRINTED]]
         rows.append([label, *cells, f"{nees / chi2.median(model.n):.2f}", f"{level:.1f}"])
     return markdown_table(["filter", *symbols, "NEES", "log L"], rows)
-
-
-# Moving-horizon estimation: where it is the right filter, and where not.
 
 
 BATCH_STEPS, SETTLED = 100, 20  # of a batch, of which errors count from a step on
@@ -312,9 +306,6 @@ def _of_reactor() -> dict[str, Filter]:
         filters[f"mhe, L = {length}"] = make_filter("mhe", within["projection"], horizon=length)
     filters["mhe, L = 30, Student's loss"] = make_filter("mhe", within["projection"], horizon=30, loss=STUDENT)
     return filters
-
-
-# Which filter to take, as a list of questions.
 
 
 FILE = "ranking_chart.png"

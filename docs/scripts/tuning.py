@@ -142,9 +142,6 @@ def _proved(what: str, choice: Choice, scenario: Scenario, names=(), identified=
     return [what, about(ratio), f"{tuned.nees.value:.3g}", f"{tuned.nis.value:.3g}", loose]
 
 
-# What a study finds again where the model is perfect.
-
-
 STUDIES = ("ekf", "nominal", 100), ("kf", "published_tunnel", 100), ("kf", "published_open_bladed", 100)
 SEEDS = range(8)  # of studies
 EQUAL = 0.005  # a score this close to the true filter's is as good
@@ -211,9 +208,6 @@ def scores_reached() -> str:
     return markdown_table(["study", "median excess of the score", "largest (95 %)", "surely below 0.5 %"], rows)
 
 
-# A chain of masses whose springs the filter has wrong: many numbers.
-
-
 MASSES, MEASURED, DT, STEPS = 5, (0, 2, 4), 0.1, 300
 STIFFNESS, DAMPING = 4.0, 0.2  # over the mass
 WRONG = 0.5  # relative errors of the springs, at most
@@ -260,9 +254,6 @@ def many() -> str:
             rows.append(["noise estimation", f"{ratio.value:.2f}"])
         rows.append([name, f"{comparison.ratios[GIVEN].value:.2f}"])
     return markdown_table(["", "score over the given one"], rows)
-
-
-# What tuning can buy where the model is wrong.
 
 
 SCENARIO = "mismatch"

@@ -233,9 +233,6 @@ def test_of_one_channel_a_full_r_is_its_variance():
     assert list(full.parameters()) == list(full._replace(full_r=False).checked().parameters())
 
 
-# Objectives on the true states: their minimum is a study's objective, and lower than elsewhere.
-
-
 def value_of(objective, choice, problem, data):
     found = evaluate(choice.filter(problem), data, problem.scale)
     return OBJECTIVES[objective].value(found, np.nan)

@@ -66,9 +66,6 @@ def brought(monkeypatch):
     plant_packages.cache_clear()
 
 
-# The contract.
-
-
 @pytest.mark.parametrize(
     "name", slow_but([*SCENARIOS, "auv:dvl_dropout", "auv:estimated_current", "auv:papers"], QUICK)
 )
@@ -150,9 +147,6 @@ def test_a_module_that_brings_no_plant_is_left_out_with_a_warning(brought):
     with pytest.warns(UserWarning, match="must offer Scenario, SCENARIOS and NOMINAL, but tests") as caught:
         assert set(plant_packages()) == {"thruster", "auv", "cart"}
     assert len(caught) == 2
-
-
-# Files.
 
 
 def test_a_file_changes_its_base(file):
@@ -252,9 +246,6 @@ def test_what_is_wrong_with_a_file_is_one_clear_line(text, line, file):
     assert "\n" not in str(caught.value)
 
 
-# Scales.
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["nominal", "published_noise", "speed_magnitude", "reversal", "bias", "mixed"])
 def test_the_stored_scale_of_a_thruster_is_the_bound(name):
@@ -326,9 +317,6 @@ def test_a_bound_is_computed_once_for_the_same_inputs(monkeypatch):
     assert np.array_equal(NOMINAL.bound(of_integers, truths=3), NOMINAL.bound(rounded, truths=3))
     noisier = NOMINAL.replace(process_noise_cov=(4.0, 1.6e-3))
     assert (noisier.bound(first, truths=3) > before).all() and len(asked) == 4
-
-
-# What is the thruster's or the vehicle's alone.
 
 
 def test_estimates_in_an_env_with_a_scenarios_voltages_are_those_on_its_data():

@@ -20,8 +20,6 @@ from thruster_env.env.model_env import ModelEnv
 from thruster_env.model.simulate import simulate
 from thruster_env.model.traced import _machine_code
 
-# Loops: a chain of masses between springs, of which each may be slack.
-
 MASSES, STIFFNESS = [1.0, 2.0, 1.5], {"wall": 8.0, "inner": 5.0}
 
 
@@ -75,8 +73,6 @@ def chain():
     )
 
 
-# Arrays: a rigid body that turns.
-
 INERTIA = np.array([[2.0, 0.1, 0.0], [0.1, 1.5, 0.0], [0.0, 0.0, 1.0]])
 AXES = np.eye(3)
 
@@ -114,9 +110,6 @@ def body():
         prior_cov=[0.1] * 3,
         inputs=2,
     )
-
-
-# Dataclasses: a boat with two thrusters, as an engineer has them in a simulator.
 
 
 @dataclass(frozen=True)
