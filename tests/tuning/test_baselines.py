@@ -38,7 +38,8 @@ from tuning.evaluation.worth import gain, tuning_effect, warnings_of
 from tuning.experiments import lorenz63
 from tuning.experiments.benchmark import noise_free_problem
 from tuning.problems.problem import Parameter
-from tuning.reporting.choice_words import consistency_sentence, gains
+from tuning.reporting.choice_words import gains
+from tuning.reporting.tuning_report import consistency_sentence
 from tuning.search.parameters import correlations_of, full_covariance
 
 
