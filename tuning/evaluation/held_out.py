@@ -80,7 +80,7 @@ class Comparison(NamedTuple):
     given: Evaluation | None = None  # what the model came with; None where nobody gave anything
     noise: Evaluation | None = None  # noise estimation; None where there is none
     lacks_ranges: bool = False  # whether the rule of thumb has the model's own Q: `Problem.lacks_ranges`
-    over_regression: Interval = NOTHING  # without truth: `regression.gain_over_regression` of the tuned filter
+    over_regression: Interval = NOTHING  # without truth: `gain_over_regression` of the tuned filter
 
     @property
     def evaluations(self) -> dict[str, Evaluation]:
