@@ -97,9 +97,8 @@ def from_nothing(objective: Objective, start: np.ndarray, stop, tell) -> Ascent 
     if not fixed.any() or fixed.all():
         return None
     at = np.where(fixed, [null for null, _ in nulls], start)
-    bounds = coordinates.low, coordinates.high
-    without = climb(objective, at, *bounds, fixed=fixed, stop=stop)
-    return climb(objective, without.at, *bounds, stop=stop, progress=tell)
+    without = climb(objective, at, fixed=fixed, stop=stop)
+    return climb(objective, without.at, stop=stop, progress=tell)
 
 
 def identify(
@@ -257,7 +256,7 @@ def _checked_starts(objective: Objective, best: Ascent, stop, tell) -> tuple[Obj
                 np.where(before.free, before.leads, further_starts.leads),
             )
         further = objective.with_changes(starts=further_starts)
-        best = climb(further, best.at, *_bounds(objective), stop=stop, progress=tell)
+        best = climb(further, best.at, stop=stop, progress=tell)
         objective = _spent(objective, further)
     return objective, best
 
@@ -272,10 +271,6 @@ def _spent(*objectives: Objective) -> Objective:
     return objectives[-1]
 
 
-def _bounds(objective: Objective) -> tuple[np.ndarray, np.ndarray]:
-    return objective.coordinates.low, objective.coordinates.high
-
-
 def _gated(objective: Objective, best: Ascent, gate: float, stop, tell) -> tuple[Objective, Ascent]:
     """The objective without outliers, and its maximum: repeated until the outliers stay the same."""
     ungated, left_out, spent = objective, None, objective.evaluations
@@ -284,7 +279,7 @@ def _gated(objective: Objective, best: Ascent, gate: float, stop, tell) -> tuple
         if stop() or (left_out is not None and np.array_equal(outliers, left_out)):
             break
         left_out, objective = outliers, without_outliers(ungated, outliers, gate)
-        best = climb(objective, best.at, *_bounds(ungated), stop=stop, progress=tell)
+        best = climb(objective, best.at, stop=stop, progress=tell)
         spent += objective.evaluations
     objective.evaluations = spent
     return objective, best
@@ -307,15 +302,14 @@ def from_start(
 
 
 def _climb_from(objective: Objective, point, simulation_first: bool, stop, tell) -> Ascent:
-    bounds = objective.coordinates.low, objective.coordinates.high
     is_attitude = bool(recorded(objective).first_model.turns)  # without a filter's correction attitudes drift
     if simulation_first and not is_attitude:
         simulation = of_changed(objective, simulation=True)
-        nearest = climb(simulation, point, *bounds, stop=stop, iterations=15)
+        nearest = climb(simulation, point, stop=stop, iterations=15)
         objective.evaluations += simulation.evaluations
         if objective.value(nearest.at) > objective.value(point):
             point = nearest.at
-    return climb(objective, point, *bounds, stop=stop, progress=tell)
+    return climb(objective, point, stop=stop, progress=tell)
 
 
 def _finite_start(objective: Objective, point: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -335,4 +329,4 @@ def _others(coordinates: Coordinates, first: np.ndarray, starts, seed: int) -> l
         first + width * rng.uniform(-1, 1, len(first))
         for _ in range(at_least("starts", starts, 1, MOST_STARTS) - 1)
     ]
-    return [np.clip(point, coordinates.low, coordinates.high) for point in drawn]
+    return list(map(coordinates.clip, drawn))

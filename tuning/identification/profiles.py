@@ -103,18 +103,10 @@ def _side(identification: Identification, index: int, reach: Sequence[float], as
     fixed = np.arange(len(identification.at)) == index
     for part in reach:
         move = part * error
-        at = np.clip(identification.at + slope * move, coordinates.low, coordinates.high)
+        at = coordinates.clip(identification.at + slope * move)
         if asked() or at[index] in [point for point, _ in points] or at[index] == identification.at[index]:
             break
-        maximum = climb(
-            identification.objective,
-            at,
-            coordinates.low,
-            coordinates.high,
-            fixed=fixed,
-            iterations=LEGS,
-            stop=asked,
-        )
+        maximum = climb(identification.objective, at, fixed=fixed, iterations=LEGS, stop=asked)
         points.append((float(at[index]), maximum.found.value))
     return points
 

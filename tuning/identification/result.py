@@ -101,7 +101,7 @@ def null_tests(
             null, is_zero = null_of(coordinates, index, start)
             restricted = _held_at(objective, best, index, null, cov, stop)
             if restricted.found.value > best.found.value + BETTER:
-                further = climb(objective, restricted.at, coordinates.low, coordinates.high, stop=stop)
+                further = climb(objective, restricted.at, stop=stop)
                 best = further if further.found.value > restricted.found.value else restricted
                 break
             inflation = max(cov[index, index] / naive[index, index], 1.0)
@@ -117,15 +117,13 @@ def null_tests(
 
 def _held_at(objective: Objective, best: Ascent, index: int, null: float, cov: np.ndarray, stop) -> Ascent:
     """The maximum with a parameter held; the others begin in the direction of their correlation with it."""
-    coordinates = objective.coordinates
-    bounds = coordinates.low, coordinates.high
     fixed = np.arange(len(best.at)) == index
     along = best.at + cov[:, index] / cov[index, index] * (null - best.at[index])
-    starts = [np.clip(along, *bounds), np.array(best.at)]
+    starts = [objective.coordinates.clip(along), np.array(best.at)]
     for at in starts:
         at[index] = null
     at = max(starts, key=objective.value)
-    return climb(objective, at, *bounds, fixed=fixed, iterations=LEGS, stop=stop)
+    return climb(objective, at, fixed=fixed, iterations=LEGS, stop=stop)
 
 
 class Optimum(NamedTuple):

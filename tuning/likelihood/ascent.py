@@ -7,9 +7,11 @@ runs, which is to be maximised.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
+
+from tuning.problems.problem import Coordinates
 
 ITERATIONS = 60  # at most
 ENOUGH = 1e-4  # predicted rise in log-likelihood below which the search ends
@@ -38,11 +40,19 @@ class Ascent(NamedTuple):
     converged: bool
 
 
+class Ascending(Protocol):
+    """What `climb` maximises: value, gradient and information at coordinates (p,) within their ranges."""
+
+    coordinates: Coordinates
+
+    def __call__(self, point: np.ndarray, /) -> Evaluation:
+        """The evaluation at coordinates."""
+        ...
+
+
 def climb(
-    evaluate: Callable[[np.ndarray], Evaluation],
+    objective: Ascending,
     start: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
     *,
     fixed: np.ndarray | None = None,
     iterations: int = ITERATIONS,
@@ -56,10 +66,8 @@ def climb(
     their range whose gradient points outwards stay there.
 
     Args:
-        evaluate: value, gradient and information at coordinates (p,).
+        objective: value, gradient and information at coordinates (p,).
         start: coordinates (p,) where the search begins.
-        low: the smallest coordinates.
-        high: the largest ones.
         fixed: which parameters are held, (p,) bool.
         iterations: largest number of iterations.
         enough: predicted rise in log-likelihood below which the search ends.
@@ -68,8 +76,9 @@ def climb(
 
     Source: Osborne (1992), "Fisher's method of scoring", International Statistical Review 60(1); Marquardt (1963).
     """
+    low, high = objective.coordinates.low, objective.coordinates.high
     at, damping = np.clip(start, low, high), 1e-3
-    here = evaluate(at)
+    here = objective(at)
     fixed = np.zeros(len(at), dtype=bool) if fixed is None else fixed
     quiet = 0
     for number in range(iterations):
@@ -91,7 +100,7 @@ def climb(
             promised = here.gradient @ (trial - at) * 0.5
             if promised < enough or damping > 1e10:
                 return Ascent(at, here, number, True)
-            next_one = evaluate(trial)
+            next_one = objective(trial)
             rise = next_one.value - here.value if _usable(next_one) else -np.inf
             if rise > 0.05 * promised:
                 break

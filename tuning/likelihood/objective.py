@@ -378,6 +378,11 @@ class Objective:
         return self.parts[0].untuned
 
     @property
+    def start(self) -> np.ndarray:
+        """Coordinates of these within their ranges, where a search begins."""
+        return self.coordinates.clip(self.coordinates.of(self.untuned))
+
+    @property
     def is_of_squares(self) -> bool:
         """Whether squared errors are minimised, in which the covariance does not count."""
         return self.objective in (SCORE, MSE)

@@ -76,7 +76,7 @@ def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np
         )
     model = task.model(task.start)
     linear = stationary(model, task.problems[0].name, name)
-    point = np.clip(coordinates.of(task.values_of(task.start, task.free)), coordinates.low, coordinates.high)
+    point = coordinates.clip(coordinates.of(task.values_of(task.start, task.free)))
     for _ in range(ITERATIONS):
         model, slopes = family.at(point)
         each = np.exp(point)
@@ -93,7 +93,7 @@ def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np
         scale = np.maximum(abs(design).max(axis=0), 1e-300)
         solution, _ = nnls(design / scale, wanted)
         values = np.maximum(solution / scale, np.exp(coordinates.low))
-        point = np.clip(coordinates.of(values), coordinates.low, coordinates.high)
+        point = coordinates.clip(coordinates.of(values))
         task.keep(family.choice_at(point))
 
 

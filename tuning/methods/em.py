@@ -64,7 +64,7 @@ def squarem(task: Task) -> None:
         if abs(twice - once).max() < CLOSE or quiet == PATIENCE:
             return
         a = -max(1.0, float(np.sqrt((r @ r) / max(v @ v, 1e-300))))
-        far = np.clip(point - 2.0 * a * r + a * a * v, goal.coordinates.low, goal.coordinates.high)
+        far = goal.coordinates.clip(point - 2.0 * a * r + a * a * v)
         after, value = _step(goal, far, counts)
         point = after if value >= before else twice
 
@@ -82,8 +82,7 @@ def _start(task: Task, goal: Objective) -> tuple[np.ndarray, np.ndarray]:
             raise ValueError(
                 f"EM tunes only variances in Q and R, but {parameter.name} is tuned, too{way_out(parameter.name)}"
             )
-    first = np.clip(goal.coordinates.of(goal.untuned), goal.coordinates.low, goal.coordinates.high)
-    return first, np.array(counts, dtype=np.float64)
+    return goal.start, np.array(counts, dtype=np.float64)
 
 
 def counts_of(task: Task) -> tuple[int, np.ndarray]:
@@ -101,7 +100,7 @@ def _step(goal: Objective, point: np.ndarray, counts: np.ndarray) -> tuple[np.nd
     here = goal(point)
     factors = 1.0 + np.divide(2.0 * here.gradient, counts, out=np.zeros_like(counts), where=counts > 0)
     after = point + np.log(np.maximum(factors, LEAST))
-    return np.clip(after, goal.coordinates.low, goal.coordinates.high), here.value
+    return goal.coordinates.clip(after), here.value
 
 
 def _full(task: Task, goal: Objective) -> None:

@@ -38,7 +38,7 @@ def posterior(task: Task) -> None:
     Rosenthal (2001), "Optimal scaling for various Metropolis-Hastings algorithms", Statistical Science 16(4).
     """
     coordinates = Coordinates(task.free)
-    centre = np.clip(coordinates.of(task.values_of(task.start, task.free)), coordinates.low, coordinates.high)
+    centre = coordinates.clip(coordinates.of(task.values_of(task.start, task.free)))
     runs = task.passes / len(task.problems)  # the likelihood objective is the mean of a run and of problems
     p, generator = len(centre), task.generator
 
@@ -98,8 +98,7 @@ def maximum_a_posteriori(task: Task) -> None:
             task.keep(goal.choice_at(point))
         return here._replace(value=value, gradient=gradient)
 
-    start = np.clip(coordinates.of(goal.untuned), coordinates.low, coordinates.high)
-    task.keep(goal.choice_at(lbfgs(with_prior, start, coordinates.low, coordinates.high).x))
+    task.keep(goal.choice_at(lbfgs(with_prior, goal.start, coordinates.low, coordinates.high).x))
 
 
 def _log_prior(
@@ -139,7 +138,7 @@ def nuts(task: Task) -> None:
 
     goal = task.goal(LIKELIHOOD, keeps=False)
     low, high = goal.coordinates.low, goal.coordinates.high
-    centre = np.clip(goal.coordinates.of(goal.untuned), low, high)
+    centre = goal.start
     p, draws, evaluated = len(centre), list[np.ndarray](), set[bytes]()
 
     def point_at(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -21,8 +21,7 @@ def scoring(task: Task) -> None:
     sensitivity function calculations", IEEE Transactions on Automatic Control 19(6); damped: Marquardt (1963).
     """
     goal = task.goal(LIKELIHOOD, information=True)
-    start, ends = goal.coordinates.of(goal.untuned), (goal.coordinates.low, goal.coordinates.high)
-    climb(goal, start, *ends, iterations=MOST_STEPS, enough=CLOSE)
+    climb(goal, goal.start, iterations=MOST_STEPS, enough=CLOSE)
 
 
 def noise_estimation(task: Task) -> None:

@@ -58,11 +58,10 @@ def ascend(objective: str) -> Callable[[Task], None]:
     def run(task: Task) -> None:
         goal = task.goal(objective)
         coordinates = goal.coordinates
-        first = np.clip(coordinates.of(goal.untuned), coordinates.low, coordinates.high)
-        best = optimum(goal, first)
+        best = optimum(goal, goal.start)
         task.keep(goal.choice_at(coordinates.of(best.parameters)))
         for factors in starts_of(coordinates.free)[1:]:
-            other = optimum(goal, np.clip(start_at(goal, factors), coordinates.low, coordinates.high))
+            other = optimum(goal, coordinates.clip(start_at(goal, factors)))
             if other.value > best.value:
                 best = other
             task.keep(goal.choice_at(coordinates.of(best.parameters)))
@@ -77,12 +76,12 @@ class Descent:
         """Begin at the task's start."""
         self.task, self.coordinates, self._evaluate = task, Coordinates(task.searched), evaluate
         start = self.coordinates.of(task.values_of(task.start, task.searched))
-        self.first = np.clip(start, self.coordinates.low, self.coordinates.high)
+        self.first = self.coordinates.clip(start)
         self.least = math.inf
 
     def __call__(self, point: np.ndarray) -> float:
         """The value at coordinates, which are put within the box."""
-        point = np.clip(point, self.coordinates.low, self.coordinates.high)
+        point = self.coordinates.clip(point)
         choice = self.task.with_values(self.coordinates.values(point), self.task.searched)
         value = self._evaluate(choice)
         if value < self.least:
@@ -131,8 +130,7 @@ def coordinate_steps(task: Task) -> None:
         before = least
         for i in range(len(point)):
             for step in (FORWARD, BACKWARD):
-                other = point + step * np.eye(len(point))[i]
-                other = np.clip(other, descent.coordinates.low, descent.coordinates.high)
+                other = descent.coordinates.clip(point + step * np.eye(len(point))[i])
                 value = descent(other)
                 if value < least:
                     point, least = other, value

@@ -265,8 +265,7 @@ class Task:
         return goal
 
     def _price_of_gradients(self, plain: Objective) -> float:
-        few, coordinates = plain.of_few(FEW), plain.coordinates
-        point = np.clip(coordinates.of(plain.untuned), coordinates.low, coordinates.high)
+        few, point = plain.of_few(FEW), plain.start
         return self.price("information" if plain.informative else plain.objective, lambda: few(point))
 
     def price(self, name: str, call: Callable[[], object]) -> float:

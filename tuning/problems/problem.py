@@ -184,6 +184,10 @@ class Coordinates:
         array = np.asarray(values, dtype=np.float64)
         return np.where(self.log, np.log(np.where(self.log, array, 1.0)), array) / self.units
 
+    def clip(self, at: np.ndarray) -> np.ndarray:
+        """The nearest coordinates within the ranges."""
+        return np.clip(at, self.low, self.high)
+
     def values(self, at: np.ndarray) -> np.ndarray:
         """Values (p,) at coordinates."""
         at = np.asarray(at) * self.units

@@ -205,9 +205,8 @@ class SeriesFit(Result):
         values, gain = list(self.chosen.values.values()), 0.0
         for column in map(self.column.axis, range(axes)):
             likelihood = ColumnLikelihood(candidate, column)
-            low, high = likelihood.coordinates.low, likelihood.coordinates.high
-            begin = np.clip(likelihood.coordinates.of(values), low, high)
-            alone = climb(likelihood, begin, low, high).found.value
+            begin = likelihood.coordinates.clip(likelihood.coordinates.of(values))
+            alone = climb(likelihood, begin).found.value
             gain += alone - likelihood.value(begin)
         return float(chdtrc((axes - 1) * len(values), 2.0 * gain))
 

@@ -185,9 +185,8 @@ def _maximum(candidate: Sum, column: Column, scales: Scales | None = None) -> Fi
     """The candidate with the likeliest numbers for a column; of a part of one with the scales of that."""
     scales = scales or column.scales
     objective = ColumnLikelihood(candidate, column, scales=scales)
-    bounds = objective.coordinates.low, objective.coordinates.high
-    ascents = [climb(objective, at, *bounds) for at in _starts(objective, candidate, scales)]
-    ascent = climb(objective, max(ascents, key=lambda end: end.found.value).at, *bounds, enough=EXACT)
+    ascents = [climb(objective, at) for at in _starts(objective, candidate, scales)]
+    ascent = climb(objective, max(ascents, key=lambda end: end.found.value).at, enough=EXACT)
     if not math.isfinite(ascent.found.value):
         rule = f"{candidate.name} must have a likelihood on the data, but has none from any start"
         raise ValueError(f"{rule}: data that a model predicts to the last digit have neither Q nor R")
@@ -197,10 +196,8 @@ def _maximum(candidate: Sum, column: Column, scales: Scales | None = None) -> Fi
 def _on_all(chosen: Fitted, column: Column) -> Fitted:
     """A candidate that was fitted on a part of the record, on the whole of it."""
     objective = ColumnLikelihood(chosen.model, column)
-    coordinates = objective.coordinates
-    begin = np.clip(coordinates.of(list(chosen.candidate.values.values())), coordinates.low, coordinates.high)
-    ascent = climb(objective, begin, coordinates.low, coordinates.high)
-    return chosen._replace(objective=objective, ascent=ascent, rivals=())
+    begin = objective.coordinates.of(list(chosen.candidate.values.values()))
+    return chosen._replace(objective=objective, ascent=climb(objective, begin), rivals=())
 
 
 def filtered(signal: Signal, model: AffineModel, column: Column) -> Estimates:
@@ -357,7 +354,7 @@ def _white(column: Column) -> Fitted:
     model = named_model("constant")
     objective = ColumnLikelihood(model, column)
     low, high = objective.coordinates.low, objective.coordinates.high
-    ascent = climb(objective, np.array([low[0], high[1]]), low, high, fixed=np.array([True, False]))
+    ascent = climb(objective, np.array([low[0], high[1]]), fixed=np.array([True, False]))
     return Fitted(model, objective, ascent, ())
 
 
@@ -380,7 +377,7 @@ def _end(fitted: Fitted, index: int, limit: float) -> float:
         """The root of the fall, nearly linear in the coordinate, less that of an end."""
         nonlocal at
         start = np.where(fixed, coordinate, at)
-        profile = climb(objective, start, coordinates.low, coordinates.high, fixed=fixed, iterations=15)
+        profile = climb(objective, start, fixed=fixed, iterations=15)
         fall = best.found.value - profile.found.value
         if not math.isfinite(fall):
             return FAR

@@ -159,7 +159,7 @@ class ColumnLikelihood:
         factor = squares / self.counted
         best = value - 0.5 * self.counted * math.log(factor) + 0.5 * (squares - self.counted)
         scaled = at + self.amplitude * math.log(factor)
-        return best, np.clip(scaled, self.coordinates.low, self.coordinates.high)
+        return best, self.coordinates.clip(scaled)
 
     def by_rows(self, at: np.ndarray) -> np.ndarray:
         """Log densities of the innovations that count, (K, axes), 0 elsewhere; the record must be one run."""

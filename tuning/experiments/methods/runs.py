@@ -241,7 +241,7 @@ def reference(case: Case, protocol: Protocol) -> Result:
         first = coordinates.of(goal.untuned)
         for turn in range(protocol.starts):
             shifted = first + rng.uniform(-np.log(100.0), np.log(100.0), len(first)) * coordinates.log * (turn > 0)
-            maximum = optimum(goal, np.clip(shifted, coordinates.low, coordinates.high))
+            maximum = optimum(goal, coordinates.clip(shifted))
             best = maximum if best is None or maximum.value > best.value else best
         assert best is not None
         choice = goal.choice_at(coordinates.of(best.parameters))
