@@ -3,15 +3,11 @@
 import copy
 import pickle
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
-import matplotlib.figure
 import numpy as np
 import pytest
 
 import tuning
-from filters.augmented import Unknown
-from filters.registry import make_filter
 from tests import pendulum_problem
 from tests.linear_problem import LinearProblem
 from tests.models import wide_model
@@ -20,7 +16,6 @@ from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
 from thruster_env.model.affine import affine_model
 from tuning.api.compare import default_filters
-from tuning.cli.verbs import described
 from tuning.evaluation.compare import known
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.residuals import model_error
@@ -82,15 +77,6 @@ def test_rows_have_the_labels_of_a_mapping_and_their_numbers_from_any_executor(c
     assert mine == {"mine": theirs["kf"], "theirs": theirs["ekf"]}
 
 
-def test_scores_are_drawn_with_their_intervals(comparison):
-    figure = comparison.plot_scores()
-    assert isinstance(figure, matplotlib.figure.Figure)
-    (axis,) = figure.axes
-    assert [text.get_text() for text in axis.get_yticklabels()] == ["kf", "ekf"]
-    whiskers = [line.get_xdata().tolist() for line in axis.lines if len(line.get_xdata()) == 2]
-    assert whiskers == [[row.evaluation.score.low, row.evaluation.score.high] for row in comparison.boards[0].rows]
-
-
 def test_filters_are_tuned_first_where_that_is_asked_for(tmp_path):
     found = tuning.compare(["kf", "ekf"], SHORT, trials=4, seeds=4, progress=False)
     assert found.filters == ("kf", "ekf")
@@ -131,17 +117,6 @@ def sluggish(**options):
 
 
 @pytest.mark.usefixtures("as_python")
-def test_a_caption_says_of_each_row_whose_q_and_r_it_has():
-    model = sluggish(name="sluggish").truth
-    problem = ModelProblem(model, inputs=Steps(hold=5), steps=20, first_scored_step=4, scale=(1.0,), name="right")
-    mine = make_filter("kf", model.replace(process_noise_cov=[9.0]))
-    found = tuning.compare({"mine": mine, "kf": "kf"}, problem, seeds=4, knows="true", progress=False)
-    text = " ".join(str(found).split())
-    assert "Q and R: of mine those of the filter itself; of kf the plant's own (oracle" in text
-    assert [row.knows for row in found.boards[0].rows] == ["own", "true"]
-
-
-@pytest.mark.usefixtures("as_python")
 def test_with_a_wrong_model_each_filter_has_the_best_q_and_r_of_a_study_and_noise_estimation():
     problem = sluggish(name="sluggish")
     assert model_error(problem).startswith("the residuals of x have ")
@@ -170,16 +145,6 @@ def test_a_comparison_s_study_does_not_tune_the_ensemble_size():
     assert plan.identity != Plan("enkf", (SHORT,)).identity
 
 
-def test_what_filters_know_has_one_explanation(thruster):  # noqa: F811
-    page = (Path(__file__).parents[2] / "docs" / "appendix" / "tuning.md").read_text()
-    help_text = thruster("compare", "--help").stdout.replace("│", " ")
-    columns = "".join(line[30:] for line in help_text.splitlines(keepends=True))  # without names and types
-    explanation = described(tuning.compare)[1]["knows"].partition(": ")[2]
-    assert len(explanation) > 200
-    for text in (page, columns):
-        assert explanation in " ".join(text.split())
-
-
 WRONG = [
     (lambda: tuning.compare(["ekf", "ekf"], SHORT, seeds=2), "must be of different filters, but got ekf, ekf"),
     (lambda: tuning.compare([]), "a comparison must have at least one filter, but got none"),
@@ -206,14 +171,6 @@ WRONG = [
 def test_errors_state_the_rule_and_the_value(call, said):
     with pytest.raises(ValueError, match=said):
         call()
-
-
-def test_beliefs_have_several_forms():
-    from tuning.problems.assumed import unknowns_of
-
-    mine = Unknown(0.2)
-    assert unknowns_of(["a", "b"]) == {"a": None, "b": None} == unknowns_of({"a": None, "b": None})
-    assert unknowns_of({"a": mine, "b": 0.2, "c": (0.2, 0.1)}) == {"a": mine, "b": mine, "c": Unknown(0.2, 0.1)}
 
 
 def test_a_filter_that_refuses_the_model_is_left_out_and_the_others_are_compared():

@@ -4,7 +4,6 @@ import copy
 import json
 import pickle
 
-import matplotlib.figure
 import numpy as np
 import pytest
 
@@ -56,14 +55,6 @@ def test_a_pair_of_model_and_log_is_the_same(recorded):
     assert pair.log_likelihood == alone.log_likelihood
     with pytest.raises(ValueError, match="'mass'"):  # the logs of the pair are read as those of the thruster
         tuning.identify(tuning.read_logs(("tunnel_physical", [recorded[0]]), sensors=WHOSE["sensors"]), "mass")
-
-
-def test_estimates_are_drawn_and_copied(recorded):
-    mine = tuning.estimate(tuning.read_logs(recorded[0], **WHOSE))
-    whole, innovations = mine.plot_states(), mine.plot_innovations()
-    assert isinstance(whole, matplotlib.figure.Figure) and len(whole.axes) > len(innovations.axes) == 2
-    for other in (copy.copy(mine), pickle.loads(pickle.dumps(mine))):
-        assert repr(other) == repr(mine)
 
 
 def test_a_baseline_has_no_nis(recorded):

@@ -5,13 +5,10 @@ import html
 import json
 import pickle
 import signal
-import subprocess
 import sys
-from dataclasses import replace
 
 import matplotlib.figure
 import numpy as np
-import optuna
 import pytest
 
 import tuning
@@ -20,7 +17,6 @@ from filters.c.project import c_filter
 from filters.monitoring import Monitor
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.problems.find import find_problem
-from tuning.reporting.sections import lines_section
 from tuning.reporting.tuning_report import report
 
 TRIALS = 5
@@ -88,28 +84,6 @@ def test_what_is_printed_are_the_tables_of_the_command_line(study):
     assert all(line in str(study) for line in lines) and html.escape(printed[0]) in study._repr_html_()
 
 
-def lines_of(page):
-    """The lines of Python of a report."""
-    found = page.read_text().split("from filters import EstimateState", 1)[1].split("</pre>", 1)[0]
-    return "from filters import EstimateState" + html.unescape(found)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_lines_to_copy_name_the_file_that_was_saved_and_run(study, tmp_path):
-    fresh, page, file = replace(study, file=None), tmp_path / "page.html", tmp_path / "motor.json"
-    assert "tuned='TUNED.json'" in lines_of(tuning.report(fresh, page, progress=False).page)
-    fresh.save(file)
-    lines = lines_of(tuning.report(fresh, page, progress=False).page)
-    names = {"measurements": [[1.0]], "inputs": [[0.0]]}
-    exec(compile(lines.replace("'motor.json'", repr(str(file))), "lines to copy", "exec"), names)
-    assert "tuned='motor.json'" in lines and names["tuned"].name == study.choice.name
-    (code,) = [
-        part for part in lines_section(study.choice, SHORT, None).parts if getattr(part, "title", "") == "Python"
-    ]
-    assert "from your_module import problem" in code.text
-
-
 def test_baselines_are_filters_that_go_around_an_env(study):
     filters = study.held_out.filters
     assert list(filters) == list(study.held_out.evaluations)
@@ -131,16 +105,6 @@ def test_a_study_in_memory_is_that_of_a_storage_and_goes_on_there(tmp_path, caps
     assert first == [trial.params for trial in short.trials] == [trial.params for trial in whole.trials[:2]]
     page = tuning.report(whole.name, tmp_path / "page.html", storage=storage, problem=SHORT, progress=False).page
     assert "Study &#x27;" not in page.read_text() and page.with_suffix(".md").is_file()
-
-
-def test_results_show_themselves_in_few_words(study):
-    assert repr(study).startswith("Study(ekf on mismatch, 5 trials: score ") and len(repr(study)) < 250
-    found = study.held_out
-    assert repr(found).startswith("HeldOut(ekf on mismatch, 200 held-out seeds: score ") and len(repr(found)) < 150
-    for one in (study, found):
-        text = one._repr_html_()
-        assert text.count("<table") == text.count("</table>") > 1 and "nan" not in text
-    assert "tuned" in study._repr_html_() and "oracle" in found._repr_html_()
 
 
 def test_tables_have_what_is_in_the_values(study):
@@ -177,39 +141,6 @@ def test_copies_and_pickles_are_the_same(study, tmp_path):
         study.plan = None
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_a_report_of_a_value_is_that_of_its_file_and_storage(study, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    page = study.report("mine.html").page
-    assert page.name == "mine.html" and "The study" in page.read_text()
-    study.save("ekf-mismatch-seed0.json")
-    folder = tuning.report("ekf-mismatch-seed0.json", progress=False).page.parent
-    assert sorted(path.name for path in folder.glob("ekf*")) == [
-        f"ekf-mismatch-seed0.{end}" for end in ("html", "json", "md")
-    ]
-    assert page.with_suffix(".md").read_text() == (folder / "ekf-mismatch-seed0.md").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_a_report_of_two_is_that_of_the_command(study, thruster, monkeypatch, tmp_path):  # noqa: F811
-    monkeypatch.setattr("tuning.api.report.run_sections", lambda *_: [])
-    other = tuning.tune("mismatch", filter="kf", trials=1, progress=False)
-    study.save("a.json")
-    other.save("b.json")
-    done = thruster("report", "a.json", "b.json", "--out", "theirs")
-    assert done.returncode == 0, done.stderr
-    mine = tuning.report(["a.json", "b.json"], "mine.html", progress=False).page
-    theirs = tmp_path / "theirs" / "a-beside-b.html"
-    assert mine.read_text() == theirs.read_text()
-    assert mine.with_suffix(".md").read_text() == theirs.with_suffix(".md").read_text()
-    with pytest.raises(ValueError, match=r"two studies must be in one list, but got out=Study\(ekf on mismatch"):
-        tuning.report("b.json", study)
-    values = tuning.report((study, "b.json"), progress=False).page  # what is no file goes into the folder out
-    assert values.as_posix() == "out/ekf-mismatch-seed0-beside-b.html" and "a.json" in values.read_text()
-
-
 def test_ctrl_c_keeps_what_is_finished(monkeypatch):
     from tuning.search import study as module
 
@@ -224,28 +155,6 @@ def test_ctrl_c_keeps_what_is_finished(monkeypatch):
     found = tuning.tune(SHORT, trials=30, progress=False)
     assert found.interrupted and found.result.finished == 3 and "3 trials, interrupted" in repr(found)
     assert found.filter.name == "ekf" and found.held_out.score.value > 0
-
-
-def test_progress_is_silent_where_nobody_looks(capsys):
-    before = optuna.logging.get_verbosity()
-    tuning.tune(SHORT, trials=1)
-    assert capsys.readouterr() == ("", "") and optuna.logging.get_verbosity() == before
-    tuning.tune(SHORT, trials=1, progress=True)
-    assert "tuning ekf on short" in capsys.readouterr().err
-
-
-def test_importing_tuning_is_light_and_says_what_there_is():
-    code = (
-        "import sys, tuning; print([n for n in ('numpy', 'optuna', 'rich') if n in sys.modules], tuning.__all__)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    names = ["SearchSpace", "compare", "estimate", "evaluate", "explore", "export", "find_problem", "fit"]
-    names += ["identify", "read_logs", "report", "train_estimator", "tune", "verify"]
-    assert done.stdout.strip() == f"[] {names}" and set(names) <= set(dir(tuning))
-    with pytest.raises(AttributeError, match="module 'tuning' has no attribute 'tunes'"):
-        tuning.tunes  # noqa: B018
-    for name in filter(str.islower, names):  # functions
-        assert "Args:" in getattr(tuning, name).__doc__ and "tuning." in getattr(tuning, name).__doc__
 
 
 WRONG = [

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 import warnings
 
 import numpy as np
@@ -10,12 +9,10 @@ import optuna
 import pytest
 from optuna.distributions import CategoricalDistribution
 from optuna.trial import TrialState
-from rich.progress import Progress
 
 import tuning
 from filters.registry import FILTERS
 from tuning.api.tune import warn_of_few_trials
-from tuning.cli.main import main
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
@@ -308,37 +305,6 @@ def test_cost_is_of_one_core_and_grows_with_the_ensemble():
     ekf = microseconds_a_step(untuned_choice("ekf", MISMATCH).filter(MISMATCH), data)
     assert 0 < ekf < small and 3 < large / small < 40
     assert over_budget(2.0, 1.0) == pytest.approx(np.log(2)) and over_budget(1.0, 1.0) == 0.0
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:12 trials are fewer")
-@pytest.mark.usefixtures("undrawn")
-def test_the_command_says_which_filters_it_tried_and_reports_on_the_winner(priced, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tuning.evaluation.held_out.HELD_OUT_SEEDS", 8)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["thruster", *arguments])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        assert not stop.value.code
-        return capsys.readouterr().out
-
-    shown = []
-    monkeypatch.setattr(Progress, "update", lambda *given, **named: shown.append(named))
-    tune = ("tune", "--filter", "auto", "--budget", "1", "--trials", "12")
-    said = run(*tune)
-    titles = [named["description"] for named in shown if "description" in named]
-    assert len(titles) == 12 and {f"tuning auto ({kind}) on mismatch" for kind in FEW} == set(titles)
-    assert "Filters that were tried" in said and "the budget is 1." in said
-    name = "auto-mismatch-seed0-budget1"
-    content = json.loads((tmp_path / "out" / f"{name}.json").read_text())
-    assert content["filter"]["name"] in FEW and content["study"]["microseconds_a_step"] <= 1.0
-    again = json.loads(run(*tune, "--json", "-"))
-    assert again["filter"]["name"] == content["filter"]["name"] and len(again["kinds"]) == 4
-    assert again["trials"] == content["study"]["trials"]
-    assert "tuned on mismatch" in run("report", f"out/{name}.json") + (tmp_path / f"out/{name}.md").read_text()
-    assert "Filters that were tried" in (tmp_path / f"out/{name}.html").read_text()
 
 
 @pytest.mark.parametrize("method", ["tpe", "gradient"])

@@ -18,10 +18,9 @@ from tuning.evaluation.compare import Leaderboard, Row, compare, contender, size
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import write_tuned
-from tuning.problems.assumed import beliefs_of, default_belief
+from tuning.problems.assumed import default_belief
 from tuning.problems.data import held_out_seeds
 from tuning.problems.model_problem import ModelProblem
-from tuning.reporting.leaderboard import belief_sentences
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import StudyResult
@@ -78,17 +77,6 @@ def test_what_is_believed_by_default():
     assert default_belief("load_gain", -20.0) == Unknown(4.0, pytest.approx(0.08))
     with pytest.raises(ValueError, match="the assumed asymmetry, .* must be positive, but got 0.0"):
         default_belief("asymmetry", 0.0)
-
-
-def test_beliefs_are_said_with_their_numbers():
-    constants = NOMINAL.model().constants
-    found = beliefs_of(constants, {"load_gain": None, "ambient_velocity": Unknown(0.4, 0.01)})
-    first, second = belief_sentences([SimpleNamespace(beliefs=found)])
-    gain = constants.load_gain
-    assert first.startswith(
-        f"load_gain has a prior mean of {gain:.4g}, a standard deviation of {gain / 5:.3g} and"
-    )
-    assert "has a prior mean of 0, a standard deviation of 0.4 and a random walk of 0.01 per step" in second
 
 
 def scored(mean_squares, first=None):
@@ -284,8 +272,3 @@ def test_by_default_a_filter_without_a_scaled_default_has_what_its_model_came_wi
 def test_a_users_mistake_is_one_clear_line_and_exit_code_2(arguments, line, thruster):
     code, _, errors = thruster(*arguments)
     assert code == 2 and line in errors and "Traceback" not in errors
-
-
-def test_help_teaches_by_an_example(thruster):
-    code, out, _ = thruster("--help")
-    assert code == 0 and "Example: thruster compare --filter ekf" in " ".join(out.split())

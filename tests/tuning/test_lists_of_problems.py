@@ -3,19 +3,16 @@
 import numpy as np
 import optuna
 import pytest
-from optuna.trial import TrialState
 
 import tuning
-from filters.tuned_file import read_tuned_file
 from tests.linear_problem import LinearProblem
 from tests.tuning.test_unequal_runs import MODEL, runs_of
-from tuning.api.verify import verify
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.sizes import ensemble_sizes, few_seeds_first
 from tuning.problems.model_problem import RunsProblem
 from tuning.problems.problem import Parameter
 from tuning.search.plan import Plan
-from tuning.search.space import choice_of, untuned_choice
+from tuning.search.space import untuned_choice
 from tuning.search.trials import BLOCK, measure, shares
 
 LENGTHS = (30, 41, 33, 52, 26, 45, 38, 44, 59, 31, 36, 48, 29, 40, 35, 27, 43, 34, 39)  # ten for training
@@ -73,26 +70,6 @@ def test_what_is_reported_to_the_pruner_is_an_equal_share_of_each_problem(proble
         scores.append([each[i:j].mean() for i, j in zip(ends, ends[1:], strict=False)])
     np.testing.assert_allclose(list(reported.values()), np.mean(scores, axis=0), rtol=1e-10)
     assert sum(np.diff(ends)) == len(many.seeds) and np.ptp(np.diff(ends)) <= 1
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_a_study_of_a_list_is_tuned_saved_verified_and_reported(problems, tmp_path):
-    found = tuning.tune(list(problems), "ekf", trials=14, consistent=False, progress=False)
-    complete = (trial for trial in found.trials if trial.state == TrialState.COMPLETE)
-    best = min(complete, key=lambda trial: trial.values[0])
-    choice = choice_of("ekf", best.params, problems[0])
-    data = Plan("ekf", problems).training_data()
-    pairs = zip(problems, data, strict=True)
-    scores = [evaluate(choice.filter(one), some, one.scale).score.value for one, some in pairs]
-    assert best.values[0] == pytest.approx(np.mean(scores), rel=1e-12)  # each problem weighs the same
-    file = found.save(tmp_path / "tuned.json")
-    assert set(read_tuned_file(file)["held_out"]) == {"runs", "model"}
-    held_out = {name: one for name, one in read_tuned_file(file)["held_out"].items() if name == "runs"}
-    assert verify(file, problem=[*problems]).holds and held_out["runs"]["seeds"] == [13, 19]
-    page = found.report(tmp_path / "report.html").page.read_text(encoding="utf-8")
-    assert f"{data[0].seeds[0]} to {data[0].seeds[-1]}; {data[1].seeds[0]} to " in page
-    assert "held-out runs 13 to 18" in page and "held-out seeds 500000 to 500199" in page
 
 
 def test_sizes_of_an_ensemble_are_compared_on_all_runs_of_each_problem(problems):

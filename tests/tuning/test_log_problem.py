@@ -2,7 +2,6 @@
 
 import json
 import pickle
-from pathlib import Path
 
 import numpy as np
 import optuna
@@ -19,7 +18,6 @@ from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.sizes import close_size
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
-from tuning.experiments import hidden_truth
 from tuning.experiments.hidden_truth import hide_truth
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import identify
@@ -209,19 +207,6 @@ def test_an_ensemble_without_a_truth_is_the_smallest_whose_estimates_are_close_t
     excess = {n: ((means_of(n)[0] - largest) ** 2 / variances).mean() for n in ladder}
     assert size == min(n for n in ladder if excess[n] < 0.0201) and 20 < size < 200
     assert close_size(choice.with_size(10), plan._replace(budget=1.0), [data]) <= 10
-
-
-def test_the_page_has_the_table_of_its_script_and_says_what_the_truth_is_worth():
-    page = (Path(__file__).parents[2] / "docs" / "appendix" / "logs.md").read_text()
-    lines = page.partition("<!-- table hidden_truth -->")[2].partition("<!-- end -->")[0].strip().splitlines()
-    rows = {(row[1].strip(" `"), row[2].strip(" `")): row for row in (line.split("|") for line in lines[2:])}
-    assert set(rows) == set(hidden_truth.CASES)
-    ratios = {case: float(row[4].split()[0]) for case, row in rows.items()}  # with the most logs
-    fitting = [ratios[case] for case in ratios if case[1] != "kf" or case[0] == "published_tunnel"]
-    assert len(fitting) == 5 and max(fitting) <= 1.02
-    assert min(ratios["nominal", "kf"], ratios["outliers", "kf"]) > 1.5  # as the text says
-    made = hidden_truth.hidden_truth(trials=2, cases=[("nominal", "ekf")], runs=(6,))
-    assert made.startswith("| scenario | filter | 6 logs |") and "| `nominal` | `ekf` | " in made
 
 
 def test_a_study_that_never_saw_the_truth_comes_close_to_one_that_did():

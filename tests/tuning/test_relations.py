@@ -2,11 +2,8 @@
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from tests.tuning.methods.problems import linear, task_of
-from tuning.cli.app import app
-from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import goal_of, tune_by_gradient
 from tuning.methods.registry import find_method
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE
@@ -100,15 +97,6 @@ def test_a_study_and_its_workers_keep_them_and_resume(tmp_path):
         assert one["Q22"] == pytest.approx(1e-3 * one["Q11"], rel=1e-12) and 0.5 <= one["R"] <= 50
     with pytest.raises(ValueError, match="study 's' must be for .*where"):
         open_study("s", plan._replace(where=()), open_storage(path))
-
-
-def test_the_command_takes_them(tmp_path):
-    out = tmp_path / "tuned.json"
-    options = ["--trials", "5", "--storage", str(tmp_path / "j"), "--out", str(out), "--where", "Q22 = 1e-3 Q11"]
-    shown = CliRunner().invoke(app, ["tune", "--filter", "ekf", "--scenario", "mismatch", *options])
-    assert shown.exit_code == 0, shown.output
-    found = parameters_of(read_tuned(out)[0])
-    assert found["Q22"] == pytest.approx(1e-3 * found["Q11"], rel=1e-9)
 
 
 @pytest.mark.parametrize(

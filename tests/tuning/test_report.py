@@ -1,6 +1,5 @@
 """The report of a tuning: one page that needs nothing else, and its tables."""
 
-import json
 import logging
 import sys
 from html.parser import HTMLParser
@@ -12,9 +11,8 @@ import pytest
 from filters.consistency.nees import Interval
 from tuning.api.report import report as write_report
 from tuning.cli.main import main
-from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
-from tuning.evaluation.tuned import read_tuned, write_tuned
+from tuning.evaluation.tuned import write_tuned
 from tuning.reporting.page import Code, Picture, Section, Table, Words, html_page, markdown_page
 from tuning.reporting.search_figures import FEWEST_TRIALS, counted_trials, early_trials, importances
 from tuning.reporting.sections import advice
@@ -134,31 +132,6 @@ def test_without_its_study_a_tuned_file_still_has_a_page():
         assert "Error against ensemble size" not in page.headings
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
-    monkeypatch.setattr("tuning.reporting.subject.HELD_OUT_SEEDS", 6)
-    plan = Plan("ekf", (MISMATCH, OUTLIERS), objectives=("score", "consistency"), consistent=False)
-    run_study(open_study("front", plan, open_storage(STORAGE)), plan, FEWEST_TRIALS)
-    report = write_report("front", storage=STORAGE)
-    assert report.page.as_posix() == "out/front.html"
-    page = Page(report.page.read_text())
-    words = " ".join(page.words)
-    assert "Pareto front" in words and "scenario mismatch" in words and "scenario outliers" in words
-    assert " on mismatch and " in report.advice and len(page.pictures()) == 2 + 4 + 5
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_a_baseline_has_no_covariance_to_speak_of():
-    tuned(Plan("low-pass", (MISMATCH,)), 3)
-    report = write_report("s.json", storage=STORAGE)
-    assert "covariance" not in report.advice
-    page = Page(report.page.read_text())
-    assert "Is the covariance consistent?" not in page.headings
-    assert "| tuned | " in report.markdown.read_text() and "nan" not in report.markdown.read_text()
-
-
 def test_importances_need_enough_trials_and_sum_to_one():
     plan = Plan("ekf", (MISMATCH,), prune=False)
     study = open_study("s", plan, optuna.storages.InMemoryStorage())
@@ -180,29 +153,6 @@ def test_importances_count_pruned_trials_where_few_are_complete(caplog, monkeypa
     caplog.clear()
     assert sum(importances(study).values()) == pytest.approx(1.0)
     assert caplog.text == "", "a copy of a study is nobody's study"
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_two_studies_stand_beside_each_other(folder, monkeypatch, capsys):
-    tuned(Plan("ekf", (MISMATCH,)), 2)
-    tuned(Plan("kf", (MISMATCH,)), 2, "t")
-    arguments = ["thruster", "report", "s.json", "t.json", "--storage", STORAGE]
-    monkeypatch.setattr(sys, "argv", arguments)
-    with pytest.raises(SystemExit):
-        main()
-    assert "s-beside-t.html" in capsys.readouterr().out
-    page = Page((folder / "s-beside-t.html").read_text())
-    words, ids = " ".join(page.words), [found["id"] for _, found in page.attributes if "id" in found]
-    assert page.headings[0] == "Side by side" and len(ids) == len(set(ids)) and len(page.pictures()) == 2 * 8
-    a, b = (read_tuned(name)[0].filter(MISMATCH) for name in ("s.json", "t.json"))
-    data = MISMATCH.data(MISMATCH.held_out_seeds(0, 6))
-    ratio = score_ratio(*(evaluate(one, data, MISMATCH.scale) for one in (a, b)))
-    assert f"Score of s over that of t, paired by run: {ratio.value:.3g}" in words
-    monkeypatch.setattr(sys, "argv", [*arguments[:2], "a.json", "b.json", "c.json"])
-    with pytest.raises(SystemExit):
-        main()
-    assert "a side-by-side report must be of two studies, but got 3" in capsys.readouterr().err
 
 
 def test_trials_that_ended_early_stand_at_the_mean_of_their_seeds():
@@ -249,11 +199,6 @@ def test_what_is_said_is_escaped():
     assert markdown == "# a\\_b\n\n1 \\< 2\n\n**c\\|d**\n\n|  | e |\n| --- | ---: |\n| f\\|g | h\\* |\n"
 
 
-def test_an_interval_stands_below_its_value():
-    text = Table("", ["", "a", "b"], [["x", "1.2 [1.1, 1.3]", "score [-]"]]).html()
-    assert "<td>1.2<small>[1.1, 1.3]</small></td><td>score [-]</td>" in text
-
-
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -275,20 +220,3 @@ def test_a_mistake_is_one_clear_line(arguments, line, folder, monkeypatch, capsy
         main()
     assert stop.value.code == 2 and line in capsys.readouterr().err
     assert {path.name for path in folder.iterdir()} == before
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_the_command_says_what_it_wrote(monkeypatch, capsys):
-    tuned(Plan("ekf", (MISMATCH,)), 2)
-    monkeypatch.setattr(
-        sys, "argv", ["thruster", "report", "s.json", "--storage", STORAGE, "--out", "new", "--json", "-"]
-    )
-    with pytest.raises(SystemExit):
-        main()
-    said = json.loads(capsys.readouterr().out)
-    assert (
-        said["page"] == "new/s.html"
-        and said["tables"] == "new/s.md"
-        and said["advice"].startswith("The study returns the ")
-    )

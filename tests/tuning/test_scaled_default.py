@@ -5,22 +5,19 @@ import re
 import numpy as np
 import pytest
 
-from filters.consistency.nees import Interval
 from tuning.evaluation.baselines import (
-    GIVEN,
     NOISE,
     ORACLE,
     RULE,
     SCALED,
     TUNED,
     baselines,
-    rule_of_thumb,
     scaled,
     scaled_default,
 )
 from tuning.evaluation.compare import contender
 from tuning.evaluation.evaluate import evaluate, score_ratio
-from tuning.evaluation.held_out import Comparison, evaluate_held_out
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.problems.data import held_out_seeds, training_seeds
 from tuning.problems.excitation import Steps
@@ -112,32 +109,6 @@ def test_a_proof_holds_all_baselines_on_the_same_seeds_and_names_the_one_that_co
     assert said.startswith("lowers the error by ") and " against the scaled default, by " in said
     assert " against the rule of thumb and raises the error by " in said and said.endswith("noise estimation")
     assert f"its Q times {comparison.default.factor:.4g}" in scaling_sentence(comparison)
-
-
-def test_what_knows_of_no_scaled_default_says_nothing_of_it():
-    found = evaluate(rule_of_thumb("ekf", MISMATCH).filter(MISMATCH), MISMATCH.data([1, 2]), MISMATCH.scale)
-    comparison = Comparison(found, found, found, np.ones(2), range(2))
-    assert scaling_sentence(comparison) == "" and list(comparison.ratios) == [RULE, ORACLE]
-
-
-def test_three_baselines_stand_with_commas_and_a_verb_is_said_once():
-    found = evaluate(rule_of_thumb("ekf", MISMATCH).filter(MISMATCH), MISMATCH.data([1, 2]), MISMATCH.scale)
-    comparison = Comparison(found, found, found, np.ones(2), range(2))
-    given, default, rule = Interval(1.0, 0.9, 1.1), Interval(0.74, 0.7386, 0.7414), Interval(0.5, 0.5, 0.5)
-    ratios = {RULE: rule, SCALED: default, GIVEN: given}
-    assert tuning_effect(comparison._replace(stored_ratios=ratios)) == (
-        "makes no significant difference on 2 seeds against the given filter, lowers the score by 26.0 % "
-        "[25.9, 26.1] against the scaled default and by 50 % against the rule of thumb"
-    )
-    said = tuning_effect(comparison._replace(stored_ratios=dict.fromkeys(ratios, Interval(0.8, 0.7, 0.9))))
-    many = "by 20 % [10, 30] against the"
-    assert said == f"lowers the score {many} given filter, {many} scaled default and {many} rule of thumb"
-    blind = comparison._replace(tuned=found._replace(mean_squares=np.full((2, 2), np.nan)))
-    gains = {GIVEN: Interval(1.0, 0.5, 1.5), SCALED: Interval(0.0, 0.0, 0.0), RULE: Interval(-2.0, -3.0, -1.0)}
-    assert tuning_effect(blind._replace(stored_gains=gains)) == (
-        "changes the log-likelihood of a run by +1.00 [+0.50, +1.50] against the given filter, by +0.00 against "
-        "the scaled default and by -2.00 [-3.00, -1.00] against the rule of thumb"
-    )
 
 
 def test_a_filter_of_a_comparison_may_know_the_scaled_default():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from thruster_env.core.files import BLUE, MOST_POINTS, RUST, panels, thinned
-from tuning.reporting.page import Code, Pair, Picture, Section, Table, figure_svg, html_page, on_dark, plain
+from tuning.reporting.page import Pair, Section, Table, figure_svg, html_page
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +49,6 @@ def test_values_are_read_off_where_they_are_drawn(drawn):
     np.testing.assert_allclose(values, 2.0 * times - 3.0, atol=0.05)
 
 
-def test_labels_without_mathematics():
-    assert plain("speed $\\omega_m$\n[rad/s]") == "speed ω_m [rad/s]" and plain("$U_{a}$") == "U_a"
-
-
-def test_dark_paper_takes_light_colours():
-    assert on_dark("#ffffff") == "#15191d" and on_dark("#222222") > "#c00000" and on_dark("#56b4e9") == "#56b4e9"
-
-
 def test_a_thinned_line_keeps_its_extremes_and_its_ends():
     x = np.arange(20_000.0)
     y = np.sin(x / 700)
@@ -76,21 +68,3 @@ def test_a_pair_shows_what_is_the_same_once():
     parts = [Pair(["A", "B"], [table, table]), Pair(["A", "B"], [table, other]), Pair(["A", "B"], [table, None])]
     text = html_page("t", ["one", "two"], [Section("s", parts)], two_columns=True)
     assert text.count('class="whose"') == 4 and text.count("<table") == 4 and text.count('class="advice"') == 2
-
-
-def test_the_script_comes_with_what_needs_it():
-    pictures = Picture('<svg viewBox="0 0 9 9"></svg>', "c", "a"), Code("t", "x = 1 < 2")
-    alone, lines = (html_page("t", "a", [Section("s", [one])]) for one in pictures)
-    assert "<script>" not in alone and "<script>" in lines and "x = 1 &lt; 2" in lines
-
-
-def test_what_is_folded_stands_on_paper_and_what_scrolls_has_a_cue():
-    page = html_page("t", "a", [Section("s", [Code("MATLAB", "function x", folded=True)])])
-    assert "<details>" in page
-    paper = page[page.index("@media print") : page.index("</style>")]
-    assert re.search(r"details > :not\(summary\) \{ display: block !important", paper)
-    assert re.search(r"details::details-content \{[^}]*content-visibility: visible !important", paper)
-    assert "beforeprint" in page[page.index("<script>") :]
-    screen = page[: page.index("@media print")]
-    assert re.search(r"\.scroll, \.picture, \.code pre \{ background: linear-gradient.*no-repeat local", screen)
-    assert 'content: "Scroll the picture sideways. "' in screen[screen.index("max-width: 40rem") :]

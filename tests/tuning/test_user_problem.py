@@ -2,7 +2,6 @@
 # ruff: noqa: F811 - fixtures come by import and go by name
 
 import copy
-import json
 import re
 import shutil
 import sys
@@ -34,17 +33,6 @@ from tuning.search.space import choice_of, parameters
 from tuning.search.study import open_study, run_study
 from tuning.thruster.scenario import find_scenario
 
-NAME = "my_pendulum:of_one_number"
-
-
-@pytest.fixture
-def mine(thruster, tmp_path, monkeypatch):
-    """The user's file in the working folder, which no other test has imported."""
-    sys.modules.pop("my_pendulum", None)
-    shutil.copy(pendulum_problem.__file__, tmp_path / "my_pendulum.py")
-    yield thruster
-    sys.modules.pop("my_pendulum", None)
-
 
 @pytest.fixture(scope="module")
 def tuned(tmp_path_factory):
@@ -55,35 +43,6 @@ def tuned(tmp_path_factory):
     path = tmp_path_factory.mktemp("pendulum") / "ekf.json"
     write_tuned(path, plan, result, [evaluate_held_out(result.choice, problem, 0, 4)], "s")
     return path, result, problem
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_by_the_command_line_a_module_of_one_s_own_is_tuned_evaluated_verified_and_wrapped(mine):
-    done = mine(
-        "tune", "--problem", NAME, "--filter", "ekf", "--trials", 3, "--method", "gradient", "--out", "t.json"
-    )
-    assert done.returncode == 0 and "sigma [rad/s]" in done.stdout and "theta" in done.stdout, done.stderr
-    for command in (("verify", "t.json"), ("report", "t.json"), ("evaluate", "--tuned", "t.json", "--seeds", 2)):
-        del sys.modules["my_pendulum"]
-        refused = mine(*command)
-        assert refused.returncode == 2 and "my_pendulum" not in sys.modules
-        assert (
-            "a problem that is code must be given, but t.json only names 'my_pendulum:of_one_number'"
-            in refused.stderr
-        )
-        done = mine(*command, "--problem", NAME)
-        assert done.returncode == 0, done.stderr
-    from my_pendulum import model
-
-    env = EstimateState(gym.make("Pendulum-v1"), tuned="t.json", model=model())
-    sigma = json.loads(Path("t.json").read_text())["filter"]["model"]["sigma"]
-    np.testing.assert_allclose(env.filter.model.process_noise_cov[1, 1], sigma**2, rtol=1e-12)
-    env.reset(seed=1)
-    for _ in range(10):
-        info = env.step(np.array([1.0], dtype=np.float32))[-1]
-    wrong = np.array(info["estimate"]) - env.unwrapped.state
-    assert abs(np.angle(np.exp(1j * wrong[0]))) < 0.1 and abs(wrong[1]) < 0.5
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ from tuning.search.plan import (
     range_warning,
     range_words,
 )
-from tuning.search.space import Choice, untuned_choice
+from tuning.search.space import untuned_choice
 from tuning.search.study import StudyResult, answered_by, open_study, run_study
 from tuning.search.trials import near
 from tuning.search.validation import (
@@ -210,21 +210,6 @@ def test_trials_are_rescaled_and_validated_with_the_size_that_they_end_with_and_
     assert baseline_size(untuned_choice("kf", problem)) is None
 
 
-def test_the_report_says_with_how_many_members_filters_met_and_which_a_baseline_is_taken_with():
-    def of_size(name, value, size):
-        met = _met(name, value, value - 0.01, value + 0.01)
-        return met._replace(choice=Choice("enkf", {}, {"ensemble_size": size}))
-
-    plan = Plan("enkf", (LinearProblem(),))
-    pair = of_size(GIVEN, 1.0, 200), of_size("trial 3", 1.01, 200)
-    meeting = Validation((7, 8), True, pair, GIVEN, "trial 3", GIVEN, None)
-    first, second = choice_sentences(as_data(meeting), plan)
-    assert first.startswith("The study returns the given filter with N = 200 members: on 2 validation seeds no ")
-    assert second == "Trials and baselines have N = 200 members here."
-    small = meeting._replace(met=(of_size(GIVEN, 1.0, 30), of_size("trial 3", 0.9, 14)), chosen="trial 3")
-    assert choice_sentences(as_data(small), plan)[1] == "Trials have N = 14 members here, baselines 30."
-
-
 def test_the_answer_of_a_gradient_gives_way_to_a_baseline_as_trials_do(monkeypatch):
     problem = LinearProblem(2, 1, steps=30)
     plan, result = Plan("kf", (problem,)), StudyResult(untuned_choice("kf", problem), 1.0, [], [], 0.0, False)
@@ -240,17 +225,6 @@ def test_the_answer_of_a_gradient_gives_way_to_a_baseline_as_trials_do(monkeypat
     found = answered_by(result, plan, "optimum of the likelihood", oracle("kf", problem))
     assert found.choice == oracle("kf", problem) and found.validation.chosen == "optimum of the likelihood"
     assert [one.name for one in found.validation.met] == [GIVEN, "optimum of the likelihood"]  # none is rescaled
-
-
-def test_what_the_log_score_chose_is_said_with_the_nees_of_both():
-    plan, trial = Plan("kf", (LinearProblem(),)), _met("trial 3", 0.96, 0.95, 0.97, True, -1e5)
-    trial = trial._replace(nees=54845.0, state_nees=2.5)
-    given = _met(GIVEN, 1.0, 1.0, 1.0)._replace(nees=2.35, state_nees=3.5)
-    met = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", GIVEN, None, by_error="trial 3")
-    (said,) = choice_sentences(json.loads(json.dumps(as_data(met))), plan)
-    assert met.gave_way and said.startswith("The study returns the given filter for its log score")
-    assert "1.042 times the score" in said and "that of trial 3 is 54845 times" in said
-    assert "NEES is 2.35 times its expected value (3.5 times in the farthest state)" in said
 
 
 def test_a_paired_ratio_has_the_interval_of_the_jackknife_and_covers_as_it_says():
@@ -280,25 +254,6 @@ def test_no_trial_no_meeting_and_none_for_objectives_that_runs_have_not_each():
     plan = Plan("kf", (LinearProblem(),), objectives=("nis",))
     result = run_study(open_study("nis", plan), plan, 2)
     assert result.validation is None and validate(plan, {}, plan.training_data()) is None
-
-
-def test_the_first_line_says_what_gave_way_and_what_consistency_would_cost():
-    plan = Plan("kf", (LinearProblem(),))
-    trial = _met("trial 3", 1.01, 0.99, 1.02)
-    meeting = Validation((7, 8), True, (_met(GIVEN, 1.0, 1.0, 1.0), trial), GIVEN, "trial 3", GIVEN, None)
-    (said,) = choice_sentences(as_data(meeting), plan)
-    assert said.startswith(
-        "The study returns the given filter: on 2 validation seeds no trial is significantly better (trial 3's "
-        "score is 1.010 [0.990, 1.020] times as large)."
-    )
-    paid = meeting._replace(met=(*meeting.met, _met("trial 4", 0.4, 0.3, 0.5, False, 5.0)), candidate="trial 4")
-    said = choice_sentences(as_data(paid._replace(chosen="trial 4", price=1.742)), plan)
-    assert (
-        "The study returns trial 4: on 2 validation seeds its score is 0.400 [0.300, 0.500] times that of"
-        in said[0]
-    )
-    assert "would cost 174 % of the score" in said[1] and "where 2 is right" in said[1]
-    assert choice_sentences(None, plan) == []
 
 
 def test_a_choice_outside_the_nis_band_is_in_the_headline_whatever_chose_it():

@@ -23,11 +23,10 @@ from thruster_env.thruster.linear import PUBLISHED_NOISE, make_linear_plant
 from thruster_env.thruster.model import observe_jacobian
 from thruster_env.thruster.parameters import INPUTS, ThrusterParameters
 from thruster_env.thruster.plant import Plant, make_plant, make_task, thrust_scale
-from thruster_env.thruster.rendering import ChartEntry, Renderer
+from thruster_env.thruster.rendering import ChartEntry, Overlay, Renderer
 
 if TYPE_CHECKING:
     from thruster_env.model.state_space import StateSpaceModel
-    from thruster_env.thruster.rendering import Overlay
 
 
 def overlay_of(label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:

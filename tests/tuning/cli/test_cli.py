@@ -13,9 +13,7 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
-from tests.slow import slow_but
-from thruster_env.core.text_tables import console
-from thruster_env.thruster.parameters import PRESETS, TUNNEL, derive_constants
+from thruster_env.thruster.parameters import TUNNEL, derive_constants
 from tuning.cli.main import main
 
 
@@ -151,41 +149,6 @@ def test_inspect_shows_the_published_model_beside_ours(thruster, as_json, tmp_pa
     assert len(data["step"]["V_s"]["T [N]"]) == len(data["step"]["time [s]"])
     assert as_json("inspect", "--preset", "t200")["published"] is None
     assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.slow
-def test_inspect_draws(thruster, as_json, tmp_path):
-    done = thruster("inspect", "--voltage", 12, "--out", "new/tunnel.png")
-    assert done.returncode == 0 and "new/tunnel.png" in done.stdout
-    assert (tmp_path / "new" / "tunnel.png").read_bytes().startswith(b"\x89PNG")
-    assert as_json("inspect", "--out", "again.png")["picture"] == "again.png"
-    assert as_json("inspect", "--voltage", 0)["picture"] is None
-
-
-@pytest.mark.parametrize("preset", slow_but(PRESETS, ["tunnel", "t200"]))
-@pytest.mark.parametrize(("width", "voltages"), [(80, (-12, 0)), (115, (13,))])
-def test_inspect_fits_the_terminal(thruster, preset, width, voltages, monkeypatch):
-    monkeypatch.setattr(console, "width", width)
-    for voltage in voltages:
-        done = thruster("inspect", "--preset", preset, "--voltage", voltage)
-        assert done.returncode == 0 and "…" not in done.stdout
-        lines = done.stdout.splitlines()
-        assert max(map(len, lines)) <= width
-        assert any(line.split()[:4] == ["A", "=", "d", "rates/d(omega_m,"] and "U_a)" in line for line in lines)
-
-
-@pytest.mark.parametrize("command", ["inspect", "simulate"])
-def test_help_lists_every_preset(command, thruster):
-    words = thruster(command, "--help").stdout.replace("│", " ").split()
-    assert set(PRESETS) <= {word.strip(",.") for word in words}
-
-
-@pytest.mark.parametrize(
-    "command", ["", "inspect", "simulate", "tune", "evaluate", "verify", "report", "reproduce", "demo"]
-)
-def test_help_teaches(command, thruster):
-    done = thruster(*filter(None, [command, "--help"]))
-    assert done.returncode == 0 and "Usage" in done.stdout
 
 
 BAD = [

@@ -9,10 +9,7 @@ from tests.thruster_env.logs.recorders.files import h5py, write_bag, write_ulog
 from tests.thruster_env.logs.recorders.test_formats import bag_topics
 from tests.tuned_files import write_untuned
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from thruster_env.core.text_tables import plain_text
-from thruster_env.logs.recorders.registry import fields
 from thruster_env.logs.table import read_table
-from tuning.cli.log import as_table, sparkline
 
 COLUMNS = ("--column", "V_s=actuator_outputs.output[2]", "--column", "thrust=load_cell#1.force")
 
@@ -112,29 +109,3 @@ def test_a_recorders_file_is_read_as_a_log_where_columns_are_told(thruster, as_j
     write_bag(tmp_path / "bag", bag_topics(), "mcap")
     said = thruster("log", "bag", "--only", "vel").stdout
     assert said.startswith("bag: bag of ROS 2, 6 fields") and "/vel.twist.linear.x" in said
-
-
-def test_on_a_terminal_fields_stand_under_their_topics(tmp_path):
-    ticks = 10_000 * np.arange(100)
-    rows = {"timestamp": ticks, "output[0]": ticks / 1e6, "output[1]": 5.0}
-    write_ulog(tmp_path / "a.ulg", [("act", k, "double[2] output;", rows) for k in (0, 1)])
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["t"], file["u"] = np.arange(9.0), np.arange(9.0)
-    lines = plain_text([as_table(tmp_path / "a.ulg", fields(tmp_path / "a.ulg"), True)], 99).splitlines()
-    words = [line.split() for line in lines]
-    course = "▁▂▃▄▅▆▇█"
-    ours = [
-        ["act", "100", "100", "0.01", "0", "0.99"],
-        [".output[0]", "0", "0.99", course],
-        [".output[1]", "5", "5"],
-    ]
-    place = words.index(ours[0])
-    assert words[place : place + 3] == ours and words[place + 3] == ["act#1", *ours[0][1:]]
-    alone = plain_text([as_table(tmp_path / "a.h5", fields(tmp_path / "a.h5"), True)], 99)
-    assert ["u", "9", "1", "1", "0", "8", "0", "8", "▁▂▃▄▅▆▇█"] in [line.split() for line in alone.splitlines()]
-
-
-def test_a_sparkline_goes_from_the_least_to_the_greatest():
-    assert sparkline([0.0, 7.0, 3.4, float("nan"), -7.0]) == "▅█▆ ▁"
-    assert sparkline([2.0, 2.0]) == "" and sparkline([]) == ""
-    assert sparkline([-1.7e308, 1.7e308, 0.0]) == "▁█▅"

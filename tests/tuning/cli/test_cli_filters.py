@@ -7,7 +7,7 @@ import pytest
 
 from filters.registry import FILTERS, filter_type
 from thruster_env.core.text_tables import console
-from tuning.cli.filters import entry, first_sentence, fitted
+from tuning.cli.filters import entry
 from tuning.cli.main import main
 
 
@@ -51,48 +51,6 @@ def test_one_filter_is_shown_in_full(thruster, monkeypatch, name, width):
     assert set(told) <= set(words)
     for number in entry(name).numbers:
         assert {number.name, str(number.default), *number.meaning.split()} <= set(words)
-
-
-@pytest.mark.parametrize("name", FILTERS)
-def test_what_is_said_of_a_filter_comes_from_its_class(name):
-    kind, told = filter_type(name).filter_class, entry(name)
-    assert told.covariance is kind.has_covariance
-    assert told.ensemble is ("ensemble_size" in filter_type(name).numbers)
-    assert 10 < len(told.about) < 120 and told.about.endswith(".")
-    assert tuple(number.name for number in told.numbers) == filter_type(name).numbers
-    for number in told.numbers:
-        assert number.default == getattr(kind, number.name) and len(number.meaning) > 5
-
-
-def test_the_list_goes_to_json(thruster):
-    code, out, _ = thruster("filters", "--json", "-")
-    told = {one["name"]: one for one in json.loads(out)["filters"]}
-    assert code == 0 and list(told) == list(FILTERS)
-    size, *others = told["enkf"]["numbers"]
-    assert size["name"] == "ensemble_size" and size["default"] == 100 and len(others) == 7
-    assert told["low-pass"]["covariance"] is False and told["low-pass"]["ensemble"] is False
-
-
-def test_an_unknown_filter_is_one_line(thruster):
-    code, _, err = thruster("filters", "none")
-    assert code == 2 and "filter must be one of kf, " in err and err.count("\n") == 1
-
-
-@pytest.mark.parametrize("command", ["tune", "evaluate"])
-def test_help_says_where_filters_are_listed(thruster, command):
-    code, out, _ = thruster(command, "--help")
-    assert code == 0 and "thruster filters" in " ".join(out.replace("│", " ").split())
-
-
-def test_a_sentence_ends_with_a_full_stop_and_a_space():
-    assert first_sentence("One of 0.5 to\n    1.0, see `a.b`. Two.") == "One of 0.5 to 1.0, see `a.b`."
-    assert first_sentence("no stop") == "no stop"
-
-
-def test_equations_break_where_they_part_and_sentences_fill_the_width():
-    text = "One two three\nfour.\n\n    update:  a = b,  c = d,  e\n             g = h\n\nAttributes:\n    x: y"
-    lines = "One two three four.", "", "    update:  a = b,", "             c = d,  e", "             g = h"
-    assert fitted(text, 23) == "\n".join(lines)
 
 
 @pytest.mark.slow

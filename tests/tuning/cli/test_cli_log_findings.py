@@ -87,23 +87,6 @@ def test_an_estimate_does_not_praise_a_stuck_sensor(folder, thruster, as_json): 
     assert "is stuck at" in mine._repr_html_()
 
 
-@pytest.mark.slow
-def test_identify_names_the_gate_and_cuts_at_gaps(folder, thruster, as_json):  # noqa: F811
-    options = ("--free", "gain", "--hold-noise", "--starts", 1, "--use-all", *MODEL)
-    wild = as_json("identify", "wild.csv", *options)
-    assert "--gate 5" in wild["sentences"][-1] and "has 3 isolated outliers" in " ".join(wild["sentences"])
-    gated = as_json("identify", "wild.csv", *options, "--gate", 5)
-    assert "--gate" not in " ".join(gated["sentences"]) and gated["samples_left_out"] == 3
-    cut = as_json("identify", "gap.csv", *options)
-    assert cut["logs"] == ["gap.csv, rows 0 to 299", "gap.csv, rows 340 to 699"]
-    assert "Runs are cut at gaps" in cut["sentences"][-1]
-    held = as_json("identify", "gap.csv", *options, "--hold-gaps")
-    assert held["logs"] == ["gap.csv"]
-    assert abs(cut["values"]["gain"] - 0.5) < 4 * cut["standard_errors"]["gain"]
-    mine = tuning.identify(("own:model", str(folder / "gap.csv")), "gain", noise=False, starts=1, use_all=True)
-    assert any("a gap: 40 rows" in said for said in mine.sentences())
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_a_study_of_logs_and_its_page_say_what_was_found(folder, thruster):  # noqa: F811
     logs = ("--log", "gap.csv", "--log", "stuck.csv", *MODEL)
@@ -163,13 +146,6 @@ def test_recorders_of_two_rates_are_told_the_option(folder, thruster):  # noqa: 
         assert done.returncode == 2 and "put them on one grid with --dt 0.1, in Python dt=0.1" in done.stderr
     both = log_problem([table(), slow], model="own:model", dt=0.1)
     assert both.dt == 0.1 and len(both.logs) == 2
-
-
-def test_a_command_without_its_command_says_so(thruster):  # noqa: F811
-    done = thruster("reproduce")
-    assert done.returncode == 2 and done.stderr.startswith(
-        "thruster: a command must follow thruster reproduce, but "
-    )
 
 
 def test_estimate_tells_of_alarms(folder, thruster, as_json):  # noqa: F811

@@ -1,42 +1,14 @@
 """Logs at the command line: estimate, tune --log, and what follows; one line for what is wrong."""
 
-import json
-import shlex
-import subprocess
-import sys
-
-import gymnasium as gym
 import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the env
-from filters import EstimateState, thruster_model
+from filters import thruster_model
 from filters.logs.estimate import estimate
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.logs.read import read_log
 from thruster_env.thruster.parameters import PRESETS, PresetFile, write_preset
-
-TWO_STATES = """
-from thruster_env.model.affine import affine_model
-
-def model(dt):
-    return affine_model(
-        a=[[1.0, dt], [-dt, 1.0 - dt]],
-        b=[[0.0], [dt]],
-        c=[[1.0, 0.0]],
-        process_noise_cov=[1e-5, 1e-3],
-        measurement_noise_cov=[1e-2],
-        prior_mean=[0.0, 0.0],
-        prior_cov=[1.0, 1.0],
-        states=[("angle", "phi", "rad"), ("rate", "omega", "rad/s")],
-        input_quantities=[("torque", "tau", "N*m")],
-        measurements=[("encoder", "enc", "rad")],
-    )
-"""
-
-
-def objectives_of(path):
-    return json.loads(path.read_text())["study"]["objectives"]
 
 
 @pytest.fixture
@@ -86,14 +58,6 @@ def test_a_simulated_log_goes_through_estimate(simulated, as_json, thruster, tmp
     assert as_json("estimate", "again.npz")["log_likelihood"] == pytest.approx(data["log_likelihood"], rel=1e-6)
 
 
-def test_estimating_imports_no_optimiser_and_draws_nothing_that_is_not_asked_for():
-    heavy = ["optuna", "matplotlib", "pint", "pyarrow"]
-    modules = "tuning.cli.app, tuning.cli.verbs, tuning.api.estimate"
-    code = f"import sys, {modules}; print([n for n in {heavy} if n in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 def test_what_is_simulated_has_the_sensors_that_are_asked_for(thruster, as_json):  # noqa: F811
     options = "--steps", 100, "--sensor", "thrust", "--sensor", "speed"
     data = as_json("simulate", "--out", "run.csv", *options)
@@ -128,64 +92,6 @@ def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_jso
     columns = "--column", "speed=omega_m_rad_per_s", "--column", "thrust=thrust_N"
     data = as_json("estimate", "run.csv", "--sensor", "speed", *columns)
     assert list(data["one_step_ahead"]) == ["speed"] and "T" in data["references"]
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_a_filter_tuned_on_logs_is_verified_reported_and_used(simulated, as_json, thruster, tmp_path):  # noqa: F811
-    simulated("a.csv", "b.csv", "c.csv")
-    for name in "abc":
-        rows = [line.split(",") for line in (tmp_path / f"{name}.csv").read_text().splitlines()]
-        (tmp_path / f"{name}.csv").write_text(
-            "\n".join(",".join(row[i] for i in (0, 1, 5)) for row in rows) + "\n"
-        )
-    logs = "--log", "a.csv", "--log", "b.csv"
-    options = "--filter", "ekf", *logs, "--held-out", "c.csv", "--lead", 40, "--trials", 4, "--out", "tuned.json"
-    data = as_json("tune", *options)
-    assert data["file"] == "tuned.json" and objectives_of(tmp_path / "tuned.json") == ["likelihood"]
-    assert as_json("verify", "tuned.json")["holds"]
-    assert "held-out blocks" in thruster("evaluate", "--tuned", "tuned.json").stdout
-    assert "log-likelihood" in as_json("report", "tuned.json")["advice"]
-    told = as_json("estimate", "tuned.json", "c.csv")
-    assert told["filter"] == "ekf"
-    wrapped = EstimateState(gym.make("BowThruster-v0"), tuned=str(tmp_path / "tuned.json"))
-    assert wrapped.filter.name == "ekf"
-    (tmp_path / "c.csv").write_text((tmp_path / "a.csv").read_text())
-    changed = thruster("verify", "tuned.json")
-    assert (
-        changed.returncode == 2 and "must be the one it was tuned on, a.csv and 2 more of digest" in changed.stderr
-    )
-    done = thruster("estimate", "b.csv", "--tuned", "tuned.json", "--dt", "0.02", "--out", "est.csv")
-    assert done.returncode == 2 and "was tuned for dt 0.01 (here 0.02)" in done.stderr
-    assert not (tmp_path / "est.csv").exists()
-
-
-@pytest.mark.slow
-def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  # noqa: F811
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "pendulum_of_a_user.py").write_text(TWO_STATES)
-    draws = np.random.default_rng(0)
-    phi, omega, rows = 0.0, 0.0, ["t_s,torque,encoder_deg"]
-    for k in range(400):
-        tau = np.sign(np.sin(0.05 * k))
-        rows.append(f"{0.05 * k:.4f},{tau},{np.degrees(phi + 0.1 * draws.normal()):.6f}")
-        phi, omega = phi + 0.05 * omega, omega + 0.05 * (tau - phi - omega) + 0.03 * draws.normal()
-    (tmp_path / "run.csv").write_text("\n".join(rows) + "\n")
-    pytest.importorskip("pint")
-    model = "--model", "pendulum_of_a_user:model"
-    data = as_json("tune", "--log", "run.csv", *model, "--filter", "kf", "--trials", 3, "--out", "tuned.json")
-    assert data["file"] == "tuned.json" and objectives_of(tmp_path / "tuned.json") == ["likelihood"]
-    logged = "--log", "run.csv", *model, "--filter", "kf", "--trials", "3", "--out", "a tuned.json"
-    said = [line for line in thruster("tune", *logged).stdout.splitlines() if line.startswith("Next: thruster ")]
-    assert said == ["Next: thruster report 'a tuned.json' --model pendulum_of_a_user:model"]
-    assert thruster(*shlex.split(said[0])[2:]).returncode == 0
-    told = as_json("estimate", "run.csv", *model, "--tuned", "tuned.json", "--smoother")
-    assert told["smoothed"] and told["dt"] == 0.05
-    done = thruster("verify", "tuned.json")
-    assert done.returncode == 2 and done.stderr.rstrip().endswith(
-        "use --model pendulum_of_a_user:model (model='pendulum_of_a_user:model' in Python), if you trust it"
-    )
-    assert as_json("verify", "tuned.json", *model)["holds"]
 
 
 @pytest.mark.parametrize(

@@ -58,12 +58,6 @@ def test_an_ensemble_with_a_monitor_writes_what_estimate_writes(thruster, as_jso
     assert ours[-1, 79] >= 1.0 and not ours[-1, :70].any()
 
 
-def test_floats_say_what_they_cost(thruster, as_json, tmp_path):  # noqa: F811
-    tuned = write_untuned(tmp_path / "tuned.json")
-    assert 1e-8 < as_json("export", tuned, "--out", "boat", "--single")["single_error"] < 1e-3
-    assert "float x[2]" in (tmp_path / "boat" / "ekf.h").read_text()
-
-
 def test_what_cannot_be_exported_is_refused(thruster, tmp_path):  # noqa: F811
     tuned = write_untuned(tmp_path / "tuned.json")
     for arguments, message in [

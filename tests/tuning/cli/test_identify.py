@@ -1,7 +1,6 @@
 """`thruster identify`: tables, files that every preset takes, and one clear line for a mistake."""
 
 import re
-from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -64,14 +63,6 @@ def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_
     assert env.state_space_model().constants.dead_band_high == kept.dead_band[1]
 
 
-@pytest.mark.slow
-def test_a_load_cell_that_will_not_be_there_is_predicted(as_json, logs):  # noqa: F811
-    free = "--free", "motor_damping,voltage_gain,lift_coefficient", "--hold-noise", "--starts", 1
-    found = as_json("identify", *logs, *OF_LOGS, *free, "--predicted", "thrust", "--degrees", 20)
-    checked = {name: found["validation"][name]["one_step"]["thrust"] for name in ("start", "identified")}
-    assert checked["identified"] < 0.9 * checked["start"]
-
-
 WITHOUT_LOG = [
     ((), "Missing argument 'LOG...'"),
 ]
@@ -107,17 +98,6 @@ def test_a_mistake_is_one_line_and_nothing_is_written(thruster, logs, tmp_path, 
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     assert re.search(message, done.stderr), done.stderr
     assert not list(tmp_path.glob("*.toml"))
-
-
-@pytest.mark.slow
-def test_logs_without_excitation_say_what_they_do_not_determine(thruster, tmp_path):  # noqa: F811
-    (log,) = record(0, 1, 100)
-    write_log("flat.csv", replace(log, inputs=np.full_like(log.inputs, 6.0)))
-    done = thruster("identify", "flat.csv", *OF_LOGS, "--free", f"{FREE},Q11")
-    assert done.returncode == 2
-    said = done.stderr.splitlines()[-1]  # before it there may be a line on compilation
-    assert "constant inputs do not determine" in said and "voltage_gain, dead_band_low" in said
-    assert not list(tmp_path.rglob("*.toml"))
 
 
 @pytest.mark.slow
@@ -196,63 +176,6 @@ def test_no_command_writes_over_a_log_or_its_description(thruster, logs, tmp_pat
         assert done.returncode == 2 and message in done.stderr, line
         assert done.stderr.count("thruster:") == 1 and "Traceback" not in done.stderr, line
         assert files() == before, line
-
-
-MOTOR = """
-from typing import NamedTuple
-
-from thruster_env.model.continuous import ContinuousModel
-
-
-class Constants(NamedTuple):
-    substep: float
-    gain: float = 60.0
-    friction: float = 3.0
-
-
-def rates(x, u, c):
-    return (c.gain * u[0] - c.friction * x[0],)
-
-
-def speed(x, c):
-    return (x[0],)
-
-
-motor = ContinuousModel(
-    rates=rates,
-    observe=speed,
-    densities=[4.0],
-    constants=Constants(0.05),
-    arguments={"prior_mean": [0.0], "prior_cov": [1.0], "measurement_noise_cov": [0.01], "inputs": 1,
-               "measurements": ["speed"]},
-)
-"""
-
-
-@pytest.mark.slow
-def test_a_log_on_its_own_stamps(as_json, thruster, tmp_path):  # noqa: F811
-    rng, speed, rows = np.random.default_rng(1), 0.0, []
-    (tmp_path / "plant.py").write_text(MOTOR)
-    stamps, volts = np.cumsum(rng.uniform(0.01, 0.09, size=400)), 0.0
-    for k, length in enumerate(np.diff(stamps, append=stamps[-1] + 0.05)):
-        volts = rng.choice([-1.0, 1.0]) if k % 10 == 0 else volts
-        rows.append(f"{stamps[k]:.6f},{volts:g},{speed + 0.1 * rng.normal():.6f}")
-        decay = np.exp(-2.0 * length)  # exact from stamp to stamp: gain 40, friction 2
-        speed = decay * speed + 20.0 * volts * (1 - decay) + np.sqrt((1 - decay**2) / 4) * rng.normal()
-    (tmp_path / "run.csv").write_text("\n".join(["time_s,u_1,speed", *rows]))
-    given = ("run.csv", "--model", "plant:motor", "--no-grid", "--dt", "0.05")
-    found = as_json("identify", *given, "--free", "gain,friction", "--starts", "1", "--out", "found.toml")
-    for name, truth in {"gain": 40.0, "friction": 2.0, "R": 0.01}.items():
-        assert abs(found["values"][name] - truth) < 4 * found["standard_errors"][name], name
-    again = as_json("estimate", *given, "--preset", "found.toml", "--skip", "0")
-    assert again["grid"] is False
-    assert again["log_likelihood"] == pytest.approx(found["validation"]["identified"]["log_likelihood"], rel=1e-9)
-    tuned = as_json("tune", "--filter", "ekf", "--log", *given, "--trials", "4", "--out", "tuned.json")
-    assert tuned["held_out"] and as_json("verify", "tuned.json", "--model", "plant:motor")
-    on_stamps = as_json("estimate", *given, "--tuned", "tuned.json")
-    assert on_stamps["grid"] is False and np.isfinite(on_stamps["log_likelihood"])
-    done = thruster("identify", *given, "--free", "gain", "--filter", "kf")
-    assert done.returncode == 2 and "must be identified with the ekf, but got filter kf" in done.stderr
 
 
 def test_values_of_a_model_belong_to_a_sample_time(tmp_path):

@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import tuning
 from filters import EstimateState, make_filter, run
 from filters.registry import filter_type
 from filters.sensitivity import likelihood
@@ -20,7 +19,6 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.parameters import TUNNEL_PHYSICAL, read_preset
 from tuning.evaluation.baselines import rule_of_thumb
-from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.find import find_problem
 from tuning.search.parameters import filter_parameters
 
@@ -42,14 +40,6 @@ def new(thruster, monkeypatch, tmp_path):  # noqa: F811
     for name in set(sys.modules) - known:
         if name.startswith("a_new_"):
             del sys.modules[name]
-
-
-@pytest.mark.slow
-def test_a_problem_can_be_tuned(new, as_json):  # noqa: F811
-    name = new("problem", "a_new_problem")
-    found = as_json("tune", "--problem", f"{name}:problem", "--filter", "ekf", "--trials", 2)
-    held_out = found["held_out"][f"{name}:problem"]
-    assert held_out["tuned"]["score"][0] < 2 and found["trials"] == 2
 
 
 def naive_correntropy(model, bandwidth, iterations, inputs, measurements):
@@ -188,13 +178,3 @@ def test_what_cannot_be_new_is_refused(thruster, tmp_path, arguments, line):  # 
     assert done.returncode == 2 and line in done.stderr
     assert {path.name for path in tmp_path.iterdir()} == {"there.py", "none"}
     assert (tmp_path / "there.py").read_text() == "mine\n"
-
-
-@pytest.mark.slow
-def test_gradients_and_methods_tune_a_users_filter(new):
-    name = f"{new('filter', 'a_new_way')}:ANewWay"
-    study = tuning.tune("nominal", name, method="likelihood", progress=False)
-    evaluated = study.held_out
-    assert evaluated is not None and study.choice.numbers["bandwidth"] == 3.0
-    found = tune_by_gradient(name, find_problem("nominal"), find_problem("nominal").data(range(8)))
-    assert found.agree and found.best.converged

@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from thruster_env.render import renderer
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.rendering import ChartEntry, Overlay
 from tuning.cli import play
@@ -43,13 +42,6 @@ def test_voltages_drive_the_thruster(as_json, frames, monkeypatch, option):  # n
     env = seen[0]
     assert env.unwrapped.plant.parameters.gear_ratio == 1.0  # a T200
     assert env.unwrapped.moment_of([0.0] * 40).reference is None
-
-
-def test_a_picture_has_the_size_that_is_asked_for(thruster, as_json, frames):  # noqa: F811
-    as_json("play", "--steps", 4, "--size", "160X90", "--out", "x.mp4")
-    thruster("simulate", "--out", "run.csv", "--steps", 3)
-    as_json("play", "--log", "run.csv", "--size", "99x81", "--out", "x.gif")
-    assert [pictures[0].shape for _, pictures, _ in frames] == [(90, 160, 3), (81, 99, 3)]
 
 
 def spy(function, seen):
@@ -111,12 +103,6 @@ def test_where_a_log_has_no_truth_the_estimate_moves_the_propeller(thruster, tmp
 def test_a_mistake_is_one_line(thruster, tmp_path, arguments, line):  # noqa: F811
     done = thruster("play", *arguments)
     assert done.returncode == 2 and line in done.stderr and not list(tmp_path.glob("*.gif"))
-
-
-def test_a_video_that_cannot_be_drawn_is_said(monkeypatch):
-    monkeypatch.setattr(renderer.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match="drawing needs pygame, which is not installed"):
-        renderer.check_drawing(None)
 
 
 def test_torch_is_not_imported():

@@ -1,16 +1,11 @@
 """How the command line presents itself: version, panels, names, tables at any width, colour, progress."""
 
-import importlib.metadata
 import io
 import os
-import re
 import signal
-import sys
 from types import SimpleNamespace
 
-import optuna
 import pytest
-from optuna.trial import create_trial
 from rich.console import Console
 
 from docs.scripts import DOCS, PAGES, made_by
@@ -19,42 +14,17 @@ from filters.registry import FILTERS
 from tests.linear_problem import LinearProblem
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.checks import any_case, listening, meant, one_of
-from thruster_env.core.text_tables import Table, plain_text
-from tuning.api.progress import trial_bar
+from thruster_env.core.text_tables import Table
 from tuning.api.tune import file_name
 from tuning.cli import output
-from tuning.cli.app import COMMANDS, PANELS, listed
+from tuning.cli.app import COMMANDS
 from tuning.evaluation.baselines import ORACLE, RULE, rule_of_thumb
 from tuning.experiments import EXPERIMENTS
-from tuning.problems.find import find_problem
-from tuning.reporting.search_figures import draw_history
 from tuning.reporting.tuning_report import way_out
 from tuning.search.plan import Plan
 from tuning.search.study import STOPPING, stop_on_interrupt
 
 WITHOUT_JSON = ("explore",)  # what it finds is exported from its page
-
-
-def test_the_version_is_that_of_the_package(thruster):  # noqa: F811
-    assert thruster("--version").stdout == f"thruster-env {importlib.metadata.version('thruster-env')}\n"
-
-
-def test_commands_are_listed_in_panels_without_being_imported(thruster, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(importlib, "import_module", lambda name: pytest.fail(f"{name} was imported"))
-    said = thruster("--help").stdout
-    places = [said.index(f" {panel} ") for panel in PANELS]
-    assert places == sorted(places)
-    for name in COMMANDS:
-        assert f"\n│ {name} " in said and listed(name).help[0].isupper()
-
-
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("demo", "reproduce")])
-def test_every_option_is_in_a_panel(thruster, name):  # noqa: F811
-    said = thruster(name, "--help").stdout
-    rest = said[said.index("─ Options ─") :]
-    options = rest[: rest.index("╰")]
-    assert options.count("--") == 1 and "--help" in options
-    assert name in WITHOUT_JSON or "--json" in said[said.index("─ Output ─") :]
 
 
 def test_what_is_random_has_a_seed_and_all_write_json(thruster):  # noqa: F811
@@ -64,13 +34,6 @@ def test_what_is_random_has_a_seed_and_all_write_json(thruster):  # noqa: F811
     assert without == rest
     for name in (*(commands - {*WITHOUT_JSON}), *(f"reproduce {experiment}" for experiment in EXPERIMENTS)):
         assert "--json " in thruster(*name.split(), "--help").stdout
-
-
-def test_experiments_are_not_in_the_wheel_and_the_command_says_where_they_are(thruster, monkeypatch):  # noqa: F811
-    monkeypatch.setattr("tuning.cli.reproduce.find_spec", lambda name: None)
-    done = thruster("reproduce", "lorenz63")
-    assert done.returncode == 2
-    assert done.stderr.startswith("thruster: experiments must be run in a checkout of the project, but ")
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -117,23 +80,6 @@ def test_names_in_python_are_told_apart_by_case():
     assert any_case("EKF", ["kf", "ekf"]) == "ekf" and any_case("module:EKF", ["ekf"]) == "module:EKF"
 
 
-def test_a_long_list_is_cut_where_a_name_comes_near():
-    many = [f"name{place}" for place in range(9)]
-    told = (
-        "filter must be one of name0, name1, name2, name3 and 5 more (thruster filters lists all), but got 'nam8'"
-    )
-    with pytest.raises(ValueError, match=f"^{re.escape(told)}; did you mean 'name8'"):
-        one_of("filter", "nam8", many, "thruster filters")
-    # It is whole where no name is near, no command lists all, or it is short.
-    for value, choices, command in (
-        ("xyz", many, "thruster"),
-        ("nam8", many, None),
-        ("nam7", many[:8], "thruster"),
-    ):
-        with pytest.raises(ValueError, match=f"one of {', '.join(choices)}, but got '{value}'"):
-            one_of("filter", value, choices, command)
-
-
 ROWS = [["rule of thumb", "5.887 ±0.069", "0.1229 ±0.0018", "7.0", "0.21"]] * 2
 HEADS = ["filter", "omega_m\n[rad/s]", "U_a\n[m/s]", "NEES", "NIS"]
 
@@ -158,26 +104,11 @@ def test_a_table_has_the_same_columns_at_any_width(monkeypatch, width):
         assert word in said
 
 
-def test_a_winner_stands_out_on_terminals_only():
-    made = Table("", HEADS, ROWS, best=[1])
-    assert drawn(made, 80, terminal=True).count("\x1b[1;32m") > 3
-    assert "\x1b" not in drawn(made, 80)
-    assert "\x1b[1;32m" not in drawn(made, 80, terminal=True, NO_COLOR="1")
-
-
 def test_the_first_ctrl_c_is_acknowledged_at_once():
     told = []
     with listening(told.append), stop_on_interrupt() as stopped:
         os.kill(os.getpid(), signal.SIGINT)
         assert stopped() and told == [STOPPING]
-
-
-def test_a_word_stands_there_while_a_command_is_imported(monkeypatch, capsys):
-    from tuning.cli.app import LOADING, imported
-
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    assert imported("tuning.cli.methods").__name__ == "tuning.cli.methods"
-    assert capsys.readouterr().err.startswith(LOADING)
 
 
 def test_a_refused_study_leaves_no_journal(thruster, tmp_path):  # noqa: F811
@@ -241,33 +172,3 @@ def test_a_tuning_that_made_it_worse_says_what_to_do_next():
     assert said.startswith("What to take: the rule of thumb (Q11 = ")
     comparison.ratios["scaled default"] = Interval(0.9, 0.8, 0.95)
     assert way_out(tuning) == way_out(by_method) == []
-
-
-def test_a_study_that_is_done_shows_its_best_and_no_time_left():
-    stream = io.StringIO()
-    plan = Plan("ekf", (find_problem("nominal"),))
-    with trial_bar(plan, "nominal", 3, [create_trial(value=1.5)] * 3, Console(file=stream, width=90)):
-        pass
-    assert "3/3 best 1.5 0:00:00" in stream.getvalue()
-    plan = plan._replace(objectives=("likelihood",))  # whose trials have the negative one
-    with trial_bar(plan, "nominal", 3, [create_trial(value=1.5)] * 3, Console(file=stream, width=90)):
-        pass
-    assert "3/3 best log L -1.5 0:00:00" in stream.getvalue()
-
-
-def test_trials_have_whole_numbers_in_pictures():
-    study = optuna.create_study()
-    for value in (3.0, 2.0, 2.5):
-        study.add_trial(create_trial(value=value))
-    figure = draw_history(study.trials, "a study", "score [-]")
-    assert all(float(tick).is_integer() for tick in figure.axes[0].get_xticks())
-
-
-def test_a_table_whose_words_fit_is_never_wider_than_the_terminal(monkeypatch):
-    words = "a covariance of innovations " * 3
-    rows = [["expectation-maximisation", words, words, "true states, a gradient"]]
-    monkeypatch.setattr("thruster_env.core.text_tables.console", Console(width=80))
-    lines = plain_text([Table("", ["method", "what it does", "use it", "needs"], rows)], 80).splitlines()
-    assert max(map(len, lines)) <= 80 and all(
-        word in " ".join(lines).split() for word in "gradient states,".split()
-    )

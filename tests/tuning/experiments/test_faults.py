@@ -1,14 +1,12 @@
 """Delays of alarms, in the quick form of the study."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from filters.monitoring.monitor import cusum_threshold
-from thruster_env.core.text_tables import with_tables
-from tuning.experiments.faults import BIASES, LOST_BLADES, PLANTS, best_delay, delays, markdown
+from tuning.experiments.faults import BIASES, LOST_BLADES, PLANTS, best_delay, delays
 
 
 def test_larger_faults_of_the_thruster_are_found_sooner_and_none_without_one():
@@ -28,9 +26,3 @@ def test_the_best_delay_is_that_of_simulated_cusums():
             g, steps = max(0.0, g + shift + rng.standard_normal() - 0.5 * shift), steps + 1
         total += steps
     assert best_delay(shift, 1000.0) == pytest.approx(total / 4000, rel=0.04)
-
-
-@pytest.mark.slow
-def test_the_page_holds_the_table():
-    page = Path("docs/monitoring.md").read_text(encoding="utf-8")
-    assert with_tables(page, {"delays": markdown}) == page

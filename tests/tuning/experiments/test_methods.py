@@ -2,7 +2,6 @@
 
 import json
 import math
-import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -13,13 +12,9 @@ from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.experiments.methods import runs
 from tuning.experiments.methods.problems import (
     CASES,
-    ENTRIES,
     FAST,
-    GROUPS,
-    PREDICTIONS,
     QUICK,
     REFERENCE,
-    Protocol,
     ring,
 )
 from tuning.experiments.methods.runs import (
@@ -107,23 +102,6 @@ def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     assert name.is_file() and file_of(tmp_path, WALK, "likelihood", 1, few._replace(runs=999)) != name
     made = tables(again, few)
     assert "noise-estimation" in made["what to use"]() and "`walk`" in made["groups A to D"]()
-
-
-def test_results_that_say_way_are_read(tmp_path):
-    few = FAST._replace(cases=(WALK,), methods=("random-only",), sets=1)
-    file = file_of(tmp_path, WALK, "random-only", 0, few)
-    assert file.name.startswith("random-0-")
-    file.parent.mkdir()
-    content = result("random", 0, 1.0)._asdict()
-    file.write_text(json.dumps({"way": content.pop("method"), **content}))
-    assert runs.read(tmp_path, few) == [result("random-only", 0, 1.0)]
-
-
-def test_the_protocol_names_all_groups_and_was_predicted():
-    assert {case.group for case in CASES} == set(GROUPS)
-    assert len({case.name for case in CASES}) == len(CASES) and Protocol().methods == ENTRIES
-    assert pickle.loads(pickle.dumps(CASES)) is not None  # --jobs sends them to processes
-    assert {"we", "Rawlings et al."} <= {one.who for one in PREDICTIONS}
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ from scipy.linalg import solve_discrete_are
 
 from filters import KalmanFilter, run
 from tests.oracles import kalman_update
-from thruster_env.core.text_tables import console
 from thruster_env.model.simulate import simulate
 from thruster_env.thruster.linear import PUBLISHED
 from tuning.cli.main import main
@@ -234,20 +233,6 @@ def test_json_on_standard_output_is_whole(monkeypatch, capsys, tmp_path):
     for study in data["studies"].values():
         assert len(study["rows"]) == 16 and study["source"] and study["statements"]
         assert all(row["why"] and len(row["published"]) == 2 for row in study["rows"])
-
-
-@pytest.mark.parametrize("width", [100, pytest.param(160, marks=pytest.mark.slow)])
-def test_tables_fit_the_terminal(monkeypatch, capsys, tmp_path, width):
-    target = tmp_path / "table.json"
-    monkeypatch.setattr(console, "_width", width)
-    arguments = ["nurhadi2022", "--runs", "4", "--members", "5", "--json", str(target)]
-    assert command_line(monkeypatch, *arguments) == 0
-    out = capsys.readouterr().out
-    assert json.loads(target.read_text())["studies"].keys() == {"nurhadi2022"}
-    assert width - 40 < max(map(len, out.splitlines())) <= width
-    assert "…" not in out
-    for words in ("0.8051", "1.8830", "a copy of the row q = 0.5", "Riccati", "un-updated", "known to us"):
-        assert words in " ".join(out.split())
 
 
 @pytest.mark.parametrize(

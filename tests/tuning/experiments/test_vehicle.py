@@ -31,7 +31,7 @@ from tuning.experiments.vehicle.experiment import (
     true_runs,
 )
 from tuning.experiments.vehicle.papers import DT, NOISE, PRINTED_PATHS, TABLE_III, PrintedRow, papers_model
-from tuning.experiments.vehicle.tables import GOLDEN, MEAN_ONLY, digits, unstable_corners, why_different
+from tuning.experiments.vehicle.tables import GOLDEN, MEAN_ONLY, unstable_corners, why_different
 
 ENDS = {  # (north, east, down) [m], of a prototype with other code
     "I": (-2.415, 3.789, 0.114),
@@ -184,16 +184,6 @@ def test_why_differences_are_told_by_size(as_python):
     huge = why_different(PrintedRow({"x": 1e3, "psi": pose["psi"]}, 1.0), scores, result)
     assert "x unlike any of ours" in huge and "psi similar to" in huge
     assert "no one transformation gives the row" in huge and "transformation gives" not in full + tiny
-
-
-def test_digits_stand_apart_by_thousands():
-    assert [digits(one) for one in (0.78612, 12.34, 8.0, 45421.0, float("nan"))] == [
-        "0.786",
-        "12.3",
-        "8",
-        "45 400",
-        "",
-    ]
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ pytest.importorskip("sb3_contrib")
 
 from tests.learners import COPIES, LIMIT, SMALL, contents, setup_of, short_episodes, trained  # noqa: F401 - some are fixtures
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
-from tuning.cli.train import name_of
 from tuning.policies.algorithms import ALGORITHMS
 from tuning.policies.environments import make_environments
 from tuning.policies.saved import FINAL, load, play, read_configuration, score
@@ -34,13 +33,6 @@ def test_a_film_is_of_the_episode_that_is_scored(suffix, size, trained, tmp_path
         assert tuple(clip.size) == (size or (640, 400))
         frames = [frame.astype(int) for frame in clip.iter_frames()]
     assert len(frames) >= 7 and np.abs(frames[-1] - frames[0]).mean() > 0.5
-
-
-def test_a_window_shows_the_same_episode(trained):
-    pytest.importorskip("pygame")
-    steps = []
-    played = play(trained / FINAL, None, 1, lambda done, count: steps.append((done, count)))
-    assert played.steps == LIMIT and steps[-1] == (LIMIT, LIMIT)
 
 
 def test_the_commands_train_score_and_play(thruster, monkeypatch, tmp_path):
@@ -99,10 +91,3 @@ def test_a_filter_is_trained_beside_as_it_is_told(thruster, monkeypatch, tmp_pat
     line = "filter of the tuned file must be one of ukf, but got 'ekf'"
     assert line in thruster(*options, "other", "--observe", "ukf", "--tuned", "mine.json").stderr
     assert not (tmp_path / "other").exists()
-
-
-def test_folders_are_named_after_what_is_learnt(tmp_path):
-    assert name_of(setup_of("raw+action", seed=2)) == "tracking-medium_noise-raw+action-ppo-seed2"
-    assert name_of(setup_of(), tmp_path / "mine.json") == "tracking-medium_noise-ekf-mine-ppo-seed0"
-    assert name_of(setup_of(), untuned=True) == "tracking-medium_noise-ekf-untuned-ppo-seed0"
-    assert name_of(setup_of(controller="mpc")) == "tracking-medium_noise-ekf-mpc-ppo-seed0"

@@ -174,32 +174,6 @@ def test_what_is_seen_is_kept_as_a_file(page, kind, name, tmp_path):
     assert content.startswith({"tuned": b"{", "python": b"from filters", "png": b"\x89PNG"}[kind])
 
 
-def test_held_configurations_are_listed_and_dropped(page):
-    for _ in range(4):
-        page.click("#hold")
-    page.wait_for_function("document.querySelectorAll('#held li').length === 4")
-    page.click("#hold")
-    page.wait_for_selector("#error:not([hidden])")
-    page.click("#held li:nth-child(2) button")
-    page.wait_for_function("document.querySelectorAll('#held li').length === 3")
-
-
-def test_another_filter_brings_its_own_knobs(page):
-    page.select_option("#filter", "enkf")
-    page.wait_for_function("document.querySelector('#title').innerText.startsWith('enkf')")
-    assert page.locator("#groups").get_by_label("ensemble").first.is_visible()
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_phone_shows_all_of_it_in_its_width(served, chromium, scheme):
-    page = opened(chromium, served.url, viewport=PHONE, color_scheme=scheme)
-    map_drawn(page)
-    assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
-    assert page.evaluate("document.documentElement.classList.contains('dark')") == (scheme == "dark")
-    assert page.locator(R).is_visible() and page.errors == []
-    page.context.close()
-
-
 def test_ten_tabs_go_on_beside_each_other(served, chromium):
     pages = [opened(chromium, served.url, viewport=WIDE) for _ in range(10)]
     was = [seen(page) for page in pages]
