@@ -15,11 +15,10 @@ from filters.engine.compile import (
     START,
     UPDATE,
     batch,
+    batch_memory,
     build_operation,
-    memory_side_by_side,
     new_memory,
     row_length,
-    vectors,
 )
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
@@ -104,32 +103,21 @@ def run(
     if isinstance(filter_, ForeignFilter):
         filter_.fill(keys, inputs, z, tuple(out))
     else:
-        run_all = _run_side_by_side if filter_.kernels().vectors else _run_one_by_one
-        run_all(filter_, (keys, inputs, z), noise, out)
+        _run_compiled(filter_, (keys, inputs, z), noise, out)
     return Estimates(*(part[0] for part in out)) if single else out
 
 
-def _run_one_by_one(filter_: Filter, data: tuple, noise: tuple, out: Estimates) -> None:
+def _run_compiled(filter_: Filter, data: tuple, noise: tuple, out: Estimates) -> None:
     kernels, numbers, size = filter_.kernels(), filter_.numbers, filter_.size
-    run_part = batch(kernels)
+    run_part, count, width = batch(kernels), len(out.means), LANES if kernels.vectors else 1
 
     def part(first: int, last: int) -> None:
-        memory = new_memory(kernels, size)  # serves the part's trajectories one after the other
-        run_part(*memory, size, *data, numbers.copy(), noise, tuple(out), first, last)
+        memory = batch_memory(
+            kernels, size, data[1].shape[2]
+        )  # serves the part's trajectories one after the other
+        run_part(*data, numbers.copy(), noise, tuple(out), memory, first * width, min(last * width, count))
 
-    spread(part, len(out.means))
-
-
-def _run_side_by_side(filter_: Filter, data: tuple, noise: tuple, out: Estimates) -> None:
-    count, numbers, kernels, (_, inputs, measurements) = len(out.means), filter_.numbers, filter_.kernels(), data
-    run_part = vectors(kernels)
-
-    def part(first: int, last: int) -> None:
-        memory = memory_side_by_side(kernels, inputs.shape[2])
-        of_part = inputs, measurements, numbers.copy(), noise, tuple(out), memory
-        run_part(*of_part, first * LANES, min(last * LANES, count))
-
-    spread(part, -(-count // LANES))
+    spread(part, -(-count // width))
 
 
 def trajectories(

@@ -118,7 +118,7 @@ class Kernels(NamedTuple):
 
     `vectors`, if there are any, are four functions (rows, given, numbers) for eight beliefs side by side: the
     parts of `predict` before its substeps, in each substep and after them, and `update`. Batches run these
-    (`engine.compile.build_side_by_side`).
+    (`engine.compile.build_batch`).
     """
 
     n: int

@@ -3,7 +3,8 @@
 The memory of eight beliefs is interleaved: number i of belief j is `rows[group, 8 i + j]`. Each stage of a step
 runs over four such groups, whose instructions the processor overlaps.
 
-`graphs.loops` translates the loops around the stages, and LLVM compiles both together.
+`graphs.loops` translates the loops around the stages, and LLVM compiles those of a batch once for all filters of a
+size of model: they call the stages by their addresses.
 """
 
 from __future__ import annotations
@@ -11,49 +12,109 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache, partial
 from math import inf
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from filters.engine.belief import LARGEST, Kernels, restart_if_lost
+from filters.engine.belief import LARGEST, Kernels, memory_offsets, restart_if_lost
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.streams import GROUP
-from thruster_env.model.shape import LANES, padded
+from thruster_env.model.shape import LANES, number_offsets, padded
 
 if TYPE_CHECKING:
+    from thruster_env.graphs.loops import Entry
     from thruster_env.graphs.machine_code import Code
 
 GROUPS = 4  # which each stage runs one after the other, so that their instructions overlap
 
 
-def build_side_by_side(kernels: Kernels) -> Callable:
-    """Return `run(inputs, measurements, numbers, noise, out, memory, first, last)`.
+class Stages(NamedTuple):
+    """What a batch calls: functions (row, given, numbers) of a group of beliefs, or of one with its ensemble.
 
-    It filters runs first ... last - 1 by `kernels.vectors`. Copies of the last run fill up a group. The memory is
-    that of `memory_side_by_side`; for the other arguments see `batch`.
+    As arguments of machine code they are addresses, so that filters with other memory share the loops around them.
     """
-    n, m, start = kernels.n, kernels.m, kernels.start
-    begin, advance, finish, update = kernels.vectors
-    t, layout, source, width, groups = kernels.t, kernels.layout, kernels.offsets, LANES, GROUPS
-    mean, cov, innovation, s = layout.mean, layout.cov, layout.innovation, layout.innovation_cov
-    divergences, log_likelihood, substeps = layout.divergences, layout.log_likelihood, source.substeps
-    q_offset, r_offset, checked = source.q, source.r, layout.gain
-    length, restart = row_length(kernels), restart_if_lost(kernels)
 
-    def run(inputs, measurements, numbers, noise, out, memory, first, last):
+    start: Any  # given is memory for a belief
+    begin: Any  # what comes before the substeps of a prediction, or all of it
+    advance: Any
+    finish: Any
+    update: Any
+    restart: Any  # given is memory for a belief
+
+
+def _stages(kernels: Kernels) -> Stages:
+    """The functions that a batch calls; those that it does not call are None."""
+    start, restart = kernels.start, restart_if_lost(kernels)
+    if not kernels.vectors:
+        parts = _of_memory(kernels.predict), None, None, _of_memory(kernels.update)
+        return Stages(_without_given(start), *parts, _without_given(restart))
+    length, width = row_length(kernels), LANES
+
+    def start_group(row, belief, numbers):
+        for i in range(length):
+            belief[i] = 0.0
+        start((belief, None, None), numbers, 0)
+        for i in range(length):
+            for j in range(width):
+                row[i * width + j] = belief[i]
+
+    def restart_group(row, belief, numbers):
+        for j in range(width):
+            for i in range(length):
+                belief[i] = row[i * width + j]
+            restart((belief, None, None), numbers, 0)
+            for i in range(length):
+                row[i * width + j] = belief[i]
+
+    return Stages._make([start_group, *kernels.vectors, restart_group])
+
+
+def _of_memory(function: Callable) -> Callable:
+    def stage(row, given, numbers, table, draws, size):
+        function((row, table, draws), given, numbers, size)
+
+    return stage
+
+
+def _without_given(function: Callable) -> Callable:
+    def stage(row, belief, numbers, table, draws, size):
+        function((row, table, draws), numbers, size)
+
+    return stage
+
+
+def _lanes(side_by_side: bool) -> tuple[int, int]:
+    """How many beliefs lie side by side, and how many such groups there are."""
+    return (LANES, GROUPS) if side_by_side else (1, 1)
+
+
+@lru_cache(maxsize=64)
+def build_batch(n: int, m: int, t: int, side_by_side: bool) -> Callable:
+    """`run` of `batch` for beliefs of this size, one after the other or side by side, as a Python function.
+
+    Copies of the last trajectory fill up a group.
+    """
+    width, groups = _lanes(side_by_side)
+    layout, source = memory_offsets(n, m, t), number_offsets(n, m, t)
+    mean, cov, innovation, s = layout.mean, layout.cov, layout.innovation, layout.innovation_cov
+    key_0, key_1, step, divergences = layout.key_0, layout.key_1, layout.step, layout.divergences
+    log_likelihood, checked = layout.log_likelihood, layout.gain
+    substeps, q_offset, r_offset = source.substeps, source.q, source.r
+
+    def run(stages, keys, inputs, measurements, numbers, noise, out, memory, first, last):
+        start, begin, advance, finish, update, restart = stages
         qs, rs = noise
         means, covs, innovations, innovation_covs, log_likelihoods, counts = out
-        belief, rows, us, zs = memory
+        rows, us, zs, belief, ensemble = memory
         for b in range(first, last, groups * width):
             count = min(groups * width, last - b)
             used = (count + width - 1) // width
-            for i in range(length):
-                belief[i] = 0.0
-            start((belief, None, None), numbers, 0)
             for g in range(used):
-                for i in range(length):
-                    for j in range(width):
-                        rows[g, i * width + j] = belief[i]
+                rows[g, key_0] = keys[b, 0]
+                rows[g, key_1] = keys[b, 1]
+                rows[g, step] = 0.0
+                rows[g, divergences] = 0.0
+                start(rows[g], belief, numbers, *ensemble)
             for k in range(measurements.shape[1]):
                 if k > 0:
                     for g in range(used):
@@ -65,12 +126,13 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                         for i in range(qs.shape[1]):
                             numbers[first_number + i] = qs[k - 1, i]
                     for g in range(used):
-                        begin(rows[g], us[g], numbers)
-                    for _ in range(int(numbers[substeps])):
+                        begin(rows[g], us[g], numbers, *ensemble)
+                    if side_by_side:
+                        for _ in range(int(numbers[substeps])):
+                            for g in range(used):
+                                advance(rows[g], us[g], numbers, *ensemble)
                         for g in range(used):
-                            advance(rows[g], us[g], numbers)
-                    for g in range(used):
-                        finish(rows[g], us[g], numbers)
+                            finish(rows[g], us[g], numbers, *ensemble)
                 if rs.shape[0] > 0:
                     for i in range(rs.shape[1]):
                         numbers[r_offset + i] = rs[k, i]
@@ -80,7 +142,7 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                             zs[g, i * width + j] = measurements[b + min(g * width + j, count - 1), k, i]
                 total, least = 0.0, 0.0
                 for g in range(used):
-                    update(rows[g], zs[g], numbers)
+                    update(rows[g], zs[g], numbers, *ensemble)
                     for i in range(checked * width):
                         total += abs(rows[g, i])
                     for i in range(t):
@@ -89,12 +151,7 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                             least = variance if variance < least else least
                 if not (total < LARGEST and least >= 0.0):
                     for g in range(used):
-                        for j in range(width):
-                            for i in range(length):
-                                belief[i] = rows[g, i * width + j]
-                            restart((belief, None, None), numbers, 0)
-                            for i in range(length):
-                                rows[g, i * width + j] = belief[i]
+                        restart(rows[g], belief, numbers, *ensemble)
                 for j in range(count):
                     g, at = j // width, j % width
                     for i in range(n):
@@ -111,13 +168,6 @@ def build_side_by_side(kernels: Kernels) -> Callable:
                 counts[b + j] = rows[j // width, divergences * width + j % width]
 
     return run
-
-
-def memory_side_by_side(kernels: Kernels, inputs: int) -> tuple[np.ndarray, ...]:
-    """One belief, and the memory, inputs and measurements of all groups, zeros."""
-    length, width = row_length(kernels), LANES
-    groups = (np.zeros((GROUPS, size * width)) for size in (length, inputs, kernels.m))
-    return np.zeros(length), *groups
 
 
 START, PREDICT, UPDATE = 1, 2, 4  # tasks of an operation; a sum is several
@@ -156,58 +206,6 @@ def build_operation(kernels: Kernels) -> Callable:
     return operate
 
 
-def _build_batch(kernels: Kernels) -> Callable:
-    n, m, start, predict, update = kernels.n, kernels.m, kernels.start, kernels.predict, kernels.update
-    t, layout = kernels.t, kernels.layout
-    mean, cov, innovation, s = layout.mean, layout.cov, layout.innovation, layout.innovation_cov
-    key_0, key_1, step, divergences = layout.key_0, layout.key_1, layout.step, layout.divergences
-    log_likelihood = layout.log_likelihood
-    q_offset, r_offset = kernels.offsets.q, kernels.offsets.r
-    restart = restart_if_lost(kernels)
-
-    def batch(row, table, draws, size, keys, inputs, measurements, numbers, noise, out, first, last):
-        qs, rs = noise
-        means, covs, innovations, innovation_covs, log_likelihoods, counts = out
-        memory = (row, table, draws)
-        u, z = np.zeros(inputs.shape[2]), np.zeros(m)
-        for b in range(first, last):
-            row[key_0] = keys[b, 0]
-            row[key_1] = keys[b, 1]
-            row[step] = 0.0
-            row[divergences] = 0.0
-            start(memory, numbers, size)
-            for k in range(measurements.shape[1]):
-                # Entry by entry: a slice of an array that threads share costs a contended reference count.
-                if k > 0:
-                    for i in range(u.shape[0]):
-                        u[i] = inputs[b, k - 1, i]
-                    if qs.shape[0] > 0:
-                        first_number = 0 if qs.shape[1] == numbers.shape[0] else q_offset
-                        for i in range(qs.shape[1]):
-                            numbers[first_number + i] = qs[k - 1, i]
-                    predict(memory, u, numbers, size)
-                for i in range(m):
-                    z[i] = measurements[b, k, i]
-                if rs.shape[0] > 0:
-                    for i in range(rs.shape[1]):
-                        numbers[r_offset + i] = rs[k, i]
-                update(memory, z, numbers, size)
-                restart(memory, numbers, size)
-                for i in range(n):
-                    means[b, k, i] = row[mean + i]
-                for i in range(t):
-                    for j in range(t):
-                        covs[b, k, i, j] = row[cov + i * t + j]
-                for i in range(m):
-                    innovations[b, k, i] = row[innovation + i]
-                    for j in range(m):
-                        innovation_covs[b, k, i, j] = row[s + i * m + j]
-                log_likelihoods[b, k] = row[log_likelihood]
-            counts[b] = row[divergences]
-
-    return batch
-
-
 def operation_on(kernels: Kernels, given: tuple) -> Callable[[int], int]:
     """`operate(task)` on a session's memory: given = (*memory, size, values, numbers), which stay where they are.
 
@@ -216,69 +214,84 @@ def operation_on(kernels: Kernels, given: tuple) -> Callable[[int], int]:
     """
     code = None if is_interpreting() else _code_one_by_one(kernels)
     if code is None:
-        return partial(_as_python(build_operation, kernels), *given)
+        return partial(_as_python(build_operation(kernels)), *given)
     from thruster_env.graphs.machine_code import builtin_of
 
     return builtin_of(code, *given)
 
 
 def batch(kernels: Kernels) -> Callable:
-    """`batch(*memory, size, keys, inputs, measurements, numbers, noise, out, first, last)` on trajectories.
+    """`run(keys, inputs, measurements, numbers, noise, out, memory, first, last)` on trajectories.
 
     noise = (qs, rs) has a row (Q, its root) for each step, or one of all numbers, and a row (R, its root) for each
     measurement, in place of the model's, or no rows. They are written into `numbers`, so threads must not share
-    these.
+    these; `memory` is that of `batch_memory`.
     """
-    return _function(None if is_interpreting() else _code_one_by_one(kernels), _build_batch, kernels)
-
-
-def vectors(kernels: Kernels) -> Callable:
-    """`run` of `build_side_by_side`, for kernels that have vectors."""
-    return _function(None if is_interpreting() else _code_side_by_side(kernels), build_side_by_side, kernels)
-
-
-def _function(code: Code | None, build: Callable, kernels: Kernels) -> Callable:
-    if code is None:
-        return _as_python(build, kernels)
+    size = kernels.n, kernels.m, kernels.t, bool(kernels.vectors)
+    code = None if is_interpreting() else _code_of_stages(kernels)
+    loops = None if code is None else _code_of_batch(*size)
+    if code is None or loops is None:
+        return partial(_as_python(build_batch(*size)), _stages(kernels))
     from thruster_env.graphs.machine_code import function_of
 
-    return function_of(code)
+    return partial(function_of(loops, code), Stages(*(code.addresses.get(name, 0) for name in Stages._fields)))
 
 
-@lru_cache(maxsize=128)
-def _as_python(build: Callable, kernels: Kernels) -> Callable:
-    return np.errstate(all="ignore")(build(kernels))  # machine code does not warn of overflow either
+def _as_python(function: Callable) -> Callable:
+    return np.errstate(all="ignore")(function)  # machine code does not warn of overflow either
 
 
 @lru_cache(maxsize=64)
 def _code_one_by_one(kernels: Kernels) -> Code | None:
-    """Machine code of `operate`, and of `batch` if batches do not run side by side."""
+    """Machine code of `operate`, and of the stages if batches do not run side by side."""
     from thruster_env.graphs.loops import Entry, common_code_of
 
-    memory = (row_length(kernels),), (kernels.table_rows, None), (None,), None
-    entries = [Entry(build_operation(kernels), (*memory, (None,), (None,), None), as_builtin=True)]
-    if not kernels.vectors:
-        shapes = *memory, (None, 2), (None, None, None), *_shapes_of_data(kernels), None, None
-        entries.append(Entry(_build_batch(kernels), shapes))
-    return common_code_of(*entries)
+    operation = Entry(
+        build_operation(kernels), (*_memory_shapes(kernels), None, (None,), (None,), None), as_builtin=True
+    )
+    return common_code_of(operation, *(() if kernels.vectors else _entries(kernels)))
+
+
+def _code_of_stages(kernels: Kernels) -> Code | None:
+    return _code_side_by_side(kernels) if kernels.vectors else _code_one_by_one(kernels)
 
 
 @lru_cache(maxsize=64)
 def _code_side_by_side(kernels: Kernels) -> Code | None:
-    from thruster_env.graphs.loops import machine_code_of
+    from thruster_env.graphs.loops import common_code_of
 
-    length, m = row_length(kernels), kernels.m
-    memory = [(length,), (GROUPS, length * LANES), (GROUPS, None), (GROUPS, m * LANES)]
-    shapes = (None, None, None), *_shapes_of_data(kernels), memory, None, None
-    return machine_code_of(build_side_by_side(kernels), shapes, unrolled=False)
+    return common_code_of(*_entries(kernels), unrolled=False)
 
 
-def _shapes_of_data(kernels: Kernels) -> tuple:
-    """Lengths of measurements, numbers, noise and estimates."""
-    n, m, t = kernels.n, kernels.m, kernels.t
+def _entries(kernels: Kernels) -> list[Entry]:
+    """The stages of a batch by address."""
+    from thruster_env.graphs.loops import Entry
+
+    width, _ = _lanes(bool(kernels.vectors))
+    ensemble = () if kernels.vectors else (*_memory_shapes(kernels)[1:], None)
+    row = (row_length(kernels) * width,)
+    lengths = {"update": kernels.m * width, "start": row_length(kernels), "restart": row_length(kernels)}
+    stages = [(name, stage) for name, stage in _stages(kernels)._asdict().items() if stage is not None]
+    return [Entry(stage, (row, (lengths.get(name),), (None,), *ensemble), name=name) for name, stage in stages]
+
+
+def _memory_shapes(kernels: Kernels) -> tuple:
+    return (row_length(kernels),), (kernels.table_rows, None), (None,)
+
+
+@lru_cache(maxsize=64)
+def _code_of_batch(n: int, m: int, t: int, side_by_side: bool) -> Code | None:
+    """Machine code of the loops around the stages of any filter of this size."""
+    from thruster_env.graphs.loops import ADDRESS, machine_code_of
+
+    width, groups = _lanes(side_by_side)
     noise = [(None, None), (None, 2 * m * m)]
     out = [(None, None, *part) for part in ((n,), (t, t), (m,), (m, m), ())] + [(None,)]
-    return (None, None, m), (None,), noise, out
+    ensemble = [] if side_by_side else [(None, None), (None,), None]
+    memory = [*((groups, size) for size in (None, None, m * width)), (None,), ensemble]
+    data = (None, 2), (None, None, None), (None, None, m), (None,)
+    shapes = Stages(*[ADDRESS] * len(Stages._fields)), *data, noise, out, memory, None, None
+    return machine_code_of(build_batch(n, m, t, side_by_side), shapes, unrolled=not side_by_side)
 
 
 def row_length(kernels: Kernels) -> int:
@@ -291,3 +304,10 @@ def new_memory(kernels: Kernels, size: int) -> tuple[np.ndarray, np.ndarray, np.
     width = padded(size, LANES)
     draws = padded(kernels.draws_per_member * width, GROUP)
     return np.zeros(row_length(kernels)), np.zeros((kernels.table_rows, width)), np.zeros(draws)
+
+
+def batch_memory(kernels: Kernels, size: int, inputs: int) -> tuple:
+    """The memory of a batch: groups of rows, inputs and measurements; a belief's row; table, draws and size."""
+    (row, *ensemble), (width, groups) = new_memory(kernels, size), _lanes(bool(kernels.vectors))
+    in_groups = (np.zeros((groups, count * width)) for count in (len(row), inputs, kernels.m))
+    return *in_groups, row, () if kernels.vectors else (*ensemble, size)

@@ -67,6 +67,12 @@ class Native:
         self.address, self.shape, self.as_array, self._holder = address, shape, as_array, holder
 
 
+class ByAddress(NamedTuple):
+    """A function of which only the address is known; it takes the words of its arguments, see `loops.Entry`."""
+
+    address: ir.Value
+
+
 class Translated(NamedTuple):
     """A function of a module.
 
@@ -103,6 +109,8 @@ class Expressions(Arrays):
         """Call a function with these arguments; return its result."""
         if hasattr(function, "program"):
             return self._call_program(function, arguments)
+        if isinstance(function, ByAddress):
+            return self._call_address(function.address, arguments)
         if function in BUILTINS:
             return BUILTINS[function](self, *arguments)
         if function in FUNCTIONS:
@@ -394,6 +402,7 @@ class Expressions(Arrays):
         else:
             kind = ir.FunctionType(ir.VoidType(), [POINTER] * len(arrays) + [LONG] * len(more))
             called = new_function(self._builder.module, kind, "program")
+            set.add(called.attributes, "alignstack(64)")  # else vectors that it keeps there lie across cache lines
             self._functions[function] = called
             if self._functions.programs_apart:
                 called.attributes.add("noinline")
@@ -411,6 +420,19 @@ class Expressions(Arrays):
             translator.free_all_but([])
             builder.ret_void()
         self._builder.call(called, [*(array.pointer for array in arrays), *map(self.numbers.as_whole, more)])
+
+    def _call_address(self, address: ir.Value, arguments: Sequence) -> None:
+        self.has_loops, words = True, self._words_of(arguments)
+        kind = ir.FunctionType(LONG, [word.type for word in words])
+        self._builder.call(self._builder.inttoptr(address, kind.as_pointer()), words)
+
+    def _words_of(self, value: Any) -> list[ir.Value]:
+        """The words of arguments as `machine_code.words_of` has them; arrays are in C order."""
+        if isinstance(value, Array):
+            return [value.pointer, *map(self.numbers.as_whole, value.shape)]
+        if isinstance(value, tuple | list):
+            return [word for part in value for word in self._words_of(part)]
+        return [as_value(value)]
 
     def call_by_name(self, name: str, numbers: Sequence, count: int, table: ir.Value | None) -> list[ir.Value]:
         """The `count` results of a function of CALLED for some numbers, and perhaps the array `numbers`."""

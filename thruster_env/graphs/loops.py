@@ -21,7 +21,7 @@ import threading
 import types
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,8 +35,9 @@ from thruster_env.core.streams import fill_in_loop
 from thruster_env.core.user_functions import OURS
 from thruster_env.graphs.arithmetic import OnlyPython, Untranslated, is_known
 from thruster_env.graphs.arrays import LAPACK, POINTER, Memory, of_lapack
-from thruster_env.graphs.expressions import FILL_NORMALS, Expressions, Functions
+from thruster_env.graphs.expressions import FILL_NORMALS, ByAddress, Expressions, Functions
 from thruster_env.graphs.forms import Array, changing_form, common_form, is_tuple
+from thruster_env.graphs.graphs import uncollected
 from thruster_env.graphs.instructions import DOUBLE, LONG
 from thruster_env.graphs.machine_code import (
     WIDE,
@@ -49,13 +50,19 @@ from thruster_env.graphs.machine_code import (
     function_of,
 )
 
+ADDRESS = object()  # the shape of an argument that is called by its address
+
 
 class Entry(NamedTuple):
-    """A function that Python calls: a builtin function "call", or a function "run" of words."""
+    """A function that Python calls, a builtin "call" or "run" of words, or one that is called by its address.
+
+    The address is that of its `name`.
+    """
 
     function: Callable
     shapes: Sequence
     as_builtin: bool = False
+    name: str = ""
 
 
 def machine_code_of(
@@ -70,23 +77,25 @@ def machine_code_of(
     return common_code_of(Entry(function, shapes, as_builtin), unrolled=unrolled)
 
 
+@uncollected()
 def common_code_of(*entries: Entry, unrolled: bool = True) -> Code | None:
-    """Machine code of functions that share those they call; at most one builtin function and another.
+    """Machine code of functions that share those they call; at most one of them is builtin, and one "run".
 
     If there is none, it returns None after a warning: a user's function can neither be traced, translated, nor
     compiled by numba; or this system's libraries lack a function; or the package has a fault.
-    If there are two, programs may become part of the functions that both call.
+    If there are several, programs may become part of the functions that call them.
     """
     module, names, functions = ir.Module(), list[str](), Functions()
-    functions.programs_apart = len(entries) == 1
+    functions.programs_apart = len(entries) == 1 or not any(entry.as_builtin for entry in entries)
     try:
         for entry in entries:
-            name = "operate" if entry.as_builtin else "run"
-            target, word_count = add_function(module, name, entry.function, entry.shapes, functions)
+            name = entry.name or ("operate" if entry.as_builtin else "run")
+            by_words = not entry.name
+            target, count = add_function(module, name, entry.function, entry.shapes, functions, by_words=by_words)
             if entry.as_builtin:
                 target.linkage = "internal"
-                add_builtin(module, "call", target, word_count - 1 - len(entry.shapes[-1] or ()))
-            names.append("call" if entry.as_builtin else "run")
+                add_builtin(module, "call", target, count - 1 - len(entry.shapes[-1] or ()))
+            names.append("call" if entry.as_builtin else name)
         libraries = [_library_of_normals()] if functions.draws else []
         symbols = functions.natives | {name: of_lapack(name) for name in LAPACK if name in module.globals}
         return code_of(module, *names, unrolled=unrolled, libraries=libraries, symbols=symbols)
@@ -121,7 +130,13 @@ def _library_of_normals() -> Code:
 
 
 def add_function(
-    module: ir.Module, name: str, function: Callable, shapes: Sequence, functions: Functions | None = None
+    module: ir.Module,
+    name: str,
+    function: Callable,
+    shapes: Sequence,
+    functions: Functions | None = None,
+    *,
+    by_words: bool = True,
 ) -> tuple[ir.Function, int]:
     """Add `i64 name(words)`, a Python function of arrays and whole numbers; return it and its number of words.
 
@@ -132,32 +147,39 @@ def add_function(
         name: of the function.
         function: of Python.
         shapes: of its arguments: of an array its lengths, None for those that a call tells; None for a whole
-            number, `float` for a float; a list for a tuple of such, or a named tuple of such. The words are those
-            of `machine_code.words_of`.
+            number, `float` for a float, `ADDRESS` for a function that is called by it; a list for a tuple of such,
+            or a named tuple of such. The words are those of `machine_code.words_of`.
         functions: those that the module has already, for functions that are added later.
+        by_words: whether it takes the address of its words, or, as a function that is called by its address, each
+            word as an argument.
 
     Raises:
         TypeError: if it contains what cannot be translated.
     """
-    target = ir.Function(module, ir.FunctionType(LONG, [LONG.as_pointer()]), name)
-    builder, word = ir.IRBuilder(target.append_basic_block("entry")), 0
+    kinds = [*_kinds(list(shapes))]
+    target = ir.Function(module, ir.FunctionType(LONG, [LONG.as_pointer()] if by_words else kinds), name)
+    builder = ir.IRBuilder(target.append_basic_block("entry"))
     translator = _Translator(builder, Functions() if functions is None else functions, FASTMATH)
 
-    def next_word() -> ir.Value:
-        nonlocal word
-        pointer, word = builder.gep(target.args[0], [ir.Constant(LONG, word)], source_etype=LONG), word + 1
-        return builder.load(pointer, typ=LONG)
+    def word(k: int, kind: ir.Type) -> ir.Value:
+        pointer = builder.gep(target.args[0], [ir.Constant(LONG, k)], source_etype=LONG)
+        value = builder.load(pointer, typ=LONG)
+        return {LONG: lambda: value, DOUBLE: lambda: builder.bitcast(value, DOUBLE)}.get(
+            kind, lambda: builder.inttoptr(value, POINTER)
+        )()
+
+    words = iter([word(k, kind) for k, kind in enumerate(kinds)] if by_words else target.args)
 
     def argument_of(shape: Any) -> Any:
-        if shape is None:
-            return next_word()
-        if shape is float:
-            return builder.bitcast(next_word(), DOUBLE)
+        if shape is None or shape is float:
+            return next(words)
+        if shape is ADDRESS:
+            return ByAddress(next(words))
         if isinstance(shape, list | Parts):
             return tuple(map(argument_of, shape))
         if hasattr(shape, "_fields"):
             return type(shape)(*map(argument_of, shape))
-        pointer, lengths = builder.inttoptr(next_word(), POINTER), [next_word() for _ in shape]
+        pointer, lengths = next(words), [next(words) for _ in shape]
         lengths = [b if a is None else a for a, b in zip(shape, lengths, strict=True)]
         return translator.array_at(pointer, lengths)
 
@@ -166,7 +188,20 @@ def add_function(
     translator.free_all_but([])
     builder.ret(translator.numbers.as_whole(0 if result is None else result))
     set.add(target.attributes, WIDE)
-    return target, word
+    return target, len(kinds)
+
+
+def _kinds(shape: Any) -> Iterator[ir.Type]:
+    """The types of the words of an argument."""
+    if shape is None or shape is ADDRESS:
+        yield LONG
+    elif shape is float:
+        yield DOUBLE
+    elif isinstance(shape, list | Parts) or hasattr(shape, "_fields"):
+        for part in shape:
+            yield from _kinds(part)
+    else:
+        yield from (POINTER, *(LONG for _ in shape))
 
 
 def unknown(count: int, *, as_array: bool) -> Any:

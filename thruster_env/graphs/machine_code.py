@@ -252,12 +252,13 @@ class _MethodDefinition(ctypes.Structure):
     ]
 
 
-def function_of(code: Code, *, floats: bool = False) -> Callable[..., int]:
+def function_of(code: Code, *called: Code, floats: bool = False) -> Callable[..., int]:
     """Return `call(*arguments)` of a function i64 run(words), which releases the interpreter lock.
 
-    Its arguments are arrays of float64 in C order, whole numbers, and perhaps floats.
+    Its arguments are arrays of float64 in C order, whole numbers, and perhaps floats. Code that is `called` by its
+    addresses lives as long.
     """
-    run = runner_of(code)
+    run = runner_of(code, *called)
 
     def call(*arguments) -> int:
         words = array("q", words_of(arguments, floats=floats))  # which must live until the function ends
@@ -266,10 +267,10 @@ def function_of(code: Code, *, floats: bool = False) -> Callable[..., int]:
     return call
 
 
-def runner_of(code: Code) -> Callable[[int], int]:
+def runner_of(code: Code, *called: Code) -> Callable[[int], int]:
     """The same as a function of the address of the words."""
     run: Any = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(code.addresses["run"])
-    run.code = code  # which lives as long as the function
+    run.code = code, called  # which live as long as the function
     return run
 
 
