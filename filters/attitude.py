@@ -121,7 +121,7 @@ def attitude(
         + [positive("magnetometer", magnetometer) ** 2] * 3,
         prior_mean=[1.0] + [0.0] * 12,
         prior_cov=[deviation**2 for deviation in prior] + [acceleration**2] * 6,
-        constants=Sensors(dt, *step.ravel().tolist(), *at_rest),
+        constants=Sensors._make([dt, *step.ravel().tolist(), *at_rest]),
         states=(
             Rotation("attitude"),
             *(Quantity(f"gyroscope bias {axis}", f"b_{axis}", "rad/s") for axis in AXES),

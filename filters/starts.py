@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -426,20 +426,20 @@ def begun_at(model: StateSpaceModel, first: np.ndarray) -> np.ndarray:
 def _begun_at(model: StateSpaceModel, z: np.ndarray) -> np.ndarray:
     shape, c, of, mean = model.any_shape, model.given_constants, model.turns, model.prior_mean
     fed, scales, measured = shape.fed(as_value(np.zeros(model.inputs))), as_value(model.scales), ~np.isnan(z)
-    slopes = observation_slopes(model.functions, shape)
+    slopes, steps = observation_slopes(model.functions, shape), cast(Any, turns)  # on arrays
     known = np.diag(model.prior_cov) > 0.0
     of_r = np.linalg.cholesky(model.measurement_noise_cov[np.ix_(measured, measured)])
     of_p = np.linalg.cholesky(model.prior_cov[np.ix_(known, known)])
 
     def residuals(x: np.ndarray) -> np.ndarray:
         v = difference(z, np.array(model.functions.observe(as_value(x), *fed, c)), shape.measurement_angles)
-        off = np.array(turns.difference(x, mean, of))
+        off = np.array(steps.difference(x, mean, of))
         return np.concatenate([np.linalg.solve(of_r, v[measured]), np.linalg.solve(of_p, off[known])])
 
     def jacobian(x: np.ndarray) -> np.ndarray:
         h = np.array(slopes(as_value(x), scales, *fed, c)).reshape(model.m, model.n)
-        h = h @ np.array(turns.slopes_of_stored(x, of))
-        off = np.array(turns.inverse_reset_slopes(mean, turns.difference(x, mean, of), of))
+        h = h @ np.array(steps.slopes_of_stored(x, of))
+        off = np.array(steps.inverse_reset_slopes(mean, steps.difference(x, mean, of), of))
         rows = np.linalg.solve(of_r, -h[measured][:, known]), np.linalg.solve(of_p, off[np.ix_(known, known)])
         return np.concatenate(rows)
 
@@ -449,7 +449,7 @@ def _begun_at(model: StateSpaceModel, z: np.ndarray) -> np.ndarray:
             j, step = jacobian(x), np.zeros(model.t)
             normal = j.T @ j
             step[known] = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -j.T @ r)
-            further = np.array(turns.move(x, step, of))
+            further = np.array(steps.move(x, step, of))
             after = residuals(further)
             is_better = bool(np.sum(after**2) < np.sum(r**2))
             if is_better:

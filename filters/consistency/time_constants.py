@@ -119,12 +119,12 @@ def time_constants(filter_: Filter, runs: Sequence[Run], constants: Sequence[int
             with these known.
 
     Returns:
-        None for a filter without a covariance, and where no estimate is finite.
+        None for a filter without a covariance, a model with rotations, and where no estimate is finite.
 
     Source: Anderson, Moore (1979), Optimal Filtering, section 4.4; Benettin, Galgani, Giorgilli, Strelcyn (1980),
     "Lyapunov characteristic exponents for smooth dynamical systems", for the mean growth.
     """
-    if not filter_.has_covariance:
+    if not filter_.has_covariance or filter_.kernel_model.turns:
         return None
     path = slopes_along(filter_, runs)
     if path is None or not _is_regular(path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from filters.estimators.foreign import Estimator, ForeignFilter
 from filters.filter import Filter
 from filters.live import Live
 from filters.smoothers.smooth import smoothed_rows
-from filters.starts import FirstRestart, Restarts
+from filters.starts import FirstRestart, Restarts, begun_at, first_measured
 from filters.wrappers.arguments import filter_for
 from thruster_env.core.checks import at_least
 from thruster_env.core.streams import filter_keys
@@ -22,7 +23,7 @@ from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.log import Log, seen_by
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import refuse_rotations
+from thruster_env.model.turns import stored_covs
 
 SKIPPED = 50  # first rows that do not count, in which a filter settles
 STEP = 1e-4  # of the slopes of outputs, in standard deviations
@@ -165,7 +166,7 @@ def estimate_with(
     seed: int = 0,
     noise: Callable[[float], np.ndarray] | None = None,
 ) -> LogEstimate:
-    """Run a given filter over a log.
+    """Run a given filter over a log; of a model with rotations it begins at the first measurement.
 
     Args:
         filter_: the filter.
@@ -175,10 +176,12 @@ def estimate_with(
         seed: likewise.
         noise: of a log on its own stamps, Q by the length of a step [s]; None for one in proportion to it.
     """
-    refuse_rotations(filter_.model)
     smoother = smoother or lag is not None
     measurements = seen_by(filter_.model, log.measurements)
     data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], measurements[None]
+    if filter_.model.turns:
+        first = begun_at(filter_.model, first_measured(data[2]))[0]
+        filter_ = replace(filter_, model=filter_.model.replace(prior_mean=first))
     if log.stamps is not None:
         estimates, restarts = by_the_clock(filter_, data[0][0], log, noise)
     elif isinstance(filter_, ForeignFilter):
@@ -194,7 +197,7 @@ def estimate_with(
         log,
         filter_,
         means[0],
-        covs[0],
+        stored_covs(means, covs, filter_.model.turns)[0],
         np.where(np.isnan(measurements), np.nan, estimates.innovations[0]),
         estimates.innovation_covs[0],
         likelihoods if filter_.has_covariance else np.full_like(likelihoods, np.nan),

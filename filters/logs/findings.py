@@ -510,7 +510,7 @@ def _measurements_of(estimate: LogEstimate, values: np.ndarray) -> list[np.ndarr
     states = estimate.means[rows] if is_array(model.n) else [tuple(row) for row in estimate.means[rows].tolist()]
     try:
         inputs = inputs_until(estimate.log.inputs)[rows]
-        fed = [model.shape.fed(as_value(u.tolist())) for u in inputs]
+        fed = [model.any_shape.fed(as_value(u.tolist())) for u in inputs]
         h, c = model.functions.observe, model.given_constants
         expected = np.array([h(x, *u, c) for x, u in zip(states, fed, strict=True)])
     except (ValueError, ArithmeticError):  # of estimates at which h has no value, where Python raises

@@ -53,8 +53,9 @@ def model_for_step(text: Any, dt: float | None) -> Callable[..., StateSpaceModel
     if dt is None:
         way_out = f"{maker.name}:dt=..." if isinstance(maker, NamedMaker) else "give it by a function"
         raise ValueError(f"a model by name must have a sample time, but {text} has no dt here: {way_out}")
+    make: Any = maker
     has_dt = isinstance(maker, NamedMaker) or "dt" in inspect.signature(maker).parameters
-    return partial(maker if has_dt else AtDt(maker), dt=dt)
+    return partial(make if has_dt else AtDt(make), dt=dt)
 
 
 def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | StateSpaceModel]:

@@ -35,8 +35,15 @@ def test_attitudes_of_recordings():
     """With what the next test finds; the cuts give Madgwick 3.6 and VQF 1.3 degrees."""
     numbers = {"accelerometer": 0.002, "magnetometer": 0.8, "acceleration": 0.42, "frequency": 1.1}
     model = attitude(1.0 / RATE, **numbers, damping=0.85, field=44.8, dip=69.7)
+    table, reference = table_of("03")
     assert total_error(model, *table_of("02")) < 1.35
-    assert total_error(model, *table_of("03")) < 1.6
+    assert total_error(model, table, reference) < 1.6
+    settings = ",".join(f"{name}={value}" for name, value in numbers.items())
+    log = tuning.read_logs(table, model=f"attitude:{settings},damping=0.85,field=44.8,dip=69.7")
+    estimate = tuning.estimate(log, filter="ekf")
+    q, deviations = estimate.means[-1, :4], estimate.stds[-1, :4]
+    np.testing.assert_allclose(q @ q, 1.0, rtol=1e-12)
+    assert (deviations < 0.01).all()
 
 
 @pytest.mark.slow
@@ -48,3 +55,15 @@ def test_numbers_of_a_recording_without_its_reference():
     assert total_error(found.model, *table_of("03")) < 1.6
     assert found.determined["dip"]
     assert abs(found.values["dip"] - 69.7) < 0.5
+
+
+@pytest.mark.slow
+def test_a_study_on_a_recording(undrawn, tmp_path):
+    """Its blocks begin at their own attitudes; the report states Q of the errors."""
+    table, _ = table_of("02")
+    path = tmp_path / "imu.csv"
+    np.savetxt(path, np.column_stack(list(table.values())), delimiter=",", header=",".join(table), comments="")
+    study = tuning.tune(("attitude", str(path)), trials=2, out=tmp_path / "tuned.json")
+    assert study.result.choice.model["dip"] == pytest.approx(69.7, abs=0.5)
+    tuning.report(str(tmp_path / "tuned.json"), out=tmp_path / "report")
+    assert "In each step q_3 moves by" in (tmp_path / "report" / "tuned.html").read_text(encoding="utf-8")

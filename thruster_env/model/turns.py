@@ -213,12 +213,26 @@ def stored_of(values: Sequence, turns: Sequence[Turn], of_rotation: float) -> li
     return result
 
 
-def tangent_of(values: Sequence, turns: Sequence[Turn], of_rotation: Any) -> list:
-    """The values of stored numbers for each component of an error, and another one for rotation vectors."""
-    result = list(values)
+def error_quantities(states: Sequence[Quantity], turns: Sequence[Turn]) -> list[Quantity]:
+    """The quantities of an error of the state: q_1, q_2, q_3 [rad] of a rotation q_w, q_x, q_y, q_z."""
+    result = list(states)
     for turn in reversed(turns):
-        result[turn.stored : turn.stored + 4] = [of_rotation] * 3
+        symbol, parts = states[turn.stored].symbol.rpartition("_")[0], turn.of_state(states)[1:]
+        units = [part.unit or "rad" for part in parts]  # positions follow the quaternion, and their errors
+        errors = [Quantity(f"{turn.name} error {i}", f"{symbol}_{i}", unit) for i, unit in enumerate(units, 1)]
+        result[turn.stored : turn.stored + turn.size + 1] = errors
     return result
+
+
+def stored_covs(means: np.ndarray, covs: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
+    """Covariances B P B' (..., n, n) of the stored numbers, of P (..., t, t) and `slopes_of_stored` B at means."""
+    if not turns:
+        return covs
+    slopes, components = np.zeros((*means.shape, covs.shape[-1])), list(np.moveaxis(means, -1, 0))
+    for i, row in enumerate(slopes_of_stored(components, turns)):
+        for j, entry in enumerate(row):
+            slopes[..., i, j] = entry
+    return slopes @ covs @ np.swapaxes(slopes, -1, -2)
 
 
 # The steps, on sequences of components: floats, arrays of them, or numbers that are traced.

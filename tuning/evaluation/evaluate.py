@@ -28,6 +28,7 @@ from filters.ensembles.square_root import record_members
 from filters.filter import Filter
 from filters.starts import Restarts, restarts_of
 from thruster_env.model.quantities import Quantity
+from thruster_env.model.turns import stored_covs
 from tuning.evaluation.runs import RunMetrics, metrics_of_all
 from tuning.problems.data import Data, estimates_in_parts
 
@@ -272,11 +273,12 @@ def check_consistency(filter_: Filter, data: Data, dt: float | None = None) -> C
             part[:MEMBER_RUNS] for part in (observed.filter_keys, observed.inputs, observed.measurements)
         )
         members = record_members(filter_, *first_runs, first=first, every=MEMBER_STEPS)
-    angles = model.shape.state_angles[:n]
+    angles = model.any_shape.state_angles[:n]
     parts, blown = [], ""
     for runs, estimates in estimates_in_parts(filter_, data):
         blown = blown or blow_up(filter_, estimates, runs, dt)
-        of_plant = estimates._replace(means=estimates.means[..., :n], covs=estimates.covs[..., :n, :n])
+        covs = stored_covs(estimates.means, estimates.covs, model.turns)
+        of_plant = estimates._replace(means=estimates.means[..., :n], covs=covs[..., :n, :n])
         parts.append(findings(of_plant, runs.states, runs.measurements, first, angles, runs.counted))
     report = report_of(
         joined(parts),

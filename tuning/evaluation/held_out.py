@@ -450,7 +450,7 @@ def gain_over_regression(model: StateSpaceModel, tuned: Evaluation, training: Da
     Returns:
         The mean over all scored measurements; NaN for a filter without a covariance, or if there are too few rows.
     """
-    angles = [is_angle(i, model.shape.measurement_angles) for i in range(model.m)]
+    angles = [is_angle(i, model.any_shape.measurement_angles) for i in range(model.m)]
     densities = log_densities(training, data, np.array(angles))
     scored = np.where(data.scored[..., None], densities, np.nan)
     counts = np.isfinite(scored).sum(axis=(1, 2))

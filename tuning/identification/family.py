@@ -11,7 +11,7 @@ import numpy as np
 
 from thruster_env.core.checks import short_repr
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import tangent_of
+from thruster_env.model.turns import error_quantities
 from tuning.problems.problem import Parameter, squared
 from tuning.search.parameters import r_name
 
@@ -66,8 +66,8 @@ class ModelFamily:
         """Every parameter that may be free, with its range about its start."""
         starts = dict(self._arguments) | {name: getattr(self.base.constants, name) for name in self._fields}
         parameters = {name: about(name, float(value)) for name, value in starts.items()}
-        of_errors = tangent_of([state.unit for state in self.base.states], self.base.turns, "rad")
-        units = [*of_errors, *(quantity.unit for quantity in self.base.measurements)]
+        errors = error_quantities(self.base.states, self.base.turns)
+        units = [quantity.unit for quantity in (*errors, *self.base.measurements)]
         for name, (_, index, variance) in self._noise.items():
             unit = units[index + (0 if name.startswith("Q") else self.base.t)]
             parameters.setdefault(name, variance_about(name, variance, unit))

@@ -18,7 +18,7 @@ from filters.consistency.nees import pooled_mean
 from filters.differentiated import recursion
 from filters.differentiated.runs import Density, ModelSlopes, Truth, derivatives
 from filters.filter import Filter
-from filters.starts import Starts
+from filters.starts import Starts, as_the_prior_says
 from thruster_env.core.checks import one_of
 from thruster_env.core.sources import is_array
 from thruster_env.model.state_space import StateSpaceModel
@@ -312,8 +312,12 @@ class Objective:
 
         def of(runs: Data) -> tuple[np.ndarray, np.ndarray]:
             arguments = model, runs.seen.inputs, runs.seen.measurements, slopes, wanted
+            begun = starts
+            if begun is None and runs.begun is not None:
+                count = len(runs.begun)
+                begun = as_the_prior_says(model, count)._replace(free=np.ones(count, bool), means=runs.begun)
             out, information = derivatives(
-                *arguments, density=density, blocks=self.blocks, starts=starts, truth=truth, used=part.used
+                *arguments, density=density, blocks=self.blocks, starts=begun, truth=truth, used=part.used
             )
             return out.reshape(-1, out.shape[-1]), information
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from filters.named import NamedMaker, is_model_name
+from filters.plants import PLANTS
 from filters.tuned_file import check_preset_file, made_with, read_tuned_file, tune_options
 from thruster_env.core.checks import short_repr
 from thruster_env.env.record import read_for
@@ -26,6 +27,7 @@ from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.identification.clocks import CLOCK, clock_offsets, shifted
 from tuning.identification.family import ModelFamily
+from tuning.identification.identify import identify
 from tuning.identification.result import Identification, write_values
 from tuning.logs.read import check_model, name_of, offer_of, read_named, texts
 from tuning.problems.assumed import name_and_unknown
@@ -89,6 +91,8 @@ def log_problem(
     cuts: dict[str, Any] = {"held_out": held_names, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps or None}
     cuts |= {"start": start, "outliers": outliers}
     cuts = {key: value for key, value in cuts.items() if value is not None and value != []}
+    if free_numbers(offer):
+        return _of_numbers(offer, recorded, cuts, apart, _content(runs, options, cuts))
     if not isinstance(offer, NamedMaker):
         content = _content(runs, options, cuts)
         return LogProblem(recorded, read_for(recorded[0], offer)[1](), **cuts, apart=apart, content=content)
@@ -100,6 +104,31 @@ def log_problem(
     recorded[run] = replace(log, measurements=recorded[run].measurements)
     assumed = partial(maker, dt=recorded[0].dt)
     return LogProblem(recorded, assumed, parameters=parameters, **cuts, apart=apart, content=content)
+
+
+def _of_numbers(
+    offer: Any, logs: list[Log], cuts: Mapping[str, Any], apart: bool, content: dict | None
+) -> LogProblem:
+    """The problem of a model of a few numbers, which begin at the maximum-likelihood ones of the training rows."""
+    options = {"hold_gaps": cuts.get("hold_gaps", False), "sizes": True}
+    parts = parts_of(logs, cuts.get("lead"), cuts.get("blocks"), cuts.get("held_out"), **options)
+    counted = [np.zeros(log.steps + 1, dtype=bool) for log in logs]
+    for index in parts.training:
+        block = parts.blocks[index]
+        counted[block.run][block.first : block.first + block.rows] = True
+    training = [
+        replace(log, measurements=np.where(rows[:, None], log.measurements, np.nan))
+        for log, rows in zip(logs, counted, strict=True)
+        if rows.any()
+    ]
+    family = LoggedFamily(training, offer, free_numbers(offer), noise=False, dt=logs[0].dt)
+    values = identify(training, family.model, family.free, starts=1, against=False).values
+    parameters = [
+        replace(parameter, default=min(max(values[parameter.name], parameter.low), parameter.high))
+        for parameter in family.free
+    ]
+    assumed = partial(offer, dt=logs[0].dt)
+    return LogProblem(logs, assumed, parameters=parameters, **cuts, apart=apart, content=content)
 
 
 def _learnt(maker: NamedMaker, logs: Sequence[Log], cuts: Mapping[str, Any]) -> tuple[int, tuple]:
@@ -375,7 +404,8 @@ def family_of(
 
 def free_numbers(offered: Any) -> list[str]:
     """The numbers of a function of `filters.plants` that are free if none is named, but for those that it has."""
-    names = getattr(getattr(offered, "func", offered), "free", ())
+    function = getattr(offered, "func", offered)
+    names = getattr(function, "free", ()) if any(function is plant for plant in PLANTS.values()) else ()
     return [name for name in names if name not in getattr(offered, "keywords", {})]
 
 

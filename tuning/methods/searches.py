@@ -175,7 +175,7 @@ def _squares(task: Task, choice: Choice, index: int, hidden: np.ndarray) -> np.n
         last = first + len(part.seeds)
         _, expected = predicted(model, estimates.means, part.seen.inputs)
         z = part.late_scored(data.measurements[first:last])
-        left = difference(z, expected[:, data.late], model.shape.measurement_angles)
+        left = difference(z, expected[:, data.late], model.any_shape.measurement_angles)
         left = np.where(hidden[first:last, data.late, None], left, np.nan)
         totals = totals + np.nansum(left**2, axis=(0, 1))
         counts = counts + (~np.isnan(left)).sum(axis=(0, 1))

@@ -163,7 +163,7 @@ def check_model(model: StateSpaceModel, data: Data, name: str) -> None:
         x, c = as_value(point.tolist()), model.given_constants
         functions = {
             "transition": lambda x=x, c=c: model.transition(x, control, c),
-            "observe": lambda x=x, c=c: model.observe(x, *model.shape.fed(control), c),
+            "observe": lambda x=x, c=c: model.observe(x, *model.any_shape.fed(control), c),
         }
         for function, value in functions.items():
             got: ArithmeticError | tuple

@@ -7,6 +7,7 @@ choice of the ensemble size, and held-out evaluation.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,6 +44,7 @@ class Data(NamedTuple):
     states: np.ndarray | None = None  # (B, K + 1, n), the first states of the model; None where there is no truth
     outputs: Mapping[str, np.ndarray] | None = None  # (B, K + 1) each, by symbol; None where there is no truth
     counted: np.ndarray | None = None  # (B, K + 1) bool, which steps count; None where all do
+    begun: np.ndarray | None = None  # (B, n), where each run begins; None for the mean of the model's prior
 
     @property
     def late(self) -> slice:
@@ -139,6 +141,7 @@ class Data(NamedTuple):
             if self.outputs is None
             else {name: values[part] for name, values in self.outputs.items()},
             counted=None if self.counted is None else self.counted[part],
+            begun=None if self.begun is None else self.begun[part],
         )
 
     def one(self, index: int) -> Data:
@@ -232,7 +235,7 @@ def estimates_on(filter_: Filter, data: Data) -> Estimates:
     An estimator of another package runs as far as each run goes, for it may have no estimate beyond.
     """
     observed = data.seen
-    if data.counted is not None and isinstance(filter_, ForeignFilter):
+    if data.begun is not None or (data.counted is not None and isinstance(filter_, ForeignFilter)):
         return _one_by_one(filter_, data)
     estimates = run(filter_, observed.filter_keys, observed.inputs, observed.measurements)
     if data.counted is None:
@@ -253,6 +256,8 @@ def _one_by_one(filter_: Filter, data: Data) -> Estimates:
 
 def _alone(filter_: Filter, data: Data, index: int) -> Estimates:
     part = data.one(index)
+    if data.begun is not None:
+        filter_ = replace(filter_, model=filter_.model.replace(prior_mean=data.begun[index]))
     return run(filter_, part.filter_keys, part.inputs, part.measurements)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from filters.consistency.time_constants import Run
-from filters.starts import MEASUREMENT, STARTS, cov_of_measured_starts, first_measured
+from filters.starts import MEASUREMENT, STARTS, begun_at, cov_of_measured_starts, first_measured
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
@@ -48,6 +48,11 @@ OF_OUTLIERS = {
 MEASURED = (
     "Each block begins where its first measurement says: the prior covariance is wide where a measurement sees "
     "the state."
+)
+
+ATTITUDES = (
+    "Each block begins at the attitude of its first measurement. True attitudes are not used: studies do not "
+    "score their errors."
 )
 
 
@@ -157,6 +162,7 @@ class LogProblem(AssumedProblem):
         for log in self.logs:
             check_quantities("input", log.input_quantities, model.input_quantities, f"log {log.name}", "the model")
             check_quantities("measurement", log.measured, model.measurements, f"log {log.name}", "the model")
+        truth = truth and not model.turns
         by_log = [log.true_states(model) if truth else None for log in self.logs]
         known = [states for states in by_log if states is not None]
         self._states = known if len(known) == len(by_log) else None
@@ -191,6 +197,8 @@ class LogProblem(AssumedProblem):
             remarks.append(f"{AT_GAPS[self._holds]}.")
         if self._start == MEASUREMENT:
             remarks.append(MEASURED)
+        if self.model().turns:
+            remarks.append(ATTITUDES)
         return (*remarks, *self.parts.sentences())
 
     def model(self, **changes) -> StateSpaceModel:
@@ -306,6 +314,8 @@ class LogProblem(AssumedProblem):
         measurements = padded(measured, rows)
         counted = mask_of([block.rows for block in blocks], rows)
         data = Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, counted=counted)
+        if model.turns:
+            data = data._replace(begun=begun_at(model, first_measured(measurements)))
         if self._states is None:
             return data
         states = padded([self._states[run][part] for run, part in slices], rows)

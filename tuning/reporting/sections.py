@@ -17,6 +17,7 @@ from filters.consistency.report import rounded, sentences
 from filters.registry import filter_type
 from thruster_env.core.sources import is_array
 from thruster_env.model.quantities import Quantity
+from thruster_env.model.turns import error_quantities
 from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison, versions
@@ -285,10 +286,11 @@ def model_section(choice: Choice, scenario: Problem) -> Section:
         "The filter assumes that w and v are white Gaussian noise of covariance Q and R. Covariances are per "
         "step and do not scale with dt: another sample time needs another Q."
     )
+    errors = error_quantities(model.states, model.turns)
     paragraphs += [
         f"In each step {state.text_symbol} moves by {_amount(variance, state)} (standard deviation) beyond the "
         "model."
-        for state, variance in zip(model.states, model.process_noise_cov.diagonal(), strict=True)
+        for state, variance in zip(errors, model.process_noise_cov.diagonal(), strict=True)
     ][:6]
     paragraphs += [
         f"A reading of {channel.text_symbol} is off by {_amount(variance, channel)} (standard deviation)."
@@ -296,7 +298,7 @@ def model_section(choice: Choice, scenario: Problem) -> Section:
     ][:6]
     if "ensemble_size" in choice.numbers:
         paragraphs.append(f"It carries {choice.numbers['ensemble_size']} members.")
-    rows = [*_rows("Q", model.process_noise_cov, model.states), *_rows("P0 ", model.prior_cov, model.states)]
+    rows = [*_rows("Q", model.process_noise_cov, errors), *_rows("P0 ", model.prior_cov, errors)]
     rows += _rows("R", model.measurement_noise_cov, model.measurements)
     columns = ["", "of", "variance", "standard deviation"]
     table = Table("Diagonals of Q, of P_0, the prior's covariance, and of R", columns, rows[:MOST_ROWS])

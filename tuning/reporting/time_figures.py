@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from filters.engine.batch import Estimates, run
+from filters.engine.batch import Estimates
 from filters.filter import Filter
 from filters.logs.findings import MEASURED, TRUTH, colour_of
 from thruster_env.core.angles import with_breaks, wrapped, wrapped_where
@@ -21,8 +21,9 @@ from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import observation_slopes
 from thruster_env.model.simulate import inputs_until
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import stored_covs
 from tuning.evaluation.runs import state_errors
-from tuning.problems.data import Data
+from tuning.problems.data import Data, estimates_on
 
 FAR = 20.0  # where one panel of a row reaches so many times as far as another each has its own limits
 WIDEST = 4.0  # times the largest error: how much of a band is shown
@@ -235,7 +236,8 @@ def _rows(
 def one_run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
     """One run of a filter on some data, with errors where there is a truth; `dt` as in `draw_estimates`."""
     single = data.one(index)
-    estimates = run(filter_, single.filter_keys, single.inputs, single.measurements)
+    estimates, turns = estimates_on(filter_, single), filter_.model.turns
+    estimates = estimates._replace(covs=stored_covs(estimates.means, estimates.covs, turns))
     time = (1.0 if dt is None else dt) * np.arange(single.steps + 1)
     innovations = np.where(np.isnan(single.measurements[0]), np.nan, estimates.innovations[0])
     if single.states is None:
@@ -324,7 +326,7 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
     channels, left_out = plotted_states(model.measurements)
     inputs, _ = plotted_states(model.input_quantities)
     figure, axes = _signal_rows(len(channels) + len(inputs), 2 * WIDTH, dt)
-    measured = wrapped_where(single.measurements[0], model.shape.measurement_angles)
+    measured = wrapped_where(single.measurements[0], model.any_shape.measurement_angles)
     colour = colour_of(filter_.name)
     for axis, j in zip(axes, channels, strict=False):
         angle = model.measurements[j].angle
@@ -416,7 +418,7 @@ def _slopes(model: StateSpaceModel, mean: np.ndarray, u: np.ndarray) -> np.ndarr
     """Slopes of the measurements by the states at an estimate and the input until then, (m, n)."""
     if not np.isfinite(mean).all():
         return np.full((model.m, model.n), np.nan)
-    slopes, fed = observation_slopes(model.functions, model.shape), model.shape.fed(as_value(u.tolist()))
+    slopes, fed = observation_slopes(model.functions, model.any_shape), model.any_shape.fed(as_value(u.tolist()))
     h = slopes(as_value(mean.tolist()), as_value(model.scales), *fed, model.given_constants)
     return np.array(h, dtype=float).reshape(model.m, model.n)
 
