@@ -1,12 +1,66 @@
 """Which filter, which N for the vehicle: claims of docs/auv.md in a quick form, and by its tables."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 from docs.scripts import main
-from docs.scripts.auv import EKF, TABLES, restless, rows_of, small
+from docs.scripts.auv import EKF, FILTERS, MOTION, NAVIGATION, TABLES, about, restless, rows_of, small
+from filters.consistency.nees import Interval
 from tuning.auv.scenario import find_scenario
 
+PAGE = (Path(__file__).parents[2] / "docs" / "appendix" / "auv.md").read_text()
 BAND = (0.8, 1.25)  # of the mean NIS over what is right, as a study holds it
+
+
+def printed(name):
+    """Cells of a table of the page, a row each."""
+    text = re.search(rf"<!-- table {name} -->\n(.*?)\n<!-- end -->", PAGE, flags=re.DOTALL)[1]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:]]
+
+
+def numbers(cell):
+    """All numbers of a cell."""
+    return [float(part) for part in re.findall(r"[\d.]+(?:e[+-]?\d+)?", cell)]
+
+
+def by_label(name):
+    """NEES with half of its interval, mean NIS over what is right, and score over the EKF's, by filter."""
+    found = {}
+    for label, ratio, nees, nis in printed(name):
+        found[label] = numbers(nees), float(nis), numbers(ratio)[0]
+    return found
+
+
+def test_the_page_has_every_table():
+    assert set(TABLES) < set(re.findall(r"<!-- table (\w+) -->", PAGE))
+    scenarios = [row[0].strip("`") for row in printed("filters_motion")]
+    assert scenarios == [name for name in MOTION for _ in FILTERS]
+    assert {row[0].strip("`") for row in printed("filters_navigation")} <= set(NAVIGATION)
+
+
+def test_there_members_cost_consistency_until_300_and_more():
+    found = by_label("filters_members")
+    for label, nees in {"ekf": 8.0, "ukf": 8.0}.items():
+        assert found[label][0][0] == pytest.approx(nees, abs=0.15)
+    for size, nees in {50: 21.0, 100: 13.0, 200: 10.2, 300: 9.5}.items():
+        assert found[f"enkf {size}"][0][0] == pytest.approx(nees, rel=0.08)
+
+
+def test_there_a_transform_with_relaxation_is_consistent_enough_with_50_members():
+    found = by_label("filters_cures")
+    for label in ("etkf 50 relaxation 0.45", "etkf 50 inflation 1.02 relaxation 0.3"):
+        (nees, half), nis, ratio = found[label]
+        assert nees + half < 10 and BAND[0] < nis < BAND[1] and ratio < 1.15
+
+
+def test_there_nothing_cures_50_members_at_1_khz():
+    found = by_label("filters_fast")
+    for label, (nees, _), _, ratio in ((label, *rest) for label, rest in found.items()):
+        if " 50" in label:
+            assert nees > 100 or ratio > 100
+    assert found["ekf"][0][0] == pytest.approx(8.0, abs=0.7)
 
 
 @pytest.mark.slow
@@ -26,6 +80,11 @@ def test_restless_angles_are_the_model_s_and_no_other_number_changes():
     before, after = known.model.process_noise_cov.diagonal(), changed.model.process_noise_cov.diagonal()
     assert after[6:].tolist() == [1e-6, 1e-6] and after[:6].tolist() == before[:6].tolist()
     assert changed.size == known.size == 50
+
+
+def test_numbers_are_printed_with_half_their_interval():
+    assert about(Interval(21.374, 20.47, 22.27)) == "21.37 ± 0.90"
+    assert about(Interval(161160.6, 112706.8, 217080.6)) == "161000 ± 52000"
 
 
 def test_only_the_table_that_is_asked_for_is_made(tmp_path, monkeypatch):

@@ -7,10 +7,11 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
-from tuning.experiments.policies import NOISES, TASK
-from tuning.experiments.policies_report import HEADER
+from tuning.experiments.policies import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
+from tuning.experiments.policies_report import GOAL, HEADER, NOT_ON_PAGE, name_of
+from tuning.policies.algorithms import OBSERVATION_SETS
 from tuning.policies.saved import classical_policy, score
-from tuning.policies.setup import make_configuration
+from tuning.policies.setup import TASKS, make_configuration
 from tuning.problems.data import held_out_seeds
 from tuning.thruster.scenario import find_scenario
 
@@ -19,6 +20,7 @@ PAGE = "\n".join((DOCS / name).read_text() for name in ("policies.md", "appendix
 TABLES = {
     noise: PAGE.partition(f"<!-- table policies_{noise} -->")[2].partition("<!-- end -->")[0] for noise in NOISES
 }
+ANSWERS = " ".join(PAGE.partition("<!-- table answers -->")[2].partition("<!-- end -->")[0].split())
 
 
 def rows_at(noise):
@@ -30,6 +32,68 @@ def rows_at(noise):
 
 def returned(row):
     return float(row["return"].split(" ± ")[0])
+
+
+@pytest.mark.parametrize("noise", ["low", "high"])
+def test_the_tables_have_every_policy(noise):
+    planned = runs_of(Comparison(noises=(noise,), seeds=1, variants=False))
+    assert list(rows_at(noise)) == [
+        name_of(run.kind, run.label) for run in planned if run.label not in NOT_ON_PAGE
+    ]
+
+
+def test_the_table_of_medium_noise_has_every_variant_too():
+    planned = runs_of(Comparison(noises=("medium",), seeds=1, variants=False))
+    expected = {name_of(run.kind, run.label) for run in planned if run.label not in NOT_ON_PAGE}
+    expected |= {name_of(kind, f"{arm}, {variant}") for kind in ("ppo", BEST) for arm, variant in VARIANTS}
+    expected |= {name_of("ppo+mpc", f"ekf, {variant}") for variant in WRONG}
+    expected |= {name_of(BEST, f"true, {variant}") for variant in WRONG if variant != "wrong model"}
+    assert set(rows_at("medium")) == expected
+
+
+def test_the_page_tells_every_arm_and_the_task():
+    assert all(f"`{arm}`" in PAGE for arm in OBSERVATION_SETS)
+    (reference,) = TASKS[TASK].arguments["reference"]
+    assert f"between {reference['low']} and {reference['high']}" in PAGE and reference["hold_time"] == 0.5
+    assert all(f"`{name}`" in PAGE for name in NOISES.values())
+
+
+def test_the_command_that_makes_the_page_is_there():
+    assert "thruster reproduce policies --page docs/appendix/policies.md" in PAGE
+
+
+def test_filtered_state_closes_the_gap_and_noise_costs():
+    for noise in NOISES:
+        rows = rows_at(noise)
+        assert returned(rows["PPO: raw"]) < returned(rows["PPO: raw+action"]) < returned(rows["PPO: true"])
+        for arm in ("ekf", "enkf", "belief"):
+            assert int(rows[f"PPO: {arm}"]["gap closed"].split()[0]) >= 100 * GOAL
+            if noise == "medium":
+                assert float(rows[f"PPO: {arm}"]["observed"]) < float(rows["PPO: raw"]["observed"])
+    for policy in ("PPO: ekf", "MPC: ekf", "one step: enkf"):
+        costs = [-returned(rows_at(noise)[policy]) for noise in ("low", "medium", "high")]
+        assert costs == sorted(costs)
+    assert "is reached" in ANSWERS
+
+
+def test_the_nonlinear_controller_is_what_a_policy_is_measured_by():
+    for noise in NOISES:
+        rows = rows_at(noise)
+        assert rows["MPC: true"]["gap closed"] == "100 %" and returned(rows["MPC: true"]) == -0.445
+        for arm in ("ekf", "enkf", "true"):
+            best = returned(rows[f"MPC: {arm}"])
+            assert best == pytest.approx(returned(rows[f"one step: {arm}"]), abs=1.1e-3)
+            assert best > 0.3 * returned(rows[f"{'LQR' if arm == 'true' else 'LQG'}: {arm}"])
+        # A policy that corrects the controller is within 2 % of it.
+        assert returned(rows["PPO + MPC: ekf"]) > 1.02 * returned(rows["MPC: ekf"])
+    assert returned(rows_at("medium")["PPO + MPC: true"]) > 1.02 * returned(rows_at("medium")["MPC: true"])
+
+
+def test_where_the_model_is_wrong_a_policy_that_corrects_it_beats_the_controller():
+    rows = rows_at("medium")
+    for variant in WRONG:
+        assert returned(rows[f"PPO + MPC: ekf, {variant}"]) > returned(rows[f"MPC: ekf, {variant}"])
+        assert f"PPO + MPC: ekf, {variant} returns +" in ANSWERS
 
 
 @pytest.mark.parametrize(
