@@ -49,7 +49,7 @@ def frame(path: Path) -> Path:
 
 def loop(path: Path) -> Path:
     """Over the top with a quaternion: the path from the side, pitch, and the error of attitude."""
-    arguments = {"attitude": "quaternion", "sensors": "vectors", "max_thrust": 8.0}
+    arguments = {"attitude": "quaternion", "sensors": "vectors", "max_thrust": 8.0, "depth": 20.0}
     env = EstimateState(gym.make("SegorogeniAUV-v0", **arguments), "ekf")
     env.reset(seed=1)
     states, estimates, covs = [], [], []
@@ -76,8 +76,8 @@ def loop(path: Path) -> Path:
     rise.plot(time, np.where(level, pitch, np.nan), color="C0", label="upright")
     rise.plot(time, np.where(level, np.nan, pitch), color="C3", label="on its back")
     rise.axhline(90.0, color="0.6", linewidth=0.8)
-    rise.set(xlabel="time [s]", ylabel="pitch [deg]")
-    rise.legend(loc="lower left")
+    rise.set(xlabel="time [s]", ylabel="pitch [deg]", ylim=(-5.0, 140.0), yticks=range(0, 91, 30))
+    rise.legend(loc="upper right")
     error.plot(time, np.degrees(np.linalg.norm(off, axis=1)), color="C0", label="error")
     error.plot(time, np.degrees(std), color="0.6", label="standard deviation")
     error.set(xlabel="time [s]", ylabel="attitude [deg]", ylim=(0.0, 0.9))
