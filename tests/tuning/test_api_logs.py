@@ -176,8 +176,14 @@ def test_the_model_of_a_tuned_file_s_logs_may_be_given_as_an_object(tmp_path, mo
 def test_the_input_of_a_row_acts_from_it_on_or_until_it():
     table = {"t": [0.0, 0.1, 0.2, 0.3], "u_1": [1.0, 2.0, 3.0, 4.0], "z_1": [0.0, 1.0, 2.0, 3.0]}
     model = affine_model(F=[[0.9]], B=[[1.0]], H=[[1.0]], Q=[1.0], R=[1.0], x0=[0.0], P0=[1.0])
-    for act, inputs in ((None, [1.0, 2.0, 3.0]), ("from", [1.0, 2.0, 3.0]), ("until", [2.0, 3.0, 4.0])):
+    expected = {
+        None: [1.0, 2.0, 3.0],
+        "from": [1.0, 2.0, 3.0],
+        "until": [2.0, 3.0, 4.0],
+        "between": [1.5, 2.5, 3.5],
+    }
+    for act, inputs in expected.items():
         log, _ = tuning.read_logs(table, model=model, inputs_act=act).read()
         assert log.inputs.ravel().tolist() == inputs
-    with pytest.raises(ValueError, match="inputs_act must be one of from, until, but got 'since'"):
+    with pytest.raises(ValueError, match="inputs_act must be one of from, until, between, but got 'since'"):
         tuning.read_logs(table, model=model, inputs_act="since").read()

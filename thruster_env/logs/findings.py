@@ -1,7 +1,8 @@
 """Findings in a recorded run that affect the trust in results from it.
 
 They are gaps; rows that were moved, dropped or doubled; inputs without samples; sensors that are stuck or
-saturated; outliers and bursts of them; and the way times were read, if the file does not state it.
+saturated; outliers and bursts of them; axes or units of inertial sensors that differ; and the way times were
+read, if the file does not state it.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 
 from thruster_env.core.angles import difference
 from thruster_env.logs.grid import date_text, time_text
+from thruster_env.logs.imu import of_inertial_sensors
 
 if TYPE_CHECKING:
     from thruster_env.logs.log import Log
@@ -22,6 +24,7 @@ GAP, MISSING, MOVED, DROPPED, DOUBLED = "gap", "missing rows", "moved", "dropped
 STUCK, SATURATED, OUTLIER = "stuck", "saturated", "outlier"
 DAMAGED = "damaged"  # the file: of its messages some are not read
 CLOCK, OUTSIDE, STALE = "clock", "outside", "no input"
+MISALIGNED = "axes or units"
 SPOILING = (GAP, STALE, STUCK, SATURATED, OUTLIER)  # what moves estimates
 OUTLIERS = ("kept", "missing")  # whether a study takes them as measurements or leaves them out
 LEVEL = 1e-4
@@ -68,7 +71,7 @@ class Finding:
 
     Attributes:
         kind: "damaged", "clock", "outside", "no input", "gap", "missing rows", "moved", "dropped", "doubled",
-            "stuck", "saturated" or "outlier".
+            "stuck", "saturated", "outlier" or "axes or units".
         channel: such as "measurement:thrust"; empty for all of a row.
         first: row of the log where it begins; 0 if it is everywhere.
         last: row where it ends, included.
@@ -87,6 +90,7 @@ class Finding:
 def found_in(log: Log) -> tuple[Finding, ...]:
     """All findings in a log, of its rows first, then channel by channel."""
     findings = [*_of_rows(log)]
+    findings += [Finding(MISALIGNED, "", 0, log.steps, 1, text) for text in of_inertial_sensors(log)]
     for channel, quantity in enumerate(log.measured):
         findings += _of_channel(log, channel, f"measurement:{quantity.symbol}")
     return tuple(findings)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from thruster_env.core.angles import difference
 from thruster_env.core.checks import finite, listed, one_of, positive, short_repr
 from thruster_env.core.files import read_toml
 from thruster_env.logs.columns import (
@@ -44,7 +45,7 @@ from thruster_env.logs.table import Table, read_table, table_of
 from thruster_env.model.state_space import StateSpaceModel
 
 SECOND = "s"
-INPUTS_ACT = ("from", "until")  # when the input of a row acts: from it on, or until it
+INPUTS_ACT = ("from", "until", "between")  # when the input of a row acts
 MOST_STEPS = 10_000_000
 MOST_DOUBLED = 0.1  # of the rows, with the time of the row before; of more the times are wrong
 
@@ -57,7 +58,7 @@ class Description(NamedTuple):
     clock_offset: Mapping[str, float] = {}  # by quantity [s]: how far its clock is ahead
     dt: float | None = None  # sample time [s]: of rows without a time, or of the grid to put irregular ones on
     stamps: str | None = None  # of a bag: "header" or "receipt"
-    inputs_act: str | None = None  # "from" their rows on, or "until" these
+    inputs_act: str | None = None  # "from" their rows on, "until" these, or in the mean "between" two
 
     def updated(self, other: Description) -> Description:
         """This one, overridden by the other."""
@@ -187,7 +188,8 @@ def read_log(
         stamps: of a bag, the clock of all topics: "header" or "receipt"; by default that of the headers if all
             topics have stamps of one clock (`thruster_env.logs.recorders.bags`).
         inputs_act: whether the input of a row acts "from" it on, as a command that is sent then, or "until" it, as
-            a current that is sampled with the voltage. By default "until" for a model whose measurements have
+            a current that is sampled with the voltage; "between" takes the mean of two rows, as for a rate of the
+            instant. By default "until" for a model whose measurements have
             feed-through, h(x, u, c), or whose states have rotations, as a gyroscope is sampled with them, and
             "from" for others.
         name: of a log that is not a file.
@@ -205,7 +207,7 @@ def read_log(
         Description(columns or {}, {}, clock_offset or {}, dt, stamps, inputs_act)
     )
     act = description.inputs_act or ("until" if model.feeds or model.turns else "from")
-    until = one_of("inputs_act", act, INPUTS_ACT) == "until"
+    until = one_of("inputs_act", act, INPUTS_ACT) != "from"
     wanted = quantities_of(model)
     form = format_of(path) if is_file else None
     if form is not None:
@@ -235,9 +237,11 @@ def read_log(
             continue
         series, present = _series(table, column_of[channel.key], channel, of_file)
         if until and channel.kind == INPUT:  # a sample acts since the one before
-            series = Series(
-                series.times[: max(len(series.times) - 1, 1)], series.values[-len(series.values) + 1 :]
-            )
+            values = series.values[-len(series.values) + 1 :]
+            if act == "between" and len(series.values) > 1:
+                rows_before, of_angles = series.values[:-1, None], (channel.quantity.angle,)
+                values = values - difference(values[:, None], rows_before, of_angles)[:, 0] / 2.0
+            series = Series(series.times[: max(len(series.times) - 1, 1)], values)
         samples[channel.key] = series
         rows |= present
         if len(series.values) < len(of_file.times) or of_file.irregular or channel.key in offsets:

@@ -66,7 +66,9 @@ def check_not_among(path: str | Path) -> None:
     for log in logs:
         if log.is_file():
             rule = "a file must not take the name of the description of a log"
-            raise ValueError(f"{rule}, but got {path} beside {log.name}")
+            raise ValueError(
+                f"{rule}, but got {path} beside {log.name}; name it {path.stem}_numbers.toml, for instance"
+            )
 
 
 def write_columns(

@@ -137,7 +137,8 @@ def read_logs(
         grid: whether to put irregular logs on a grid, or to use their own time stamps, for a model in continuous
             time.
         inputs_act: when the input of a row acts: "from" it on, as a command that is sent then, or "until" it, as a
-            current that is sampled with a voltage; "until" by default for models h(x, u, c), "from" for others.
+            current that is sampled with a voltage; "between" takes the mean of two rows, as for a rate of the
+            instant; "until" by default for models h(x, u, c) and those with rotations, "from" for others.
         stamps: clock of all topics of a bag: header (stamps of their headers) or receipt (when messages were
             received); by default that of the headers if all have one clock.
         held_out: held-out run, never used by a search; by default every third one.

@@ -212,7 +212,7 @@ def _report(log: Log) -> list[RenderableType]:
         name = f"{kind} {symbol} [{unit}]" if unit else f"{kind} {symbol}"
         ends = [f"{values.min():.5g}", f"{values.max():.5g}", f"{values.std():.5g}"] if len(values) else [""] * 3
         rows.append([name, str(len(values)), *ends])
-    on_grid = ", put on a grid" if log.irregular else ""
+    on_grid = ", on its own stamps" if log.stamps is not None else ", put on a grid" if log.irregular else ""
     title = f"{log.name}: {log.steps + 1} rows, dt {log.dt:g} s{on_grid}"
     columns = ["channel", "samples", "smallest", "largest", "standard\ndeviation"]
     messages = sentences(log.findings) or ["Nothing stands out: no gaps, no stuck sensors, no outliers."]
