@@ -76,7 +76,7 @@ class WithTables:
         data, model = self.data, self.data.filter.model
         refuse_rotations(model)
         run = at_least("run", run, 0, len(data.keys) - 1)
-        steps, z = np.diff(data.times), data.measurements[run, data.rows]
+        steps, z = np.diff(data.times) if len(data.times) > 1 else np.ones(1), data.measurements[run, data.rows]
         stamps = None if same_dt(float(steps.min()), float(steps.max())) else data.times - data.times[0]
         plain = getattr(model, "plain", model)
         inputs = data.inputs[run][data.rows[1:] - 1, : plain.inputs]

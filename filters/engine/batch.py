@@ -28,7 +28,7 @@ from thruster_env.core.streams import filter_keys
 from thruster_env.core.threads import spread
 from thruster_env.logs.grid import count_steps, resolution_of, resolution_of_digits
 from thruster_env.logs.log import in_any_steps
-from thruster_env.logs.table import refuse_holes, times_of_index
+from thruster_env.logs.table import refuse_holes, refuse_swapped, times_of_index
 from thruster_env.model.continuous import SAME_DT, same_dt
 from thruster_env.model.shape import LANES, with_root
 from thruster_env.model.state_space import StateSpaceModel
@@ -222,11 +222,17 @@ def noise_rows(
 def _noise_rows(name: str, covs, count: int, size: int) -> np.ndarray:
     if covs is None:
         return np.empty((0, 2 * size * size))
-    covs = _floats(name, covs)
-    if covs.shape != (count, size, size):
-        raise ValueError(f"{name} must have shape {(count, size, size)}, but got {covs.shape}")
+    covs = _covs_of_rows(name, covs, count, size)
     definite = name.startswith("measurement")
     return np.array([with_root(covariance(name, cov, size, positive_definite=definite)) for cov in covs])
+
+
+def _covs_of_rows(name: str, covs: Any, count: int, size: int) -> Any:
+    """Covariances of so many rows as an array, (count, size, size); None if there are none."""
+    covs = None if covs is None else _floats(name, covs)
+    if covs is not None and covs.shape != (count, size, size):
+        raise ValueError(f"{name} must have shape {(count, size, size)}, but got {covs.shape}")
+    return covs
 
 
 # Steps of any length, as the arguments of a batch.
@@ -273,6 +279,8 @@ def prepared(
         keys, measurements = None, keys
     if measurements is None:
         raise ValueError(f"measurements must be an array (B, K + 1, m), but got None: {BY_NAME}")
+    refuse_swapped("measurements", measurements, filter_.kernel_model.measurements)
+    refuse_swapped("inputs", inputs, filter_.kernel_model.input_quantities)
     by_index = dt is None and hasattr(measurements, "iloc")
     stamps = times_of_index(measurements.index) if by_index else None
     if by_index and stamps is None:
@@ -285,20 +293,21 @@ def prepared(
     model_dt, fixed = _sample_time(filter_), getattr(filter_.model, "dt", None)
     if stamps is not None and len(stamps) > 1:
         dt = _steps_of(stamps, fixed if model_dt is None else model_dt, update_first)
+    of_rows = measurements.shape[measurements.ndim == 3] if measurements.ndim else 0
+    r = _covs_of_rows("measurement_noise_covs", measurement_noise_covs, of_rows, filter_.kernel_model.m)
+    q = process_noise_covs
+    q = _covs_of_rows("process_noise_covs", q, of_rows - update_first, filter_.kernel_model.t)
     if not update_first:  # a row without a measurement before the first one
         measurements = np.insert(measurements, 0, np.nan, axis=1 if measurements.ndim == 3 else 0)
-        if measurement_noise_covs is not None:
-            measurement_noise_covs = np.concatenate([measurement_noise_covs[:1], measurement_noise_covs])
+        r = None if r is None else np.concatenate([r[:1], r])
     single = is_single(None, inputs, measurements)
     keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
     rows = np.arange(0 if update_first else 1, z.shape[1])
     usual = fixed if model_dt is None else model_dt
     lengths = _lengths(dt, inputs.shape[1], 1.0 if usual is None else usual)
     times = np.append(0.0, np.cumsum(lengths))
-    plain = Prepared(
-        filter_, keys, inputs, z, process_noise_covs, measurement_noise_covs, rows, times[rows], single
-    )
-    if noise is not None and not (callable(noise) and process_noise_covs is None):
+    plain = Prepared(filter_, keys, inputs, z, q, r, rows, times[rows], single)
+    if noise is not None and not (callable(noise) and q is None):
         got = "process_noise_covs, too" if callable(noise) else short_repr(noise)
         raise ValueError(
             f"noise must be a function of a step's length, in place of process_noise_covs, but got {got}"
@@ -332,14 +341,13 @@ def prepared(
     user_rows = np.append(0, np.cumsum(counts))
     long_z = np.full((len(z), len(parts) + 1, z.shape[2]), np.nan)
     long_z[:, user_rows] = z
-    q, r = process_noise_covs, measurement_noise_covs
     if noise is not None:
         of_length = {length: as_floats(noise(length)) for length in np.unique(parts).tolist()}
         q = np.array([of_length[length] for length in parts.tolist()])
     elif q is not None:  # of a whole step, of which each part has its share
-        q = np.repeat(as_floats(q) / counts[:, None, None], counts, axis=0)
+        q = np.repeat(q / counts[:, None, None], counts, axis=0)
     if r is not None:
-        r = as_floats(r)[np.minimum(np.searchsorted(user_rows, np.arange(len(parts) + 1)), len(r) - 1)]
+        r = r[np.searchsorted(user_rows, np.arange(len(parts) + 1))]
     long_u, of_user = np.repeat(inputs, counts, axis=1), (user_rows[rows], times[rows], single)
     if filter_.by_length:
         known = {text: filter_.of_length(float(text)) for text in {f"{part:.12g}" for part in parts.tolist()}}

@@ -159,6 +159,9 @@ def test_an_index_of_times_gives_the_steps(walk):
     for function in (lambda z: filters.run(walk, z), lambda z: tuning.fit(z, model="constant", dt=0.1)):
         with pytest.raises(ValueError, match="whole numbers must be equal steps, but 9 follows 6: z.reindex"):
             function(holes)
+        for index in (np.arange(40)[::-1], -0.1 * np.arange(40), np.append(np.arange(20), np.arange(20))):
+            with pytest.raises(ValueError, match="index of numbers must increase, but .* follows .*z.sort_index"):
+                function(pandas.Series(Z, index=index))
     with pytest.raises(ValueError, match="times of the index must increase, but row 1 comes -0.1 s later"):
         filters.run(walk, series[::-1])
 

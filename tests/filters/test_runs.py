@@ -39,6 +39,28 @@ def test_a_run_of_a_list_a_table_or_a_batch_is_a_table_and_a_picture(as_python):
     np.testing.assert_array_equal(of_pandas.means, estimates.means)
     with pytest.raises(ValueError, match="run must be at most 1, but got 2"):
         batch.plot(2)
+    with pytest.raises(ValueError, match="at least 3 rows, but run has 1"):
+        filters.run(LEVEL, Z[:1]).to_frame()
+
+
+def test_columns_of_a_table_in_another_order_than_the_models_are_refused():
+    kf, swapped = filters.make_filter("kf", LINEAR), pandas.DataFrame(MEASURED, columns=["rate", "position"])
+    with pytest.raises(
+        ValueError, match=r"position, rate, but got rate, position: table\[\['position', 'rate'\]\]"
+    ):
+        filters.run(kf, inputs=U, measurements=swapped)
+    named = filters.run(kf, inputs=U, measurements=swapped[["position", "rate"]])
+    plain = filters.run(kf, inputs=U, measurements=MEASURED[:, ::-1])
+    np.testing.assert_array_equal(named.means, plain.means)
+
+
+@pytest.mark.parametrize("lengths", [None, LENGTHS])
+def test_covariances_of_fewer_rows_are_refused_also_with_steps_of_any_length(lengths):
+    kf = filters.make_filter("kf", LINEAR)
+    for name, size in (("process_noise_covs", 29), ("measurement_noise_covs", 30)):
+        for covs in (np.eye(2), np.eye(2)[None], np.tile(np.eye(2), (size - 1, 1, 1)), np.ones((size, 2))):
+            with pytest.raises(ValueError, match=rf"{name} must have shape \({size}, 2, 2\), but got"):
+                filters.run(kf, inputs=U, measurements=MEASURED, dt=lengths, **{name: covs})
 
 
 def test_a_prediction_before_the_first_measurement_is_that_of_the_prior(as_python):

@@ -387,13 +387,32 @@ def times_of_index(index: Any) -> np.ndarray | None:
 
 
 def refuse_holes(index: Any) -> None:
-    """Raise ValueError for a pandas index that counts rows of which some are missing, as after `dropna`."""
-    steps = np.diff(index.to_numpy()) if getattr(index.dtype, "kind", "") in "iu" else np.ones(1)
-    if (steps > 0).all() and len(set(steps.tolist())) > 1:
+    """Raise ValueError for a pandas index of numbers that has holes, as after `dropna`, or does not increase.
+
+    Floats of another unit than of time are not checked.
+    """
+    kind, unit = getattr(index.dtype, "kind", "O"), parted(str(index.name or ""))[1]
+    if kind not in "iuf" or (kind == "f" and unit and simple(unit)[0] != "s"):
+        return
+    steps = np.diff(index.to_numpy())
+    if not (steps > 0).all():
+        row = int(np.argmin(steps > 0)) + 1
+        rule = f"an index of numbers must increase, but {index[row]} follows {index[row - 1]}"
+        raise ValueError(f"{rule}: z.sort_index() puts rows in order, z.to_numpy() leaves the index out")
+    if kind != "f" and len(set(steps.tolist())) > 1:
         row = int(np.argmax(steps != steps.min())) + 1
         rule = "rows of an index of whole numbers must be equal steps"
         way = "z.reindex(range(first, last + 1)) puts NaN in missing rows, z.to_numpy() leaves the index out"
         raise ValueError(f"{rule}, but {index[row]} follows {index[row - 1]}: {way}")
+
+
+def refuse_swapped(name: str, table: Any, quantities: Sequence) -> None:
+    """Raise ValueError for a pandas table whose columns are those of the model in another order."""
+    symbols, headers = [quantity.symbol for quantity in quantities], map(str, getattr(table, "columns", ()))
+    columns = [header if header in symbols else parted(header)[0] for header in headers]
+    if columns != symbols and sorted(columns) == sorted(symbols):
+        rule = f"columns of {name} must be in the order of the model, {', '.join(symbols)}"
+        raise ValueError(f"{rule}, but got {', '.join(columns)}: table[[{', '.join(map(repr, symbols))}]] has it")
 
 
 def _of_arrays(path: Path | str, cells: dict[str, np.ndarray]) -> Table:
