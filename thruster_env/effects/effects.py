@@ -155,8 +155,9 @@ class Registry:
 
         def decorate(cls: type[Registered]) -> type[Registered]:
             known = self.effects.get(name, cls)
-            if known.__module__ != cls.__module__ and known.__module__.startswith("thruster_env."):
-                raise ValueError(f"an effect must have a name of its own, but {name!r} is {known.__qualname__}")
+            if known.__module__ != cls.__module__:  # else it is defined anew, as in a notebook
+                of_other = f"{known.__qualname__} of {known.__module__}"
+                raise ValueError(f"an effect must have a name of its own, but {name!r} is {of_other}")
             cls.name = name
             self.effects[name] = cls
             return cls

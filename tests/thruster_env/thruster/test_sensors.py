@@ -12,7 +12,7 @@ from scipy import stats
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
-from thruster_env.effects.effects import Effect
+from thruster_env.effects.effects import Effect, Registry
 from thruster_env.effects.sensors import SENSOR_EFFECTS, Bias, Quantisation
 from thruster_env.thruster.dynamics import thrust_and_torque
 from thruster_env.thruster.equations import simulate
@@ -282,6 +282,14 @@ def registered(monkeypatch, act):
     OwnEffect.act = staticmethod(act)
     monkeypatch.setitem(SENSOR_EFFECTS.effects, "own", OwnEffect)
     return {"name": "own", "factor": 1.5}
+
+
+def test_a_name_of_another_module_s_effect_is_refused_and_one_defined_anew_replaces():
+    registry, classes = Registry("sensors"), [type("Drift", (Effect,), {"__module__": name}) for name in "aab"]
+    for cls in classes[:2]:  # as a cell of a notebook that runs again
+        assert registry.register("drift")(cls) is registry.effects["drift"]
+    with pytest.raises(ValueError, match="an effect must have a name of its own, but 'drift' is Drift of a"):
+        registry.register("drift")(classes[2])
 
 
 def test_an_effect_of_one_s_own_may_decide_and_keep_what_it_likes(monkeypatch):
