@@ -163,6 +163,16 @@ def test_ctrl_c_keeps_the_best_so_far(data):
     assert found.log_likelihood >= rises[2][0] and "Interrupted" in found.sentences()[-1]
 
 
+def test_ctrl_c_before_any_start_is_an_interrupt_not_an_error_of_the_starts(data, monkeypatch):
+    def interrupted(objective, *_):
+        signal.raise_signal(signal.SIGINT)
+        return objective
+
+    monkeypatch.setattr("tuning.identification.identify._with_starts", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        identify(data, pendulum, FREE, starts=2)
+
+
 def test_a_profile_falls_as_the_standard_error_says(found, tmp_path):
     (one,) = profiles(found, ["stiffness"])
     low, high = one.interval

@@ -165,6 +165,7 @@ def identify(
 
     Raises:
         ValueError: for parameters, starts or data that do not fit each other, or if no start has a likelihood.
+        KeyboardInterrupt: after Ctrl-C before any start.
 
     Source: Astrom (1980), "Maximum likelihood and prediction error methods", Automatica 16(5).
     """
@@ -193,6 +194,8 @@ def identify(
                 objective.evaluations += evaluations
                 tell(ascent.at, ascent.found, number)
         ascents = [ends[number][1] for number in sorted(ends)]
+        if not ascents:
+            raise KeyboardInterrupt
         if not any(math.isfinite(ascent.found.value) for ascent in ascents):
             raise ValueError(
                 "the filter must stay finite on all runs from at least one start, but it does from none of "
