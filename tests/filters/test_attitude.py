@@ -629,3 +629,20 @@ def test_a_run_begins_at_its_first_measurement():
         Turned.from_quat(begun_at(model, np.where(np.arange(6) < 3, z, np.nan))[:, [1, 2, 3, 0]]).as_quat().T
     )
     np.testing.assert_allclose(np.column_stack([2 * (x * zz - w * y), 2 * (y * zz + w * x)]), z[:, :2], atol=1e-2)
+
+
+def test_a_measured_quaternion_is_refused_and_the_columns_of_its_matrix_have_its_covariance():
+    def quaternion(x, c):
+        return x[0], x[1], x[2], x[3]
+
+    def columns(x, c):
+        return tuple(v for axis in np.eye(3).tolist() for v in rotations.to_world(x[:4], axis))
+
+    sigma, model = 0.01, attitude_model()
+    with pytest.raises(ValueError, match="observe must be the same for q and -q of 'attitude'.*to_world"):
+        model.replace(observe=quaternion, measurement_noise_cov=[sigma**2] * 4, measurements=None)
+    of_columns = model.replace(observe=columns, measurement_noise_cov=[2.0 * sigma**2] * 9, measurements=None)
+    z = Turned.from_rotvec([0.03, -0.05, 0.02]).as_matrix().T.ravel()
+    estimates = filters.run(filters.make_filter("ekf", of_columns), inputs=np.zeros((0, 3)), measurements=[z])
+    prior = np.deg2rad(5.0) ** 2
+    np.testing.assert_allclose(estimates.stds[0, :3] ** 2, prior * sigma**2 / (prior + sigma**2), rtol=5e-3)
