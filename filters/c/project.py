@@ -226,6 +226,17 @@ def c_filter(
     return called(name)
 
 
+def write_filter(generated: CFilter, folder: str | Path) -> list[Path]:
+    """Write a filter's header and source alone; return the files."""
+    texts = {f"{generated.name}.h": generated.header, f"{generated.name}.c": generated.source}
+    files = [Path(folder) / name for name in texts]
+    for file in files:
+        check_target(file)
+    for file, text in zip(files, texts.values(), strict=True):
+        write_whole(file, text)
+    return files
+
+
 class Sizes(NamedTuple):
     """Bytes of a filter."""
 

@@ -4,6 +4,7 @@ import ctypes
 import shutil
 import subprocess
 from functools import partial
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation as Turned
 
 import filters
 from filters.bounds import path_bound, posterior_bound
-from filters.c.project import c_filter, write_project
+from filters.c.project import c_filter, write_filter, write_project
 from filters.consistency.report import consistency_report
 from filters.differentiated.runs import ModelSlopes
 from filters.estimators.foreign import Estimator, ForeignFilter
@@ -323,6 +324,22 @@ def test_the_filter_in_c_has_the_same_numbers(data, of_side, tmp_path):
         c.attitude_update(address(memory), address(z[0, k].copy()))
     np.testing.assert_allclose(memory[:7], of_side["body"].means[0, 19], atol=1e-14)
     np.testing.assert_allclose(memory[7:43].reshape(6, 6), of_side["body"].covs[0, 19], atol=1e-16)
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_c_on_the_page_begins_at_the_attitude_of_gravity_and_field(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "attitude.md").read_text(encoding="utf-8")
+    files = write_filter(c_filter(filters.ExtendedKalmanFilter(model=attitude_model()), "attitude"), tmp_path)
+    (tmp_path / "begin.c").write_text(page.split("```c\n")[1].split("```")[0])
+    library, flags = tmp_path / "begin.so", ["-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
+    subprocess.run(["gcc", *flags, *map(str, (files[1], tmp_path / "begin.c")), "-o", library, "-lm"], check=True)
+    c, memory = ctypes.CDLL(str(library)), np.zeros(7 + 36 + 6 + 36 + 4)
+    half_turns = [[np.pi, 0, 0], [0, np.pi, 0], [0, 0, np.pi], [np.pi / 2**0.5, -np.pi / 2**0.5, 0]]
+    for turn in [*half_turns, *np.random.default_rng(2).normal(size=(20, 3)), [0.0, 0.0, 0.0]]:
+        world = Turned.from_rotvec(turn)
+        z = np.concatenate([9.81 * world.inv().apply(GRAVITY), 48.0 * world.inv().apply(FIELD)])
+        c.begin(*(array.ctypes.data_as(ctypes.c_void_p) for array in (memory, z)))
+        assert (world.inv() * Turned.from_quat(memory[:4], scalar_first=True)).magnitude() < 1e-7
 
 
 @pytest.mark.parametrize("name", FILTERS)

@@ -21,10 +21,11 @@ if TYPE_CHECKING:
 AXES = "xyz"
 WINDOW = 0.1  # s, of a turn
 FEWEST = 50  # turns
+LATEST = 1.0  # s, of a first sample
 CORRELATED, HIGHER = 0.6, 0.15  # the best correlation, at least, and how much it must be above that of P = 1
-LEAST_SCALE, MOST_SCALE = 0.6, 1.6
+LEAST_SCALE, MOST_SCALE = 0.3, 3.0  # an accelerometer far from the axis of swinging turns faster, too
 GRAVITY, LEAST_GRAVITY, MOST_GRAVITY = 9.81, 7.0, 13.0  # m/s^2
-UNITS = {"deg/s": 0.0174533, "mrad/s": 1e-3}  # in rad/s
+UNITS = {"deg/s": 0.0174533, "rpm": 0.104720, "mrad/s": 1e-3}  # in rad/s
 SENSORS = {"acc": "accelerometer", "mag": "magnetometer"}
 
 
@@ -43,6 +44,10 @@ class Fit(NamedTuple):
             return False
         is_swapped = self.axes != tuple(AXES) and self.correlation > self.as_named + HIGHER
         return is_swapped or not LEAST_SCALE < self.scale < MOST_SCALE
+
+    def agrees(self, other: Fit) -> bool:
+        """Whether another vector has the same axes, and about the same scale."""
+        return self.axes == other.axes and 0.7 < self.scale / other.scale < 1.4
 
     @property
     def inverse(self) -> tuple[str, ...]:
@@ -63,21 +68,27 @@ def of_inertial_sensors(log: Log) -> list[str]:
     if gyroscope is None or log.inputs.shape[0] < FEWEST:
         return []
     symbols, sentences, fits = [quantity.symbol for quantity in log.measured], [], {}
-    for sensor in SENSORS:
+    for sensor, name in SENSORS.items():
         columns = _columns(symbols, sensor)
         if columns is None:
             continue
         vectors = log.measurements[:, columns]
-        fit = fitted(vectors, log.inputs[:, gyroscope], np.diff(log.times))
-        if fit is not None and fit.is_off:
-            fits[sensor] = fit
-        length = float(np.nanmedian(np.linalg.norm(vectors, axis=1))) if np.isfinite(vectors).any() else GRAVITY
+        measured = np.isfinite(vectors).all(axis=1)
+        if not measured.any():
+            continue
+        begins = float(log.times[measured.argmax()])
+        if begins > LATEST:
+            wrong = "attitudes until then are wrong, and those after it for long, beyond their deviations"
+            sentences.append(f"The {name} begins after {begins:.3g} s: {wrong}; cut the log to begin there")
+        length = float(np.median(np.linalg.norm(vectors[measured], axis=1)))
         if sensor == "acc" and not LEAST_GRAVITY < length < MOST_GRAVITY:
             hint = ": it may be in g; name the unit, as in acc_x [g]" if 0.7 < length < 1.3 else ""
             sentences.append(f"The median of |acc| is {length:.3g} m/s^2, not about {GRAVITY}{hint}")
-    first, *more = fits.values() or [None]
-    if first and more and all(fit.axes == first.axes and 0.7 < fit.scale / first.scale < 1.4 for fit in more):
-        return [*sentences, _sentence(list(fits), first)]
+        fit = fitted(vectors, log.inputs[:, gyroscope], np.diff(log.times))
+        if fit is not None and fit.is_off:
+            fits[sensor] = fit
+    if len(fits) == len(SENSORS) and fits["acc"].agrees(fits["mag"]):
+        return [*sentences, _sentence(list(fits), fits["mag"])]
     return sentences + [_sentence([sensor], fit) for sensor, fit in fits.items()]
 
 

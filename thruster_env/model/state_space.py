@@ -34,7 +34,7 @@ from thruster_env.model.quantities import (
 )
 from thruster_env.model.shape import Functions, Shape, constants_are_array, constants_form
 from thruster_env.model.traced import called_function
-from thruster_env.model.turns import Turn, move, refuse_rotations, unit_mean, with_rotations
+from thruster_env.model.turns import Turn, refuse_rotations, refuse_signs, unit_mean, with_rotations
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -376,30 +376,7 @@ def check_functions(model) -> None:
             _check_arguments(name, function, arguments)
             _check_result(name, function, model, arguments, shape, rule)
     if model.turns:
-        _refuse_signs(model, arguments_of_h)
-
-
-def _refuse_signs(model, arguments: str) -> None:
-    """Raise ValueError if h differs between q and -q of a rotation: no filter knows which of them a sensor has."""
-    x = np.array(move(model.prior_mean, np.linspace(0.2, 0.4, model.t), model.turns))
-    for turn in model.turns:
-        if turn.kind == "direction":
-            continue
-        other = x.copy()
-        other[turn.quaternion] *= -1.0
-        try:
-            with np.errstate(all="ignore"):
-                first, second = (as_floats(model.observe(*_arguments(arguments, model, at))) for at in (x, other))
-        except (ArithmeticError, ValueError):
-            continue
-        if not np.allclose(
-            first, second, rtol=1e-6, atol=1e-9 * np.nanmax(abs(first), initial=1.0), equal_nan=True
-        ):
-            raise ValueError(
-                f"observe must be the same for q and -q of {turn.name!r}, which are one attitude, but returned "
-                f"{short_repr(first)} and {short_repr(second)}: in place of a quaternion measure the columns of "
-                "its matrix, rotations.to_world(q, (1, 0, 0)) and so on"
-            )
+        refuse_signs(lambda x: model.observe(*_arguments(arguments_of_h, model, x)), model.prior_mean, model.turns)
 
 
 def _refuse_slopes(name: str, model, arguments: str, value_text: str) -> None:

@@ -204,6 +204,28 @@ def refuse_rotations(model: Any) -> None:
         )
 
 
+def refuse_signs(observe: Callable[[np.ndarray], Any], mean: np.ndarray, turns: Sequence[Turn]) -> None:
+    """Raise ValueError if h(x) differs between q and -q of a rotation: no filter knows which one a sensor has."""
+    x = np.array(move(mean, np.linspace(0.2, 0.4, len(mean) - len(turns)), turns))
+    for turn in turns:
+        if turn.kind == "direction":
+            continue
+        other = x.copy()
+        other[turn.quaternion] *= -1.0
+        try:
+            with np.errstate(all="ignore"):
+                first, second = (np.asarray(observe(at), dtype=np.float64) for at in (x, other))
+        except (ArithmeticError, ValueError):  # not defined there
+            continue
+        near = 1e-9 * float(np.nanmax(abs(first), initial=1.0))
+        if not np.allclose(first, second, rtol=1e-6, atol=near, equal_nan=True):
+            raise ValueError(
+                f"observe must be the same for q and -q of {turn.name!r}, which are one attitude, but returned "
+                f"{short_repr(first)} and {short_repr(second)}: in place of a quaternion measure the columns of "
+                "its matrix, rotations.to_world(q, (1, 0, 0)) and so on"
+            )
+
+
 def stored_of(values: Sequence, turns: Sequence[Turn], of_rotation: float) -> list:
     """The values of a tangent for each stored number: those of numbers, and another one for unit vectors."""
     result = list(values)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from filters.c.programs import programs_of, single_error
-from filters.c.project import write_project
-from filters.monitoring.monitor import Monitor
+from filters.c.project import c_filter, write_filter, write_project
+from filters.monitoring.monitor import Monitor, monitor_of
 from thruster_env.core.checks import one_of
 from thruster_env.core.files import check_target
 from tuning.api.estimate import monitor_for
@@ -63,7 +63,8 @@ def export(
     """Write a tuned Kalman or ensemble filter as C99, with its model, Q and R, and a program that filters a log.
 
     All but gsf, imm, mmae and fuzzy can be exported. The code has fixed sizes and needs only math.h; it comes with
-    a C++ class. `single` also computes the largest change of an estimate on a training run.
+    a C++ class. `single` also computes the largest change of an estimate on a training run. Of rotations it writes
+    the filter alone, without C++, program and that change; docs/attitude.md says how it begins.
     See docs/howto/export.md.
 
         tuning.export("tuned.json", "boat", name="bow")
@@ -97,6 +98,9 @@ def export(
     check_target(Path(out) / "README.md")
     choice, source, seed = read_tuned(tuned, given_for(tuned, problem, model, preset))
     filter_ = choice.filter(source)
+    if filter_.model.turns and not board:
+        generated = c_filter(filter_, name, single=single, monitor=monitor_of(watch))
+        return Exported([str(path) for path in write_filter(generated, out)], None)
     options: dict[str, Any] = {"single": single, "monitor": watch, "board": board, "dt": source.dt}
     files = [str(path) for path in write_project(filter_, out, name, **options)]
     if not single:

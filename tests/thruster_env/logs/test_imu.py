@@ -60,3 +60,10 @@ def test_wrong_axes_and_units_are_said_with_what_fits(sensors, change, expected)
 
 def test_times_in_milliseconds_are_said(sensors):
     assert any("times may be in ms" in sentence for sentence in _sentences(*sensors, dt=DT * 1000))
+
+
+def test_a_sensor_that_begins_late_is_said(sensors):
+    gyr, acc, mag = (array.copy() for array in sensors)
+    mag[:200] = np.nan
+    (sentence,) = _sentences(gyr, acc, mag)
+    assert sentence.startswith("The magnetometer begins after 3 s")
