@@ -6,6 +6,8 @@ import json
 import pickle
 import signal
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import matplotlib.figure
 import numpy as np
@@ -17,7 +19,7 @@ from filters.c.project import c_filter
 from filters.monitoring import Monitor
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.problems.find import find_problem
-from tuning.reporting.tuning_report import report
+from tuning.reporting.tuning_report import next_steps, report
 
 TRIALS = 5
 SHORT = find_problem("nominal").replace(steps=70, name="short")  # quick to tune on
@@ -82,6 +84,10 @@ def test_what_is_printed_are_the_tables_of_the_command_line(study):
     assert "\n" not in repr(found) and "\n" not in repr(study)
     assert str(study).splitlines()[0] == lines[0] and str(study).count(lines[0]) == 1
     assert all(line in str(study) for line in lines) and html.escape(printed[0]) in study._repr_html_()
+    named = next_steps(replace(study, file=Path("tuned.json")))
+    assert named == ["Tuned filter: tuned.json", "Next: thruster report tuned.json"]
+    (unsaved,) = next_steps(replace(study, file=None))
+    assert "study.save(FILE)" in unsaved and "None" not in unsaved
 
 
 def test_baselines_are_filters_that_go_around_an_env(study):

@@ -64,6 +64,7 @@ from tuning.problems.problem import Problem
 from tuning.reporting.leaderboard import as_json, report
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
+from tuning.search.storage import quiet_optuna
 
 if TYPE_CHECKING:
     import pandas
@@ -333,7 +334,8 @@ def compare(
     for each in problems:
         held_out(each)  # a clear error before any filter runs
     total, console = len(contenders) * len(problems), console_for(progress)
-    with task_map(executor) as tasks, row_bar(total, console) as on_row:
+    # Around all threads of an executor: the first that is done would else let Optuna talk in the others.
+    with quiet_optuna(), task_map(executor) as tasks, row_bar(total, console) as on_row:
         boards, interrupted = compare_all(contenders, problems, held_out, on_row, tasks)
     return FilterComparison(tuple(boards), seed, interrupted, left_out | unfit, knows)
 

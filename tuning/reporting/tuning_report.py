@@ -156,6 +156,8 @@ def next_steps(tuning: Study) -> list[str]:
     ]
     options += [f"--model {name}" for name in dict.fromkeys(map(model_named_in, plain)) if name is not None]
     output.append(" ".join([f"Next: thruster report {quote(str(tuning.file))}", *options]))
+    if tuning.file is None:  # in Python, where nobody asked for one
+        output = ["Next: study.save(FILE) writes the tuned filter for commands and EstimateState."]
     if tuning.result.interrupted:
         output.append("Interrupted: this is the result of the finished trials; the same command continues.")
     return output
