@@ -230,7 +230,7 @@ BAD = {
     "uncertainty = 3": "uncertainty must be",
     'plant = "auv"\nstates = "motion"\nscale = 1': "scale must be 8 finite numbers",
     'plant = "auv"\nstates = "all"': "states must be one of velocities, motion, .*, but got 'all'",
-    'plant = "auv"\nmeasurement_noise_cov = 1.0': "measurement_noise_cov must be 1 to 14 variances, one for each",
+    'plant = "auv"\nmeasurement_noise_cov = 1.0': "measurement_noise_cov must be 1 to 20 variances, one for each",
     'plant = "auv"\npreset = "titanic"': "preset must be",
     'plant = "auv"\nexcitation = {name = "manoeuvre", path = "V"}': "path must be one of I, II, III, IV, dynamic",
     'plant = "auv"\nbase = "auv:navigation"\nstates = "motion"\nscale = [1, 1, 1, 1, 1, 1, 1, 1]': (
