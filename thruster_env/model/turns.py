@@ -200,7 +200,7 @@ def refuse_rotations(model: Any) -> None:
         raise ValueError(
             f"states must be numbers and angles here, but {names} {'is' if len(model.turns) == 1 else 'are'} of "
             f"{kinds}: 'ekf', 'iekf', 'ukf', 'ckf', their kin and 'enkf' take these, in filters.run, "
-            "sessions, wrapped envs and C"
+            "sessions, C and EstimateState around an env of your own; problems, ModelEnv and tensors do not"
         )
 
 
