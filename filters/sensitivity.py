@@ -154,9 +154,9 @@ def sensitivity(
             outliers move less; above 2. The filter stays as it is.
         blocks: number of equal parts of each trajectory, whose values and gradients are returned separately.
         predicted: (m,) which channels the filter only predicts, after it has seen the others, and is never updated
-            with: such as a load cell that is there for the identification only. Their prediction errors enter as
-            innovations do. As nothing corrects them, they are correlated in time, and the information is
-            overestimated.
+            with: such as a load cell that is there for the identification only. Their prediction errors have the
+            covariance R, not S: the R of such a channel is that of its whole error. As nothing corrects them, they
+            are correlated in time, and the information is overestimated.
         starts: of trajectories that do not begin at the prior: parameters do not move their priors (unless these
             are not held), and the innovations of their lead-ins do not count. The likelihood is that of the other
             measurements, given the lead-ins.

@@ -147,7 +147,7 @@ def identify(
             With predicted channels, those of their errors alone.
         predicted: symbols of channels that the filter predicts, but never uses, such as a load cell that will not
             be there later. Without them the model is identified for the best one-step prediction of the
-            measurements; with them, for the best prediction of these channels.
+            measurements; with them, for the best prediction of these channels, whose R is that of the whole error.
         gate: leave out samples whose innovations exceed so many standard deviations of a robust filter, and
             identify again, until the samples stay the same; infinite to keep all. Squares of what is left are
             divided by their share of the variance (`kept_variance`), so that Q and R do not shrink. (With
