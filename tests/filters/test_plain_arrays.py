@@ -162,6 +162,8 @@ def test_an_index_of_times_gives_the_steps(walk):
         for index in (np.arange(40)[::-1], -0.1 * np.arange(40), np.append(np.arange(20), np.arange(20))):
             with pytest.raises(ValueError, match="index of numbers must increase, but .* follows .*z.sort_index"):
                 function(pandas.Series(Z, index=index))
+    depth = pandas.Index(np.arange(40.0)[::-1], name="depth [m]")  # is no time
+    np.testing.assert_array_equal(filters.run(walk, pandas.Series(Z, index=depth)).means, plain.means)
     with pytest.raises(ValueError, match="times of the index must increase, but row 1 comes -0.1 s later"):
         filters.run(walk, series[::-1])
 

@@ -376,7 +376,6 @@ def test_a_pandas_index_of_times_is_taken_and_one_that_counts_is_not():
         assert column_of(pandas.Series(z, index=index)).dt == 1.0
     with pytest.raises(ValueError, match="index of numbers must increase, but 3.8.* follows 3.9"):
         column_of(pandas.Series(z, index=seconds[::-1]))
-    assert column_of(pandas.Series(z, index=pandas.Index(seconds[::-1], name="depth [m]"))).dt == 1.0
     table = pandas.DataFrame({"time": np.arange(40.0), "z": z}, index=seconds)
     assert column_of(table).dt == 1.0  # its column of times is meant
     missing = column_of(pandas.Series(z, index=seconds).drop(seconds[[5, 6]]))
