@@ -221,7 +221,7 @@ def filtered(signal: Signal, model: AffineModel, column: Column) -> Estimates:
     begin = Beginning(np.zeros(axes), True, priors, np.empty((axes, 0, n + n * n)), np.zeros(axes))
     z, rows = (column.table - model.matrices()[4]).T, np.tile(np.append(0, index), (axes, 1))
     sums = filtered_runs(z, rows, tables, signal.output, r, np.empty(0), begin, each_row=True)
-    v, s = sums.innovations[..., 0].T, sums.innovations[..., 1].T
+    v, s = sums.innovations[..., 0].T, np.maximum(sums.innovations[..., 1].T, r)  # less is a wide prior's rounding
     of_axes = sums.beliefs[..., n:].reshape(axes, -1, n, n)
     variances = np.einsum("i,akij,j->ka", signal.output, of_axes, signal.output) + r  # S without a measurement
     densities = -0.5 * (np.log(2.0 * math.pi * s) + v**2 / s)
