@@ -169,10 +169,15 @@ def screw(x, u, c):
     return 0.4, -0.3, 0.9, 1.0, 2.0, -3.0
 
 
+def ahead_and_position(x, c):
+    """The first axis of a pose, and where it is."""
+    return *rotations.to_world(x[:4], (1.0, 0.0, 0.0)), *x[4:]
+
+
 @pytest.mark.parametrize("side", ["body", "world"])
 def test_constant_rates_of_a_pose_are_a_screw(side):
     """A step is the exponential, and errors propagate as by differences; directions have no rates."""
-    common = {"rates": screw, "observe": lambda x, c: x[1:], "constants": Constants()}
+    common = {"rates": screw, "observe": ahead_and_position, "constants": Constants()}
     arguments = {"states": (Pose("camera", side=side),), "prior_mean": [0.6, 0.0, 0.8, 0.0, 1.0, 2.0, 3.0]}
     arguments |= {"prior_cov": np.ones(6), "measurement_noise_cov": np.ones(6)}
     model = ContinuousModel(densities=np.ones(6), arguments=arguments, **common)
@@ -184,4 +189,4 @@ def test_constant_rates_of_a_pose_are_a_screw(side):
     np.testing.assert_allclose(np.transpose(columns) / 1e-7, expm(model.slope), atol=1e-5)
     arguments = {"states": (Direction("field"),), "prior_mean": (0.0, 0.0, 1.0)}
     with pytest.raises(ValueError, match="'field' is a direction"):
-        ContinuousModel(densities=np.ones(2), arguments=arguments, **common)
+        ContinuousModel(densities=np.ones(2), arguments=arguments, **common | {"observe": lambda x, c: x})
