@@ -447,6 +447,7 @@ def run_trials(
             drop_waiting(study)
         return False
     space, beside_others = plan.space(), False
+    before = {trial.number for trial in study.get_trials(deepcopy=False, states=FINISHED)}
 
     def objective(trial: optuna.Trial) -> list[float]:
         trial.set_user_attr(PROCESS, this_process())
@@ -467,7 +468,11 @@ def run_trials(
     try:
         with stop_on_interrupt() as interrupted:
             study.optimize(objective, callbacks=[after])
-        if drops_waiting and beside_others and finished_trials(study) >= trials:
+        finished = study.get_trials(deepcopy=False, states=FINISHED)
+        beside_others |= any(
+            trial.number not in before and trial.user_attrs.get(PROCESS) != this_process() for trial in finished
+        )
+        if drops_waiting and beside_others and len(finished) >= trials:
             drop_waiting(study)
         return interrupted()
     except KeyboardInterrupt:
