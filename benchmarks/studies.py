@@ -19,7 +19,7 @@ from benchmarks.timing import Row, Timing
 from filters.engine.batch import run
 from tuning.evaluation import sizes
 from tuning.experiments.lorenz96 import STEPS, problem
-from tuning.likelihood import family
+from tuning.likelihood import objective
 from tuning.problems import data as in_parts
 from tuning.search import parameters, trials
 from tuning.search import plan as plans
@@ -35,7 +35,7 @@ MEMORY_GOAL = 500.0  # [MB]
 FILTERS_AND_SCORES = {  # what runs filters or rates their runs, where a study calls it; none calls another
     trials: ("metrics_of_all", "compute_metrics"),
     sizes: ("evaluate", "values_of"),
-    family: ("derivatives",),
+    objective: ("derivatives",),
 }
 WARM_UP = 25  # trials, with the first search of the likeliest Q and R
 IN_A_PROCESS = """

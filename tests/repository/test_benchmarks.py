@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from benchmarks import studies
 from benchmarks.__main__ import command
 from benchmarks.batches import NORMALS, array_filter
 from filters import EnsembleKalmanFilter, thruster_model
@@ -47,3 +48,8 @@ def test_the_filter_written_for_jax_is_ours_given_our_random_numbers(process_noi
         mean, cov = peer.moments(members)
     np.testing.assert_allclose(mean, belief.mean, rtol=1e-9)
     np.testing.assert_allclose(cov, belief.cov, rtol=1e-9)
+
+
+def test_what_a_study_spends_in_filters_is_timed_where_it_calls_them():
+    for module, names in studies.FILTERS_AND_SCORES.items():
+        assert all(callable(getattr(module, name)) for name in names)
