@@ -226,15 +226,20 @@ def c_filter(
     return called(name)
 
 
-def write_filter(generated: CFilter, folder: str | Path) -> list[Path]:
-    """Write a filter's header and source alone; return the files."""
-    texts = {f"{generated.name}.h": generated.header, f"{generated.name}.c": generated.source}
+def _written(texts: dict[str, str], folder: str | Path) -> list[Path]:
+    """Write texts by their files' names, none of them unless all can be written; return the files."""
     files = [Path(folder) / name for name in texts]
     for file in files:
         check_target(file)
     for file, text in zip(files, texts.values(), strict=True):
         write_whole(file, text)
     return files
+
+
+def write_filter(generated: CFilter, folder: str | Path) -> list[Path]:
+    """Write a filter's header and source alone; return the files."""
+    texts = {f"{generated.name}.h": generated.header, f"{generated.name}.c": generated.source}
+    return _written(texts, folder)
 
 
 class Sizes(NamedTuple):
@@ -423,9 +428,4 @@ def write_project(
         "README.md": README.format(**about),
         **({"board.c": BOARD, "board.ld": MEMORY} if board else {}),
     }
-    files = [Path(folder) / name for name in texts]
-    for file in files:
-        check_target(file)
-    for file, text in zip(files, texts.values(), strict=True):
-        write_whole(file, text)
-    return files
+    return _written(texts, folder)
