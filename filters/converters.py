@@ -24,6 +24,8 @@ from thruster_env.model.state_space import StateSpaceModel
 if TYPE_CHECKING:
     import filterpy.kalman
 
+CHANGES = ": what changes is an input of a model, transition(x, u, c) or observe(x, u, c) (docs/other_packages.md)"
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PredictedKalmanFilter(KalmanFilter):
@@ -138,7 +140,7 @@ def from_pykalman(kf: Any) -> KalmanFilter:
     for name, value in values.items():
         most = 1 if name.endswith(("offsets", "mean")) else 2
         if value.ndim > most:
-            raise ValueError(f"{name} must be the same in all steps, but has shape {value.shape}")
+            raise ValueError(f"{name} must be the same in all steps, but has shape {value.shape}{CHANGES}")
     a, offset, q, h, shift, r, mean, cov = values.values()
     return _filter(a, np.zeros((len(a), 0)), h, q, r, mean, cov, state_offset=offset, measurement_offset=shift)
 
@@ -164,7 +166,7 @@ def from_statsmodels(results: Any) -> KalmanFilter:
     for name in names:
         value = as_floats(getattr(part, name))
         if value.shape[-1] > 1 and (value != value[..., :1]).any():
-            raise ValueError(f"{name} must be the same in all steps, but changes")
+            raise ValueError(f"{name} must be the same in all steps, but changes{CHANGES}")
         matrices.append(value[..., 0])
     f, c, selection, noise, h, d, r = matrices
     diffuse = getattr(part, "initial_diffuse_state_cov", None)
@@ -246,7 +248,8 @@ def _attributes(value: Any, kind: str, *names: str) -> list[np.ndarray]:
     """Attributes as matrices; ValueError where one is missing."""
     missing = [name for name in names if getattr(value, name, None) is None]
     if missing:
-        raise ValueError(f"it must be {kind}, but {short_repr(value)} has no {', '.join(missing)}")
+        way = "a filter of functions is make_filter(name, StateSpaceModel(transition=..., observe=...))"
+        raise ValueError(f"it must be {kind}, but a {type(value).__name__} has no {', '.join(missing)}: {way}")
     return [np.atleast_2d(as_floats(getattr(value, name))) for name in names]
 
 

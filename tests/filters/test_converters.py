@@ -89,6 +89,34 @@ def test_pykalman_gives_the_same_with_offsets_and_missing_numbers():
     close(filters.smooth(filters.from_pykalman(kf), z.filled(np.nan)).means, smoothed)
 
 
+def test_a_matrix_of_each_step_is_an_input_of_a_model():
+    pykalman = pytest.importorskip("pykalman")
+    price = 50.0 + Z.cumsum()
+    measured = 1.4 * price + 3.0 + 0.1 * Z
+    kf = pykalman.KalmanFilter(
+        transition_matrices=np.eye(2),
+        observation_matrices=np.column_stack([price, np.ones_like(price)])[:, None, :],
+        transition_covariance=1e-4 * np.eye(2),
+        observation_covariance=[[1.0]],
+        initial_state_mean=[0.0, 0.0],
+        initial_state_covariance=np.eye(2),
+    )
+    with pytest.raises(ValueError, match=r"what changes is an input of a model.*other_packages\.md"):
+        filters.from_pykalman(kf)
+    model = filters.StateSpaceModel(
+        transition=lambda x, u, c: x,
+        observe=lambda x, u, c: (x[0] * u[0] + x[1],),
+        process_noise_cov=[1e-4, 1e-4],
+        measurement_noise_cov=[1.0],
+        prior_mean=[0.0, 0.0],
+        prior_cov=[1.0 - 1e-4, 1.0 - 1e-4],
+        inputs=1,
+    )
+    run = {"inputs": price, "measurements": measured, "update_first": False}
+    close(filters.run(filters.make_filter("ekf", model), **run).means, kf.filter(measured)[0])
+    close(filters.smooth(filters.make_filter("ekf", model), **run).means, kf.smooth(measured)[0])
+
+
 def test_statsmodels_gives_the_same_states_and_likelihood():
     structural = pytest.importorskip("statsmodels.tsa.statespace.structural")
     model = structural.UnobservedComponents(Z, "lltrend")
