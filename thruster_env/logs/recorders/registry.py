@@ -16,7 +16,7 @@ from thruster_env.logs.columns import INPUT, MEASUREMENT, TIME, Column, find_col
 from thruster_env.logs.columns import Wanted as MergedWanted
 from thruster_env.logs.findings import CLOCK, OUTSIDE, Remark
 from thruster_env.logs.grid import SECOND, follows, in_seconds, time_text
-from thruster_env.logs.recorders import bag_counts, bags, dataflash, hdf5, matlab, ulog
+from thruster_env.logs.recorders import arrays, autopilots, bag_counts, bags
 from thruster_env.logs.recorders.bag_counts import METADATA
 from thruster_env.logs.recorders.bags import HEADER, RECEIPT, STAMPS, Choice, Clocked, chosen_clock
 from thruster_env.logs.recorders.topics import Reader, Topic, Wanted, unreadable
@@ -40,13 +40,13 @@ class Format(NamedTuple):
 
 
 FORMATS = (
-    Format(ulog.KIND, (".ulg", ".ulog"), ulog.MAGIC, ulog.topics, has_units=False),
-    Format(dataflash.KIND, (".bin",), dataflash.MAGIC, dataflash.topics),
+    Format(autopilots.ULOG, (".ulg", ".ulog"), autopilots.ULOG_MAGIC, autopilots.ulog_topics, has_units=False),
+    Format(autopilots.DATAFLASH, (".bin",), autopilots.DATAFLASH_MAGIC, autopilots.dataflash_topics),
     Format("bag of ROS 1", (".bag",), bag_counts.ROS1, bags.topics, has_receipt=True),
     Format("MCAP file", (".mcap",), bag_counts.MCAP, bags.topics, has_receipt=True),
     Format("bag of ROS 2", (".db3",), bag_counts.DB3, bags.topics, has_receipt=True),
-    Format(matlab.KIND, (".mat",), matlab.MAGIC, matlab.topics, False),
-    Format(hdf5.KIND, (".h5", ".hdf5", ".hdf"), hdf5.MAGIC, hdf5.topics, False),
+    Format(arrays.MATLAB, (".mat",), arrays.MATLAB_MAGIC, arrays.matlab_topics, False),
+    Format(arrays.HDF5_KIND, (".h5", ".hdf5", ".hdf"), arrays.HDF5_MAGIC, arrays.hdf5_topics, False),
 )
 ENDINGS = tuple(ending for form in FORMATS for ending in form.endings)
 

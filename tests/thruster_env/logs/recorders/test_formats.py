@@ -8,7 +8,7 @@ import scipy.io
 from scipy.io import loadmat, savemat
 
 from tests.thruster_env.logs.recorders.files import dataflash, h5py, stamped, write_bag, write_ulog
-from thruster_env.logs.recorders.matlab import arrays_of
+from thruster_env.logs.recorders.arrays import arrays_of
 from thruster_env.logs.recorders.registry import fields, format_of, read
 
 RNG = np.random.default_rng(0)
