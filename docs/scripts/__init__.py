@@ -32,7 +32,6 @@ SCRIPTS = {  # of this folder, by page; experiments name theirs
     "ranking": ("ranking", "estimators"),
     "readme": ("pictures",),
     "tuning": ("tuning", "tuning_choice"),
-    "workers": ("workers",),
 }
 
 

@@ -10,22 +10,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from docs.scripts import by_name, digits, legend_below, log_ticks, subplots
-from docs.scripts.filter_gaussian import (
-    FLOW,
+from docs.scripts import by_name, digits, log_ticks, subplots
+from docs.scripts.filter_pictures import (
     FLOW_RMSE,
+    PICTURES,
     RUNS,
     SEED,
     STYLES,
     Runs,
-    deviations,
     errors_of,
     fuzzy,
     held_runs,
     times,
 )
-from docs.scripts.filter_gaussian import PICTURES as GAUSSIAN
-from docs.scripts.filter_sampled import PICTURES as SAMPLED
 from filters import (
     FILTERS,
     ExtendedKalmanFilter,
@@ -82,57 +79,6 @@ def adaptive(path: Path) -> Path:
         ]
         right.plot([100 * share for share in shares], errors, label=name, **STYLES[name])
     right.set(xlabel="measurements that are off by 10 N [%]", ylabel=FLOW_RMSE, ylim=(0.04, 0.12))
-    right.legend(fontsize=8, frameon=False)
-    return save_figure(figure, path)
-
-
-def baselines(path: Path) -> Path:
-    """Baselines beside the extended filter, in still water and in a flow that nobody knows of."""
-    figure, axes = subplots((9.6, 3.8), 1, 2, sharey=True)
-    for axis, flow in zip(axes, (0.0, 1.0), strict=True):
-        runs, window = held_runs(1, ambient_velocity=flow), slice(100, 251)
-        for name in ("inversion", "low-pass", "open-loop", "ekf"):
-            estimate = run(make_filter(name, thruster_model()), *runs.arguments).means[0, window, 1]
-            axis.plot(times(501)[window], estimate, label=name, **STYLES[name])
-        axis.plot(times(501)[window], runs.states[0, window, 1], label="truth", **STYLES["truth"])
-        axis.set_title(f"ambient flow {flow:g} m/s, believed to be 0", fontsize=10)
-        axis.set_xlabel("time [s]")
-    axes[0].set_ylabel(FLOW)
-    legend_below(figure, axes[0], 5)
-    return save_figure(figure, path)
-
-
-def augmented(path: Path) -> Path:
-    """The ambient flow as a third state: where it is found, where not, and what that is worth."""
-    joint = augmented_model(thruster_model(), {"ambient_velocity": Unknown(std=0.5)})
-    figure, (left, right) = subplots((9.6, 3.6), 1, 2)
-    examples = {
-        "levels within $\\pm$12 V": (12.0, {}, BLUE),
-        "0 V, from rest": (0.0, {"initial_state": [0.0, 0.0]}, RUST),
-    }
-    for label, (amplitude, start, colour) in examples.items():
-        runs = held_runs(1, amplitude, ambient_velocity=0.6, **start)
-        estimates = run(ExtendedKalmanFilter(model=joint), *runs.arguments)
-        mean, spread = estimates.means[0, :, 2], deviations(estimates, 2)[0]
-        left.plot(times(501), mean, color=colour, label=label)
-        left.fill_between(
-            times(501), mean - 1.96 * spread, mean + 1.96 * spread, color=colour, alpha=0.15, linewidth=0
-        )
-    left.axhline(0.6, label="truth", **STYLES["truth"])
-    left.set(xlabel="time [s]", ylabel="ambient flow and 95 % band [m/s]")
-    left.legend(fontsize=8, frameon=False, loc="lower right")
-    flows = np.linspace(-1.0, 1.0, 9)
-    errors = {"ignored": [], "a third state": [], "known": []}
-    for flow in flows:
-        runs = held_runs(20, ambient_velocity=flow)
-        models = (thruster_model(), joint, thruster_model(ambient_velocity=flow))
-        for values, model in zip(errors.values(), models, strict=True):
-            values.append(errors_of(ExtendedKalmanFilter(model=model), runs)[1])
-    for (label, values), look in zip(errors.items(), ((RUST, "--"), (BLUE, "-"), (DARK, ":")), strict=True):
-        right.plot(flows, values, color=look[0], linestyle=look[1], label=f"flow {label}")
-    right.set_ylim(bottom=0.03)
-    right.set_xticks(flows[::2])
-    right.set(xlabel="ambient flow [m/s]", ylabel=FLOW_RMSE)
     right.legend(fontsize=8, frameon=False)
     return save_figure(figure, path)
 
@@ -343,7 +289,7 @@ def situations() -> list[Situation]:
 
 
 FIGURES = {
-    **{f"filters_{name}.png": draw for name, draw in (GAUSSIAN | SAMPLED).items()},
-    **{f"filters_{draw.__name__}.png": draw for draw in (adaptive, baselines, augmented, varying)},
+    **{f"filters_{name}.png": draw for name, draw in PICTURES.items()},
+    **{f"filters_{draw.__name__}.png": draw for draw in (adaptive, varying)},
 }
 TABLES = by_name(kinds, advice, fuzzy)

@@ -1,4 +1,4 @@
-"""The tables of docs/appendix/tuning.md on objectives, pruning and wrong choices; each takes some minutes."""
+"""The tables of docs/appendix/tuning.md on pruning and wrong choices; each takes some minutes."""
 
 from __future__ import annotations
 
@@ -20,21 +20,11 @@ from tuning.experiments.benchmark import run_in_memory
 from tuning.problems.log_parts import Block, parts_of
 from tuning.problems.log_problem import LogProblem
 from tuning.search.measures import Measured, Runs, over, signed_rank
-from tuning.search.objectives import LOG_SCORE, nees_ratio, nis_ratio
 from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS, Plan
 from tuning.search.space import Choice, choice_of
 from tuning.search.trials import measure
 from tuning.search.validation import Choosing
 from tuning.thruster.scenario import find_scenario
-
-OBJECTIVE_SCENARIOS = "nominal", "published_tunnel", "outliers", "mismatch", "startup"
-OBJECTIVE_SEEDS, OBJECTIVE_TRIALS, FILTER = range(5), 40, "ekf"
-
-
-def by_objective(name: str, seed: int, trials: int = OBJECTIVE_TRIALS) -> list[Evaluation]:
-    """The filters that studies of the score, with the mean NIS in its band, and of the log score choose."""
-    plans = [Plan(FILTER, (find_scenario(name),), seed, (objective,)) for objective in ("score", LOG_SCORE)]
-    return [held_out(run_in_memory(plan, trials).choice, plan) for plan in plans]
 
 
 def held_out(choice: Choice, plan: Plan) -> Evaluation:
@@ -42,21 +32,6 @@ def held_out(choice: Choice, plan: Plan) -> Evaluation:
     (scenario,) = plan.scenarios
     data = scenario.data(scenario.held_out_seeds(plan.seed, HELD_OUT_SEEDS))
     return evaluate(choice.filter(scenario), data, scenario.scale)
-
-
-def objectives() -> str:
-    """Score, NEES and NIS by either objective, a row a scenario: medians over studies, and all ratios."""
-    rows = []
-    for name in OBJECTIVE_SCENARIOS:
-        pairs = [by_objective(name, seed) for seed in OBJECTIVE_SEEDS]
-        ratios = [score_ratio(by_log_score, by_score).value for by_score, by_log_score in pairs]
-        cells = [f"{np.median(ratios):.3f}", f"{min(ratios):.3f} to {max(ratios):.3f}"]
-        for ratio in (nees_ratio, nis_ratio):
-            for index in range(2):
-                cells.append(f"{np.median([ratio(study_pair[index]) for study_pair in pairs]):.3g}")
-        rows.append([f"`{name}`", *cells])
-    heads = ["scenario", "score, log score over score", "single studies", "NEES, by score", "by log score"]
-    return markdown_table([*heads, "NIS, by score", "by log score"], rows)
 
 
 # Do studies with and without pruning end at the same score? Wilcoxon's test ranks the scores of single runs, the
@@ -445,4 +420,4 @@ def choice_sizes(studies: int = SIZE_STUDIES) -> str:
     return markdown_table(["scores", "time constant [rows]", *heads], rows)
 
 
-TABLES = by_name(objectives, pruning, log_choices, truth_choices, choice_sizes)
+TABLES = by_name(pruning, log_choices, truth_choices, choice_sizes)

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from docs.scripts.filter_sampled import followed, half_lost
+from docs.scripts.filter_pictures import followed, half_lost
 from filters import StateSpaceModel, make_filter, run
 from filters.gaussian.mixtures import Parts, blender
 from tests.models import pendulum

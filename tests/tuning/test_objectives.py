@@ -5,11 +5,11 @@ import pytest
 from optuna.trial import create_trial
 from scipy.stats import chi2, multivariate_normal
 
-from docs.scripts.tuning_choice import by_objective
 from filters import run
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.evaluate import evaluate, variance_ratios
 from tuning.evaluation.runs import RunMetrics
+from tuning.experiments.benchmark import run_in_memory
 from tuning.reporting.page import of_history
 from tuning.reporting.search_figures import draw_history
 from tuning.reporting.sections import of_front, reported_about
@@ -17,10 +17,11 @@ from tuning.reporting.tuning_report import _band_sentence
 from tuning.search.among_types import TypeResult
 from tuning.search.measures import measured
 from tuning.search.objectives import find_objective, nees_ratio, reported, reported_name
-from tuning.search.plan import Plan
+from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
 from tuning.search.trials import measure
+from tuning.thruster.scenario import find_scenario
 
 PROBLEM = LinearProblem(scale=(0.2, np.inf, 0.4))
 DATA = PROBLEM.data(range(8))
@@ -161,7 +162,11 @@ def test_runs_are_left_out_one_by_one_also_of_the_worst_problem(name):
 
 @pytest.mark.slow
 def test_where_the_model_is_wrong_a_study_of_the_score_has_a_covariance_as_good_as_that_of_the_log_score():
-    by_score, by_log_score = by_objective("mismatch", seed=1, trials=16)
+    scenario = find_scenario("mismatch")
+    plans = [Plan("ekf", (scenario,), 1, (objective,)) for objective in ("score", "log-score")]
+    data = scenario.data(scenario.held_out_seeds(1, HELD_OUT_SEEDS))
+    choices = [run_in_memory(plan, 16).choice for plan in plans]
+    by_score, by_log_score = (evaluate(choice.filter(scenario), data, scenario.scale) for choice in choices)
     # At the end the log score decides among filters of the least error.
     assert by_score.log_score.value == pytest.approx(by_log_score.log_score.value, abs=0.1)
     assert max(nees_ratio(by_log_score), nees_ratio(by_score)) < 3.0

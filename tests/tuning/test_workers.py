@@ -1,7 +1,6 @@
 """Several processes on one study: a journal and a real PostgreSQL, with a worker killed and the database away."""
 
 import dataclasses
-import math
 import os
 import re
 import signal
@@ -170,26 +169,3 @@ def test_the_page_names_options_that_there_are():
     known = {option for parameter in tune.params for option in parameter.opts}
     named = set(re.findall(r"(?<=\s)--[a-z]+", " ".join(re.findall(r"^ *thruster tune.*", page, re.MULTILINE))))
     assert {"--workers", "--storage", "--trials"} <= named <= known
-
-
-def test_the_page_has_the_picture_and_the_lines_that_its_script_makes():
-    import docs.scripts.workers as script
-
-    folder = Path(__file__).parents[2] / "docs"
-    page = (folder / "workers.md").read_text()
-    assert all(f"]({picture})" in page and (folder / picture).exists() for picture in script.FIGURES)
-    lines = page.partition("<!-- table trials_a_second -->")[2].partition("<!-- end -->")[0].strip().splitlines()
-    head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    assert head[2:] == [str(count) for count in script.COUNTS]
-    assert [row[0] for row in rows[::2]] == [work.name for work in script.WORKS]
-    for row, work in zip(rows[::2], script.WORKS, strict=True):
-        assert [int(n) for n, cell in zip(head[2:], row[2:], strict=True) if cell] == list(work.workers)
-
-
-def test_a_worker_gets_through_trials_while_it_is_watched(tmp_path):
-    from docs.scripts.workers import NOTHING, rate
-
-    path = str(tmp_path / "j")
-    assert 0 <= rate(NOTHING, path, 1) < math.inf  # none in a window of a second, if the machine is busy
-    (summary,) = optuna.get_all_study_summaries(open_storage(path))
-    assert summary.n_trials >= 1

@@ -43,7 +43,6 @@ EXPERIMENTS = {
     "lidar": Experiment("Learned Q and R of a lidar's tracks, beside OKF", "lidar", "methods"),
     "identification": Experiment("Are the standard errors of identification right?", "identification", "identify"),
     "faults": Experiment("How soon a monitor notices faults", "faults", "monitoring"),
-    "hidden-truth": Experiment("Tuning from logs beside tuning with true states", "hidden_truth", "logs"),
     "recordings": Experiment("A recorded thruster beside its load cell", "recordings.identification", "real_data"),
     "users": Experiment("Filters tuned on users' problems, beside users' baselines", "users", "tuning"),
     "methods": Experiment("Every method of tuning on the same data and budget", "methods.tables"),

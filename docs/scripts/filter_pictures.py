@@ -1,7 +1,8 @@
-"""Runs of the thruster for docs/filters.md, and pictures of filters whose belief is Gaussian."""
+"""Runs of the thruster for docs/filters.md, and its pictures but those of unknown noise, which `filters` has."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,8 +14,11 @@ from filters import (
     ExtendedKalmanFilter,
     FuzzyKalmanFilter,
     GaussianSumFilter,
+    InteractingMultipleModelFilter,
     KalmanFilter,
+    ParticleFilter,
     StateSpaceModel,
+    affine_model,
     make_filter,
     run,
     smooth,
@@ -22,11 +26,12 @@ from filters import (
 )
 from filters.bounds import posterior_bound
 from filters.consistency.nees import normalized_squares, rmse_ratios
+from filters.ensembles.square_root import record_members
 from filters.filter import Filter
 from filters.gaussian.mixtures import BLENDINGS
 from filters.logs.findings import TRUTH, plot_style
 from filters.registry import FILTERS
-from thruster_env.core.files import BLUE, DARK, MUSTARD, RUST, SKY, save_figure
+from thruster_env.core.files import BLUE, DARK, MUSTARD, PALE, RUST, save_figure
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.thruster.analysis import steady_state
@@ -250,42 +255,7 @@ def _smoothed_rmse(filter_, runs, lag: int) -> float:
 
 
 CENTRE = 12.0  # [V]
-SHOWN_WIDTH = 12.0  # [V], of the run that is drawn
-WIDTHS = (1.0, 2.0, 4.0, 6.0, 9.0, SHOWN_WIDTH, 16.0, 20.0, 24.0)  # [V]
 TABLE_WIDTHS = (2.0, 6.0)  # [V]
-BLENDING_LOOKS = {
-    "weights": STYLES["fuzzy"],
-    "moments": {"color": SKY},
-    "output": {"color": DARK, "linestyle": ":"},
-}
-
-
-def blendings(path: Path) -> Path:
-    """The fuzzy filters over the width of the range that their rules span, and a run."""
-    figure, (left, right) = subplots((9.6, 3.8), 1, 2, width_ratios=(2, 3))
-    looks = {f"fuzzy, {blending}": look for blending, look in BLENDING_LOOKS.items()}
-    looks |= {name: STYLES[name] for name in ("kf", "ekf")}
-    errors = {label: [] for label in looks}
-    for width in WIDTHS:
-        model, runs = _about_the_centre(width, 20)
-        filters = {f"fuzzy, {blending}": _fuzzy(model, width, blending=blending) for blending in BLENDINGS}
-        filters |= {name: make_filter(name, model) for name in ("kf", "ekf")}
-        for label, filter_ in filters.items():
-            errors[label].append(errors_of(filter_, runs)[1])
-            if width == SHOWN_WIDTH:
-                estimate = run(filter_, *runs.arguments).means[0, :, 1]
-                right.plot(times(len(estimate)), estimate, **looks[label])
-        if width == SHOWN_WIDTH:
-            right.plot(times(501), runs.states[0, :, 1], **STYLES["truth"])
-    for label, values in errors.items():
-        left.plot(WIDTHS, values, label=label, **looks[label])
-    left.plot([], [], label="truth", **STYLES["truth"])
-    log_ticks(left.yaxis, (0.03, 0.1, 0.3, 1, 3, 10))
-    left.set(xlabel="width of the voltages' range about 12 V [V]", ylabel=FLOW_RMSE)
-    right.set_title("levels from 6 to 18 V", fontsize=10)
-    right.set(xlabel="time [s]", ylabel=FLOW)
-    legend_below(figure, left, 6)
-    return save_figure(figure, path)
 
 
 def fuzzy() -> str:
@@ -333,5 +303,218 @@ def _fuzzy(model: StateSpaceModel, width: float, **choices) -> FuzzyKalmanFilter
     return FuzzyKalmanFilter(model=model, low=low, high=high, **choices)
 
 
-PICTURES = {"kalman": kalman, "update": one_update, "points": sigma_points, "fuzzy": blendings}
-PICTURES["smoothers"] = smoothers
+SIGNLESS = {"sensors": ["speed-magnitude"], "process_noise_cov": (4.0, 4e-4), "measurement_noise_cov": [0.25]}
+
+
+def signless_runs(count: int) -> Runs:
+    """Runs with a tachometer without a sign; the voltage swings slowly within plus and minus 0.3 V."""
+    voltage = 0.3 * np.sin(2 * np.pi * times(500) / 2.5)
+    return runs_of(make_plant(**SIGNLESS), np.tile(voltage, (count, 1)))
+
+
+def ensembles(path: Path) -> Path:
+    """Errors and NEES over the size of an ensemble; what inflation and relaxation do to a small one."""
+    runs, model = held_runs(), thruster_model()
+    sizes = (5, 8, 12, 20, 30, 50, 100, 200, 400)
+    figure, axes = subplots((9.6, 3.6), 1, 3)
+    for name in ("enkf", "etkf", "denkf", "enkf-n"):
+        results = [errors_of(make_filter(name, model, ensemble_size=size), runs) for size in sizes]
+        for axis, values in zip(axes, list(zip(*results, strict=True))[1:], strict=False):
+            axis.plot(sizes, values, label=name, **STYLES[name])
+    _, error, _ = errors_of(make_filter("ekf", model), runs)
+    axes[0].axhline(error, label="ekf", **STYLES["ekf"])
+    axes[1].axhline(2.0, color=DARK, linestyle=":", label="2 is right")
+    controls = {
+        "inflation": ((1.0, 1.02, 1.05, 1.1, 1.2), RUST, "o-"),
+        "relaxation": ((0.0, 0.25, 0.5, 0.75, 0.9), DARK, "s--"),
+    }
+    for control, (values, colour, marks) in controls.items():
+        points = [errors_of(make_filter("enkf", model, ensemble_size=8, **{control: v}), runs)[1:] for v in values]
+        axes[2].plot(*zip(*points, strict=True), marks, color=colour, markersize=4, linewidth=1.2, label=control)
+        for value, (x, y) in zip(values, points, strict=True):
+            offset, side = ((5, 3), "left") if control == "inflation" else ((-6, -3), "right")
+            text = {"textcoords": "offset points", "fontsize": 7, "color": colour, "ha": side}
+            axes[2].annotate(f"{value:g}", (x, y), offset, **text)
+    for axis, label in zip(axes, ("RMSE of $U_a$ [m/s]", "mean NEES [-]"), strict=False):
+        log_ticks(axis.xaxis, (5, 10, 20, 50, 100, 200, 400))
+        axis.set(xlabel="members N", ylabel=label)
+    log_ticks(axes[1].yaxis, (2, 3, 5, 10))
+    axes[2].set_xlim(0.045, 0.092)
+    axes[2].set_title("enkf, N = 8", fontsize=10)
+    axes[2].set(xlabel="RMSE of $U_a$ [m/s]", ylabel="mean NEES [-]")
+    for axis in axes:
+        axis.legend(fontsize=8, frameon=False)
+    return save_figure(figure, path)
+
+
+def modes(path: Path) -> Path:
+    """A belief with two modes over time, and errors over the number of particles at the published noise."""
+    model, runs, window = thruster_model(**SIGNLESS), signless_runs(1), slice(90, 171)
+    figure, (left, right) = subplots((9.6, 3.8), 1, 2, width_ratios=(3, 2))
+    recorded = record_members(ParticleFilter(model=model, ensemble_size=20_000), *runs.arguments)
+    edges, steps = np.linspace(-12, 12, 97), range(window.start, window.stop)
+    density = np.array(
+        [np.histogram(recorded.members[0, k, 0], edges, weights=recorded.weights[0, k])[0] for k in steps]
+    )
+    between = times(501)[window]
+    cells = (*(np.append(between, between[-1] + 0.01) - 0.005,), edges)
+    left.pcolormesh(*cells, np.sqrt(density.T), cmap="Greys", rasterized=True)
+    looks = {
+        "ekf": STYLES["ekf"],
+        "pf": STYLES["pf"],
+        "truth": {"color": RUST, "linestyle": "none", "marker": "o", "markersize": 3},
+    }
+    for name in looks:
+        mean = runs.states[0, :, 0] if name == "truth" else _mean(make_filter(name, model), runs)
+        left.plot(between, mean[window], label=name, **looks[name])
+    left.set_title("$|\\omega_m|$ is measured; grey: the particles", fontsize=10)
+    left.set(xlabel="time [s]", ylabel="motor speed [rad/s]")
+    left.grid(visible=False)
+    left.legend(fontsize=8, frameon=False, loc="upper right")
+    runs, model = held_runs(20, **PUBLISHED_NOISE), thruster_model(**PUBLISHED_NOISE)
+    sizes = (20, 50, 100, 200, 500, 1000, 2000)
+    for name in ("pf", "enkf", "ienkf"):
+        errors = [errors_of(make_filter(name, model, ensemble_size=size), runs)[1] for size in sizes]
+        right.plot(sizes, errors, label=name, **STYLES[name])
+    for name in ("ekf", "gsf"):
+        look = STYLES[name] | {"linestyle": ":"}
+        right.axhline(errors_of(make_filter(name, model), runs)[1], label=name, **look)
+    log_ticks(right.xaxis, (20, 50, 100, 200, 500, 1000, 2000))
+    right.set_ylim(0.15, 0.56)
+    right.set_title("published noise, thrust measured", fontsize=10)
+    right.set(xlabel="members or particles N", ylabel="RMSE of $U_a$ [m/s]")
+    right.legend(fontsize=8, frameon=False, ncols=3)
+    return save_figure(figure, path)
+
+
+def _mean(filter_, runs: Runs) -> np.ndarray:
+    return run(filter_, *runs.arguments).means[0, :, 0]
+
+
+LOST_FROM, LOST_TO, LEVEL = 150, 350, 12.0  # steps; [V]
+
+
+def half_lost(model: StateSpaceModel) -> StateSpaceModel:
+    """The same thruster with half of its thrust."""
+    names = [name for name in model.constants._fields if name.startswith("thrust_")]
+    return model.replace(
+        constants=model.constants._replace(**{k: 0.5 * getattr(model.constants, k) for k in names})
+    )
+
+
+def run_that_switches(intact: StateSpaceModel, seed: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States (K + 1, 2), thrusts (K + 1, 1), voltages (K, 1) of a run that loses half of its thrust."""
+    generator, steps = np.random.default_rng(seed), np.arange(STEPS + 1)
+    inputs = np.repeat(generator.uniform(-LEVEL, LEVEL, STEPS // 25), 25)[:, None]
+    is_lost = (steps >= LOST_FROM) & (steps < LOST_TO)
+    return *followed([intact, half_lost(intact)], is_lost.astype(int), inputs, generator), inputs
+
+
+def followed(
+    models: Sequence[StateSpaceModel], modes: np.ndarray, inputs: np.ndarray, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """States (K + 1, n) and measurements (K + 1, m) of a plant that is models[modes[k]] at step k."""
+    first, states, measured = models[modes[0]], [], []
+    x = generator.multivariate_normal(first.prior_mean, first.prior_cov)
+    for k, mode in enumerate(modes):
+        model = models[mode]
+        if k:
+            for _ in range(model.substeps):
+                x = np.array(model.transition(tuple(x), tuple(inputs[k - 1]), model.constants))
+            x = x + generator.multivariate_normal(np.zeros(len(x)), model.process_noise_cov)
+        measured.append(
+            generator.multivariate_normal(model.observe(tuple(x), model.constants), model.measurement_noise_cov)
+        )
+        states.append(x)
+    return np.array(states), np.array(measured)
+
+
+def several(path: Path) -> Path:
+    """The probability of a mode, and errors with and without it."""
+    intact = thruster_model()
+    states, measured, inputs = run_that_switches(intact)
+    imm = InteractingMultipleModelFilter(model=intact, modes=[intact, half_lost(intact)], stay=0.98)
+    figure, (left, right) = subplots((9.6, 3.6), 1, 2)
+    probabilities = []
+    for filter_ in (imm, make_filter("ekf", intact)):
+        belief, means = filter_.init(), []
+        for k, z in enumerate(measured):
+            belief, _ = filter_.update(filter_.predict(belief, inputs[k - 1]) if k else belief, z)
+            means.append(belief.mean)
+            if filter_ is imm:
+                probabilities.append(imm.mode_probabilities(belief)[1])
+        right.plot(
+            times(STEPS + 1), np.array(means)[:, 1] - states[:, 1], label=filter_.name, **STYLES[filter_.name]
+        )
+    left.plot(times(STEPS + 1), probabilities, **STYLES["imm"])
+    for axis in (left, right):
+        axis.axvspan(
+            *times(STEPS + 1)[[LOST_FROM, LOST_TO]], color=PALE, alpha=0.3, label="half of the thrust is lost"
+        )
+        axis.set_xlabel("time [s]")
+    left.set_ylabel("probability that it is lost")
+    right.set_ylabel("error of $U_a$ [m/s]")
+    right.legend(fontsize=8, frameon=False)
+    return save_figure(figure, path)
+
+
+def point() -> StateSpaceModel:
+    """A point whose position is measured, R = 1; its acceleration is noise of variance 0.01, to the filters."""
+    f, g = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
+    noise = {"process_noise_cov": 0.01 * g @ g.T, "measurement_noise_cov": [1.0]}
+    return affine_model(a=f, b=g, c=[[1.0, 0.0]], prior_mean=[0.0, 0.0], prior_cov=[1.0, 0.1], **noise)
+
+
+def swung(frequencies: np.ndarray, steps: int = 4000) -> np.ndarray:
+    """States (B, K + 1, 2) of points that accelerate by 0.1 sin(w k)."""
+    a, b, *_ = point().matrices()
+    states = np.zeros((len(frequencies), steps + 1, 2))
+    for k in range(steps):
+        states[:, k + 1] = states[:, k] @ a.T + 0.1 * np.sin(frequencies * (k + 1))[:, None] * b.T
+    return states
+
+
+def weighted(path: Path) -> Path:
+    """Errors over the frequency of a disturbance that is no white noise; the worst beside those by noise."""
+    model, frequencies = point(), np.logspace(-2.5, 0.4, 25)
+    states = swung(frequencies)
+    noise, inputs = (
+        np.random.default_rng(0).normal(size=(1, states.shape[1], 1)),
+        np.zeros((1, states.shape[1] - 1, 1)),
+    )
+
+    def errors(filter_: Filter) -> tuple[np.ndarray, float]:
+        differences = run(filter_, None, np.repeat(inputs, len(states), axis=0), states[..., :1]).means - states
+        by_noise = run(filter_, None, inputs, noise).means
+        return np.sqrt(np.mean(differences[:, 2000:, 0] ** 2, axis=1)), float(by_noise[0, 2000:, 0].std())
+
+    families = {
+        "kf": [make_filter("kf", model)],
+        "fading": [make_filter("fading", model, fading=a) for a in (1.02, 1.05, 1.1, 1.15, 1.2)],
+        "h-infinity": [
+            make_filter("h-infinity", model, theta=theta, scale=[1.0, 1e6]) for theta in (0.05, 0.1, 0.2, 0.3, 0.4)
+        ],
+    }
+    figure, (left, right) = subplots((9.6, 3.6), 1, 2)
+    for name, filters in families.items():
+        points = [errors(filter_) for filter_ in filters]
+        index = min(3, len(filters) - 1)
+        label = {"fading": "fading, a = 1.15", "h-infinity": "h-infinity, theta = 0.3"}.get(name, name)
+        left.plot(frequencies, points[index][0], label=label, **STYLES[name])
+        right.plot(
+            [noise for _, noise in points],
+            [errors.max() for errors, _ in points],
+            marker="o",
+            ms=4,
+            **STYLES[name],
+        )
+    left.set(xscale="log", xlabel="frequency of the acceleration [rad/step]", ylabel="RMS error of the position")
+    left.legend(fontsize=8, frameon=False)
+    right.set(xlabel="RMS error by measurement noise alone", ylabel="error at the worst frequency")
+    return save_figure(figure, path)
+
+
+PICTURES = {
+    **{"kalman": kalman, "update": one_update, "points": sigma_points, "smoothers": smoothers},
+    **{"ensembles": ensembles, "modes": modes, "weighted": weighted, "several": several},
+}
