@@ -16,9 +16,9 @@ from benchmarks.timing import Measure, Row, alone, side_by_side
 from filters import run
 from filters.filter import Filter
 from thruster_env.core.checks import covariance_root
+from thruster_env.core.parallel import cores, spread
 from thruster_env.core.sources import column_reader, column_writer, vector_reader
 from thruster_env.core.streams import FILTER_PROCESS, fill_normals
-from thruster_env.core.threads import cores, spread
 from thruster_env.graphs.loops import Loops
 from thruster_env.thruster.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.thruster.plant import Plant

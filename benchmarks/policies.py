@@ -41,7 +41,7 @@ def by_hand(setup: TrainingConfiguration, rollouts: int) -> Measure:
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
-    from thruster_env.core.threads import one_thread
+    from thruster_env.core.parallel import one_thread
     from tuning.policies.environments import make_environments
 
     numbers = dict(setup.hyperparameters)

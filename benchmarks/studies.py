@@ -14,7 +14,7 @@ from unittest import mock
 
 import numpy as np
 
-from benchmarks.peers import EnsembleStep, python_model
+from benchmarks.steps import EnsembleStep, python_model
 from benchmarks.timing import Row, Timing
 from filters.engine.batch import run
 from tuning.evaluation import sizes

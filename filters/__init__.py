@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 from filters.adaptive import RobustExtendedKalmanFilter, SageHusaFilter, VariationalBayesFilter
 from filters.augmented import Unknown, augmented_model, transformed_model
 from filters.baselines import Inversion, LowPass, OpenLoop
-from filters.converters import from_control, from_filterpy, from_pykalman, from_statsmodels, to_filterpy
 from filters.engine.batch import Estimates
 from filters.engine.belief import Belief, Innovation
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
@@ -18,6 +17,7 @@ from filters.ensembles.square_root import (
     SerialSquareRootFilter,
 )
 from filters.ensembles.stochastic import DeterministicEnsembleKalmanFilter, EnsembleKalmanFilter
+from filters.estimators.libraries import from_control, from_filterpy, from_pykalman, from_statsmodels, to_filterpy
 from filters.gaussian.extended import (
     ExtendedKalmanFilter,
     FadingMemoryFilter,

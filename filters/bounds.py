@@ -21,9 +21,9 @@ from thruster_env.core.checks import as_floats, at_least, correlations, covarian
 from thruster_env.core.compiled import function_fingerprint, is_interpreting
 from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.matrices import multiplier, quadratic_form
+from thruster_env.core.parallel import cores, spread
 from thruster_env.core.sources import Source, matrix_reader, vector_reader, vector_writer
 from thruster_env.core.streams import GROUP
-from thruster_env.core.threads import cores, spread
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.shape import (
     Functions,

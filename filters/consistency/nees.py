@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import chdtr, chdtrc, chdtri
 
 from thruster_env.core.checks import at_least
-from thruster_env.core.threads import spread
+from thruster_env.core.parallel import spread
 
 RESAMPLES = 2000  # bootstrap resamples of whole runs
 SLIGHT = 0.005  # difference of a ratio from 1 that makes practically none

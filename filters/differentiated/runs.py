@@ -24,7 +24,7 @@ from filters.gaussian.sigma_points import CubatureKalmanFilter, UnscentedKalmanF
 from filters.pages.page import Page
 from filters.starts import Starts, as_the_prior_says
 from thruster_env.core.angles import wrapped_where
-from thruster_env.core.threads import spread
+from thruster_env.core.parallel import spread
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import refuse_rotations
 

@@ -24,8 +24,8 @@ from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from thruster_env.core.checks import as_floats, covariance, short_repr
 from thruster_env.core.compiled import is_interpreting
+from thruster_env.core.parallel import spread
 from thruster_env.core.streams import filter_keys
-from thruster_env.core.threads import spread
 from thruster_env.logs.grid import count_steps, resolution_of, resolution_of_digits
 from thruster_env.logs.log import in_any_steps
 from thruster_env.logs.table import refuse_holes, refuse_swapped, times_of_index

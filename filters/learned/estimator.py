@@ -19,8 +19,8 @@ from filters.tensors.stages import wrapped_where
 from thruster_env.core.checks import as_floats, at_least, one_of
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.derivatives import jacobian
+from thruster_env.core.parallel import one_thread
 from thruster_env.core.sources import matrix_writer, vector_reader, vector_writer
-from thruster_env.core.threads import one_thread
 from thruster_env.logs.log import AnyStepModel
 from thruster_env.model.shape import Functions, Shape, constants_reader, number_offsets
 from thruster_env.model.state_space import StateSpaceModel, refuse_feed

@@ -38,7 +38,7 @@ from filters.pages.kernels import Stage, as_tuple, programs_of, stored
 from filters.pages.page import Equations, Page, RowMemory
 from thruster_env.core.angles import difference
 from thruster_env.core.compiled import is_interpreting
-from thruster_env.core.threads import spread
+from thruster_env.core.parallel import spread
 from thruster_env.model.shape import Functions, Shape
 from thruster_env.model.turns import refuse_rotations
 

@@ -27,8 +27,8 @@ from filters.starts import warn_of_restarts
 from thruster_env.core.angles import difference, wrapped_where
 from thruster_env.core.checks import at_least
 from thruster_env.core.compiled import is_interpreting
+from thruster_env.core.parallel import spread
 from thruster_env.core.sources import joiner, vector_part, written_out
-from thruster_env.core.threads import spread
 from thruster_env.model.shape import number_offsets
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import refuse_rotations

@@ -11,7 +11,7 @@ import pytest
 from filters.augmented import Unknown
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.executors import IN_PROCESS, task_map
+from thruster_env.core.parallel import IN_PROCESS, task_map
 from thruster_env.model.affine import affine_model
 from tuning.cli.main import main
 from tuning.evaluation.compare import Leaderboard, Row, compare, contender, sized, winners

@@ -12,7 +12,7 @@ import pytest
 
 from filters import ExtendedKalmanFilter, run
 from tests.filters.test_sensitivity import pendulum
-from thruster_env.core.executors import task_map
+from thruster_env.core.parallel import task_map
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.logs.log import Log
 from thruster_env.model import simulate

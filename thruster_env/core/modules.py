@@ -1,16 +1,21 @@
 """Objects by "module:object", actions that wait for a package's import, and how to install optional packages.
 
-It imports nothing that takes time: `import thruster_env` needs it.
+It imports nothing that takes time: `import thruster_env` needs it. `python -m thruster_env.core.modules`,
+from the checkout's folder, removes what an uninstalled copy of our packages left behind, folders without sources,
+which would hide the checkout's; `make` does so after each installation.
 """
 
 from __future__ import annotations
 
 import importlib
 import os
+import shutil
 import sys
+import sysconfig
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any
 
@@ -202,3 +207,25 @@ def to_install(extra: str) -> str:
     if extra in OF_ONE_PACKAGE:
         return f"pip install {OF_ONE_PACKAGE[extra]}"
     return f"pip install '.[{extra}]' in the project's folder"
+
+
+def remove_leftovers(site: Path, checkout: Path) -> list[Path]:
+    """Remove folders in `site` with the name of a package in `checkout` that hold caches alone; return them.
+
+    Args:
+        site: folder where pip installs packages.
+        checkout: folder of the sources.
+    """
+    removed = []
+    for source in sorted(checkout.glob("*/__init__.py")):
+        folder = site / source.parent.name
+        files = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
+        if folder.is_dir() and all(file.parent.name == "__pycache__" for file in files):
+            shutil.rmtree(folder)
+            removed.append(folder)
+    return removed
+
+
+if __name__ == "__main__":
+    for folder in remove_leftovers(Path(sysconfig.get_path("purelib")), Path.cwd()):
+        print(f"removed {folder}, which an earlier installation left behind")

@@ -465,3 +465,17 @@ def zeros_of(*shape: int) -> Callable:
 def part_of(rows: int, columns: int, shape: tuple[int, int], top: int = 0, left: int = 0) -> Callable:
     """Return `part(a)`: the block (rows, columns) at (top, left) of a matrix of this shape."""
     return entrywise("part", "a", (rows, columns), lambda i, j: f"a[{i + top}][{j + left}]", a=shape)
+
+
+def fill(out, value):
+    """Copy a vector or matrix, in whatever form, into an array."""
+    out[...] = value
+
+
+def as_array(function: Callable, arguments: str, *shape: int) -> Callable:
+    """Return a function with the same result as an array, for a function that returns a tuple of this shape."""
+    if not is_array(*shape):
+        return function
+    lines = f"out = np.empty({shape})", f"fill(out, function({arguments}))"
+    names = {"function": function, "fill": fill, "np": np}
+    return written_out("array_valued", arguments, *lines, "out", **names)

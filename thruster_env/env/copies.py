@@ -12,8 +12,7 @@ import numpy as np
 from thruster_env.core.checks import covariance_root
 from thruster_env.core.checks import options as checked_options
 from thruster_env.core.compiled import is_interpreting
-from thruster_env.core.results import as_array
-from thruster_env.core.sources import tuple_of, written_out
+from thruster_env.core.sources import as_array, tuple_of, written_out
 from thruster_env.effects.effects import Moment, unrolled
 from thruster_env.env.plant_data import checked_state
 from thruster_env.graphs.draws import Draws

@@ -14,7 +14,7 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 
 from thruster_env.core.compiled import fastmath_of, instead_of
-from thruster_env.core.results import fill
+from thruster_env.core.sources import fill
 from thruster_env.core.streams import fill_normals
 from thruster_env.graphs.arithmetic import (
     BOOL,

@@ -24,7 +24,7 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 
 from thruster_env.core.compiled import is_interpreting
-from thruster_env.core.threads import ACTIVE, cores, wait_policy
+from thruster_env.core.parallel import ACTIVE, cores, wait_policy
 from thruster_env.graphs.expressions import instruction
 from thruster_env.graphs.instructions import LONG
 from thruster_env.graphs.loops import machine_code_of

@@ -19,8 +19,7 @@ from thruster_env.core.compiled import FASTMATH, Instead, compiled_in_place_of, 
 from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.modules import error_line
-from thruster_env.core.results import array_valued
-from thruster_env.core.sources import is_array, matrix_of, tuple_of, written_out
+from thruster_env.core.sources import as_array, is_array, made_here, matrix_of, tuple_of, written_out
 from thruster_env.core.user_functions import functions_in, is_copy, needs_python, stand_in, stands_for
 from thruster_env.graphs.branches import along, on_every_side
 from thruster_env.graphs.graphs import Graph, Number, TooLarge
@@ -286,7 +285,7 @@ def _machine_code(
     """Machine code of a function's graph, or of its loops, else of numba's."""
     parts, of_loops = (
         [*functions_in(function)],
-        _of_floats(array_valued(function, arguments, *shape), arguments, shape),
+        _of_floats(_array_valued(function, arguments, *shape), arguments, shape),
     )
     large = is_array(max(sizes[:-1])) or is_array(*shape)
     if (large or not parts) and _is_translated(of_loops, sizes, form):
@@ -308,6 +307,15 @@ def _machine_code(
         return Instead(_by_numba(function, sizes, form, shape), reason)
     except Exception as error:  # numba's, of many classes
         return Instead(None, f"{reason}; numba refuses it: {_reason(error)}")
+
+
+@makes_functions
+def _array_valued(function: Callable, arguments: str, *shape: int) -> Callable:
+    """A function whose result is an array where vectors or matrices of its shape are (`is_array`).
+
+    So a user's function may return tuples, or arrays, of any size.
+    """
+    return function if made_here(function) else as_array(function, arguments, *shape)
 
 
 @makes_functions

@@ -17,8 +17,8 @@ from filters.logs.findings import colour_of
 from filters.registry import FILTERS, filter_type
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import at_least, short_repr
-from thruster_env.core.executors import task_map
 from thruster_env.core.files import panels
+from thruster_env.core.parallel import task_map
 from thruster_env.core.text_tables import TITLE, Table, verbatim
 from tuning.api.evaluate import NOMINAL
 from tuning.api.held_out import cells_of

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 from filters.consistency.nees import Interval, rmse_ratios
 from filters.registry import filter_type
 from thruster_env.core.checks import short_repr
-from thruster_env.core.executors import task_map
 from thruster_env.core.files import check_target
+from thruster_env.core.parallel import task_map
 from thruster_env.logs.write import check_picture
 from tuning.api.held_out import CovarianceCheck, HeldOut, on_held_out
 from tuning.api.markers import (

@@ -14,7 +14,7 @@ from filters.consistency.report import MOST_STATES, ConsistencyReport, compariso
 from filters.estimators.foreign import label_of
 from filters.filter import Filter
 from thruster_env.core.checks import at_least
-from thruster_env.core.executors import IN_PROCESS, TaskMap
+from thruster_env.core.parallel import IN_PROCESS, TaskMap
 from thruster_env.core.text_tables import Table
 from tuning.api.progress import working
 from tuning.api.result import Result, about, drawn, frame, number

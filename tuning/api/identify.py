@@ -12,8 +12,8 @@ import numpy as np
 from rich.text import Text
 
 from thruster_env.core.checks import finite, short_repr
-from thruster_env.core.executors import task_map
 from thruster_env.core.files import save_figure
+from thruster_env.core.parallel import task_map
 from thruster_env.core.text_tables import Table
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import check_picture

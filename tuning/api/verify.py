@@ -11,7 +11,7 @@ from rich.console import RenderableType
 
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import short_repr
-from thruster_env.core.executors import task_map
+from thruster_env.core.parallel import task_map
 from thruster_env.core.text_tables import Table
 from tuning.api.markers import CodeProblem, ExecutorOption, ModelOption, PresetOption, Progress, TunedFile
 from tuning.api.problems import given_for

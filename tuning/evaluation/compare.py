@@ -20,7 +20,7 @@ from filters.filter import Filter
 from filters.particles.kernels import WeightedFilter
 from filters.registry import FILTERS, filter_type, make_filter
 from thruster_env.core.checks import one_of, tell
-from thruster_env.core.executors import IN_PROCESS, TaskMap
+from thruster_env.core.parallel import IN_PROCESS, TaskMap
 from tuning.evaluation.baselines import (
     GIVEN,
     NOISE,

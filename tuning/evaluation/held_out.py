@@ -21,7 +21,7 @@ from filters.consistency.time_constants import TimeConstants
 from filters.starts import Restarts
 from thruster_env.core.angles import is_angle
 from thruster_env.core.checks import with_progress
-from thruster_env.core.executors import IN_PROCESS, TaskMap
+from thruster_env.core.parallel import IN_PROCESS, TaskMap
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import (

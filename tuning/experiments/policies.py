@@ -19,9 +19,8 @@ import numpy as np
 from scipy.stats import t as student
 
 from filters.consistency.nees import Interval
-from thruster_env.core.executors import Where, task_map
 from thruster_env.core.files import write_whole
-from thruster_env.core.threads import one_thread
+from thruster_env.core.parallel import Where, one_thread, task_map
 from tuning.policies.environments import make_environments
 from tuning.policies.learn import train
 from tuning.policies.saved import FINAL, Policy, Scores, classical_policy, load, score
@@ -206,7 +205,7 @@ def run_comparison(
     Args:
         comparison: the comparison.
         folder: folder for a file of results and a folder of the training of each run.
-        executor: as for `thruster_env.core.executors.task_map`; on other hosts they must share the folder.
+        executor: as for `thruster_env.core.parallel.task_map`; on other hosts they must share the folder.
         on_run: called after each run.
 
     Raises:

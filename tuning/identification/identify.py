@@ -15,7 +15,7 @@ import numpy as np
 from filters.adaptive import RobustExtendedKalmanFilter
 from filters.starts import Starts
 from thruster_env.core.checks import at_least, short_repr
-from thruster_env.core.executors import IN_PROCESS, TaskMap
+from thruster_env.core.parallel import IN_PROCESS, TaskMap
 from thruster_env.core.streams import START_POINTS, derived_generator
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel

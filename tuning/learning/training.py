@@ -24,7 +24,7 @@ from filters.learned.estimator import Equations, LearnedEstimator, Scales, Track
 from filters.learned.filters import LEARNED
 from filters.tensors.stages import density, factor
 from thruster_env.core.angles import wrapped_where
-from thruster_env.core.threads import one_thread
+from thruster_env.core.parallel import one_thread
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import ORACLE, baselines
 from tuning.evaluation.evaluate import NOTHING, Evaluation, evaluate, score_ratio, values_of

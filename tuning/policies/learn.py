@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from thruster_env.core.files import write_whole
-from thruster_env.core.threads import PASSIVE, one_thread, waiting
+from thruster_env.core.parallel import PASSIVE, one_thread, waiting
 from tuning.policies.algorithms import find_algorithm
 from tuning.policies.environments import make_environments, seed_episodes
 from tuning.policies.saved import (

@@ -17,7 +17,7 @@ from filters.engine.batch import Estimates, run
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from thruster_env.core.checks import at_least, with_progress
-from thruster_env.core.threads import cores
+from thruster_env.core.parallel import cores
 from thruster_env.model.shape import LANES
 
 FIRST_SCORED_STEP = 50  # RMSE is of steps 50 to 500; the start-up is reported separately

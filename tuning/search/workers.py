@@ -23,8 +23,8 @@ from typing import Any
 
 import optuna
 
-from thruster_env.core.executors import take_share, without_interrupts
 from thruster_env.core.modules import working_folder_last
+from thruster_env.core.parallel import take_share, without_interrupts
 from tuning.problems.assumed import within
 from tuning.problems.data import Data
 from tuning.problems.find import find_same

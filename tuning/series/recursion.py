@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.core.threads import spread
+from thruster_env.core.parallel import spread
 from thruster_env.graphs.loops import Loops
 
 SETTLED = 1e-13  # of the variances: a change of P from row to row below which they have settled

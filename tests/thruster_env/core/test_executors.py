@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from thruster_env.core import executors
-from thruster_env.core.executors import prepare_process, task_map
+from thruster_env.core import parallel
+from thruster_env.core.parallel import prepare_process, task_map
 
 
 def square(number):
@@ -62,7 +62,7 @@ class Broken(ThreadPoolExecutor):
 def test_the_rest_of_an_executor_that_breaks_runs_here_and_ours_are_not_opened_for_ever(monkeypatch):
     with Broken(1) as pool, task_map(pool) as tasks, pytest.warns(UserWarning, match="run in this process"):
         assert dict(tasks(square, [(1,), (2,), (3,)])) == {0: 1, 1: 4, 2: 9}
-    monkeypatch.setattr(executors, "opener_of", lambda name: lambda: Broken(0))
+    monkeypatch.setattr(parallel, "opener_of", lambda name: lambda: Broken(0))
     with task_map("processes:2") as tasks, pytest.warns(UserWarning, match="1 tasks are run again"):
         with pytest.raises(ValueError, match="workers must live until .* but died 3 times without finishing one"):
             list(tasks(square, [(1,)]))
@@ -123,8 +123,8 @@ def test_what_has_no_name_is_refused_in_one_line():
 def test_a_process_leaves_ctrl_c_to_its_parent_and_ends_with_it(monkeypatch):
     ended, before = [], signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(os, "_exit", ended.append)
-    monkeypatch.setattr(executors, "take_share", lambda count: None)
-    monkeypatch.setattr(executors.multiprocessing, "parent_process", lambda: None)
+    monkeypatch.setattr(parallel, "take_share", lambda count: None)
+    monkeypatch.setattr(parallel.multiprocessing, "parent_process", lambda: None)
     try:
         prepare_process(2)
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from thruster_env.core.leftovers import remove_leftovers
+from thruster_env.core.modules import remove_leftovers
 
 ROOT = Path(__file__).parents[3]
 
@@ -71,4 +71,4 @@ def test_make_installs_again_where_a_copy_has_taken_the_place_of_the_checkout(tm
     assert "pip" not in planned()
     installed.unlink()  # as `pip install .` does
     again = planned()
-    assert "--no-build-isolation -e" in again and "-m thruster_env.core.leftovers" in again
+    assert "--no-build-isolation -e" in again and "-m thruster_env.core.modules" in again

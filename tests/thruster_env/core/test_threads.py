@@ -8,7 +8,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from thruster_env.core.threads import spread
+from thruster_env.core.parallel import spread
 
 COUNT = 1000
 
@@ -27,8 +27,8 @@ def test_spread_covers_everything_once():
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_after_an_exception_no_further_part_of_spread_begins(error, monkeypatch):
     pool, begun, raised = ThreadPoolExecutor(2), [], threading.Event()
-    monkeypatch.setattr("thruster_env.core.threads._pool", lambda: pool)
-    monkeypatch.setattr("thruster_env.core.threads.cores", lambda: 50)
+    monkeypatch.setattr("thruster_env.core.parallel._pool", lambda: pool)
+    monkeypatch.setattr("thruster_env.core.parallel.cores", lambda: 50)
 
     def fail(*_):
         raised.set()
@@ -74,7 +74,7 @@ def test_work_that_is_spread_while_a_module_is_imported_may_import_it(tmp_path, 
     # an import that waits for the worker.
     source = """
 from importlib import import_module
-from thruster_env.core.threads import spread
+from thruster_env.core.parallel import spread
 found = []
 def part(first, last):
     if not found:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.threads import waiting
+from thruster_env.core.parallel import waiting
 from thruster_env.graphs.loops import machine_code_of
 from thruster_env.graphs.machine_code import words_of
 from thruster_env.graphs.workers import BEHIND, CALLER, SPIN_ROUNDS, InParts, WorkerThreads, worker_threads

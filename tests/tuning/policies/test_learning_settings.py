@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from torch.distributions import Distribution
 
 from tests.learners import setup_of, short_episodes  # noqa: F401 - a fixture
-from thruster_env.core.threads import wait_policy
+from thruster_env.core.parallel import wait_policy
 from tuning.policies.algorithms import ALGORITHMS
 from tuning.policies.environments import make_environments
 from tuning.policies.learn import EpochBuffer, NumpyTanh, learning, new_model, numpys_tanh

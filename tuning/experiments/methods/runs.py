@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.consistency.nees import Interval
-from thruster_env.core.executors import Where, task_map
 from thruster_env.core.files import write_whole
+from thruster_env.core.parallel import Where, task_map
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.evaluate import compute_metrics
 from tuning.evaluation.runs import metrics_of_all
@@ -290,7 +290,7 @@ def run_protocol(
     Args:
         protocol: how much is done.
         folder: for a file a result.
-        executor: as for `thruster_env.core.executors.task_map`.
+        executor: as for `thruster_env.core.parallel.task_map`.
         on_result: called after each result.
 
     Raises:
