@@ -8,8 +8,7 @@ import torch
 
 import filters
 from filters import make_filter, run
-from filters.differentiated.runs import ModelSlopes
-from filters.sensitivity import likelihood, sensitivity
+from filters.sensitivity import ModelSlopes, likelihood, sensitivity
 from tests.models import simulated, state_space
 
 DT = 0.1

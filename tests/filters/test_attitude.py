@@ -16,10 +16,9 @@ import filters
 from filters.bounds import path_bound, posterior_bound
 from filters.c.project import c_filter, write_filter, write_project
 from filters.consistency.report import consistency_report
-from filters.differentiated.runs import ModelSlopes
 from filters.estimators.foreign import Estimator, ForeignFilter
 from filters.registry import FILTERS
-from filters.sensitivity import sensitivity, state_score
+from filters.sensitivity import ModelSlopes, sensitivity, state_score
 from filters.starts import begun_at
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted

@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from filters.differentiated import recursion
-from filters.differentiated.recursion import Wanted, recursion_of
-from filters.differentiated.runs import ModelSlopes
-from filters.sensitivity import information, likelihood, sensitivity
+from filters import differentiated
+from filters.differentiated import Wanted, recursion_of
+from filters.sensitivity import ModelSlopes, information, likelihood, sensitivity
 from tests.filters.test_sensitivity import case, slopes_of
 from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.models import DT, pendulum, simulated, swing, wide_model
@@ -43,17 +42,17 @@ def at_once(model):
 
 @pytest.mark.usefixtures("as_python")
 def test_only_what_can_be_traced_becomes_a_program():
-    assert at_once(pendulum()) == at_once(wide_model()) == at_once(turning_pendulum()) == recursion.AT_ONCE
+    assert at_once(pendulum()) == at_once(wide_model()) == at_once(turning_pendulum()) == differentiated.AT_ONCE
     assert at_once(pendulum(transition=swing_if)) == at_once(pendulum(transition=swing_by_kind)) == 1
     assert at_once(pendulum(transition=swing_undefined, prior_mean=[2e3, 0.0])) == 1
 
 
 @pytest.mark.usefixtures("as_python")
 def test_a_graph_that_is_too_large_is_called(monkeypatch):
-    monkeypatch.setattr(recursion, "MOST", 50)
-    recursion._recursion_of.cache_clear()
+    monkeypatch.setattr(differentiated, "MOST", 50)
+    differentiated._recursion_of.cache_clear()
     assert at_once(wide_model()) == 1
-    recursion._recursion_of.cache_clear()
+    differentiated._recursion_of.cache_clear()
 
 
 def units(model):
@@ -132,7 +131,7 @@ def test_machine_code_of_a_program_is_found_again_and_that_of_another_is_not_tak
                 expected = likelihood(model, inputs, z, *units(model))
             np.testing.assert_allclose(found.values, expected.values, rtol=1e-12)
     compiled = recursion_of(model.functions, model.shape, PLAIN).run
-    recursion._recursion_of.cache_clear()
+    differentiated._recursion_of.cache_clear()
     monkeypatch.setattr(machine_code, "_compiled", lambda text: pytest.fail("the code is compiled again"))
     again = recursion_of(model.functions, model.shape, PLAIN).run
     assert again is not compiled

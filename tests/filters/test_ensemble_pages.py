@@ -10,10 +10,10 @@ import pytest
 from filters import FILTERS, make_filter, run, thruster_model
 from filters.algebra.members import mean
 from filters.algebra.operations import divide
-from filters.differentiated.runs import differentiable
 from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, propagate
 from filters.pages.kernels import with_extras
 from filters.pages.page import Page
+from filters.sensitivity import differentiable
 from tests.filters.of_arrays import OfArrays, parameters_of
 from tests.filters.test_pages import turn_if, wide_pendulum
 from tests.filters.test_sensitivity import pendulum as turning_pendulum

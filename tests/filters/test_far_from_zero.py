@@ -12,8 +12,7 @@ import torch
 import filters
 from filters import make_filter, run
 from filters.c.project import c_filter
-from filters.differentiated.runs import ModelSlopes
-from filters.sensitivity import sensitivity
+from filters.sensitivity import ModelSlopes, sensitivity
 from tests.models import simulated, state_space
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.derivatives import jacobian, step_growth, step_of

@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 
 from filters import FILTERS, ExtendedKalmanFilter, KalmanFilter, make_filter, run, thruster_model
-from filters.differentiated.runs import KINDS, ModelSlopes, differentiable
 from filters.filter import PageFilter
-from filters.sensitivity import information, likelihood, sensitivity, state_score
+from filters.sensitivity import (
+    KINDS,
+    ModelSlopes,
+    differentiable,
+    information,
+    likelihood,
+    sensitivity,
+    state_score,
+)
 from tests.filters.of_arrays import run_page
 from tests.filters.test_differentiated import units
 from tests.filters.test_likelihood import directions, two_channels

@@ -6,11 +6,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from filters.differentiated import recursion
-from filters.differentiated.recursion import Wanted, recursion_of
-from filters.differentiated.runs import differentiable
+from filters import differentiated
+from filters.differentiated import AT_ONCE, Wanted, recursion_of
 from filters.pages.page import called_at_points
-from filters.sensitivity import likelihood, state_score
+from filters.sensitivity import differentiable, likelihood, state_score
 from tests.filters.test_differentiated import units
 from tests.filters.test_likelihood import directions
 from tests.filters.test_pages import NAMES, assert_slopes, gaze, gaze_slopes, made, whirl, wide_pendulum
@@ -38,7 +37,10 @@ def test_functions_that_are_called_have_the_derivatives_of_those_that_are_traced
     decides = model.replace(transition=turn_if)
     _, inputs, z, x = data_of(model, steps=12)
     slopes = tuple(map(np.array, directions(model)))
-    assert (at_once(model, made(name, model)), at_once(decides, made(name, decides))) == (recursion.AT_ONCE, 1)
+    assert (at_once(model, made(name, model)), at_once(decides, made(name, decides))) == (
+        AT_ONCE,
+        1,
+    )
     for work in (likelihood, partial(state_score, states=x)):
         given = {"inputs": inputs, "measurements": z, "q_slopes": slopes[0], "r_slopes": slopes[1]}
         traced, called = (work(one, **given, filter=made(name, one)) for one in (model, decides))
@@ -49,15 +51,15 @@ def test_functions_that_are_called_have_the_derivatives_of_those_that_are_traced
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", NAMES)
 def test_a_model_that_is_too_large_to_be_written_out_is_called(name, monkeypatch):
-    monkeypatch.setattr(recursion, "MOST", 50)
-    recursion._recursion_of.cache_clear()
+    monkeypatch.setattr(differentiated, "MOST", 50)
+    differentiated._recursion_of.cache_clear()
     model = random_affine(n=7, m=2, p=1)  # its matrices are arrays
     inputs, z = simulated(model, 3, count=2, missing=0.2)
     slopes = units(model)
     slopes = slopes[0], np.array([np.zeros((2, 2))] * 7 + [np.eye(2)])
     assert at_once(model, made(name, model)) == 1
     kalman, other = (likelihood(model, inputs, z, *slopes, filter=one) for one in (None, made(name, model)))
-    recursion._recursion_of.cache_clear()
+    differentiated._recursion_of.cache_clear()
     np.testing.assert_allclose(other.values, kalman.values, rtol=1e-11)
     np.testing.assert_allclose(other.gradients, kalman.gradients, rtol=1e-7, atol=1e-7)
 

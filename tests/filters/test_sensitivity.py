@@ -8,8 +8,7 @@ import pytest
 from scipy.stats import multivariate_t, norm
 
 from filters import ExtendedKalmanFilter, StateSpaceModel, affine_model, run
-from filters.differentiated.runs import ModelSlopes
-from filters.sensitivity import likelihood, sensitivity
+from filters.sensitivity import ModelSlopes, likelihood, sensitivity
 from thruster_env.core.angles import difference
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from filters import FILTERS, KalmanFilter, make_filter, run, smooth, torch
-from filters.differentiated.recursion import Wanted
-from filters.differentiated.runs import ModelSlopes, derivatives
+from filters.differentiated import Wanted
+from filters.sensitivity import ModelSlopes, derivatives
 from filters.smoothers.smooth import WithSmoother
 from tests.filters.test_session import cart
 from tests.fuzz import unequal_steps

@@ -8,7 +8,7 @@ import pytest
 
 from docs.scripts.machine_code import TABLES, body
 from filters import ExtendedKalmanFilter
-from filters.differentiated.recursion import Memory, Wanted, stages_of
+from filters.differentiated import Memory, Wanted, stages_of
 from filters.pages.kernels import as_programs
 from filters.pages.page import Equations
 from thruster_env.model.traced import MOST

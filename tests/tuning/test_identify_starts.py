@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from filters.differentiated.runs import ModelSlopes
-from filters.sensitivity import sensitivity
+from filters.sensitivity import ModelSlopes, sensitivity
 from filters.starts import Starts
 from tests.filters.test_sensitivity import pendulum
 from tests.models import random_affine

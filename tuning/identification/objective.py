@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from filters.differentiated.runs import ModelSlopes
 from filters.registry import make_filter
+from filters.sensitivity import ModelSlopes
 from thruster_env.core.checks import one_of, short_repr
 from thruster_env.logs.log import Log
 from thruster_env.model.state_space import StateSpaceModel

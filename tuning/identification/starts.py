@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from filters.differentiated.runs import ModelSlopes
 from filters.engine.batch import Estimates, run
 from filters.gaussian.extended import ExtendedKalmanFilter
-from filters.sensitivity import sensitivity
+from filters.sensitivity import ModelSlopes, sensitivity
 from filters.starts import Starts, as_the_prior_says, begun_at, first_measured, wide_cov
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import short_repr

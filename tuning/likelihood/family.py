@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from filters.differentiated.runs import KINDS, ModelSlopes, has_derivatives
 from filters.estimators.foreign import is_foreign
 from filters.filter import Filter
 from filters.registry import filter_type, make_filter
+from filters.sensitivity import KINDS, ModelSlopes, has_derivatives
 from thruster_env.core.checks import one_of
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.likelihood.objective import Part

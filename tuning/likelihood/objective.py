@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from filters import differentiated
 from filters.consistency.nees import pooled_mean
-from filters.differentiated import recursion
-from filters.differentiated.runs import Density, ModelSlopes, Truth, derivatives
 from filters.filter import Filter
+from filters.sensitivity import Density, ModelSlopes, Truth, derivatives
 from filters.starts import Starts, as_the_prior_says
 from thruster_env.core.checks import one_of
 from thruster_env.core.sources import is_array
@@ -30,9 +30,9 @@ from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 from tuning.search.space import Choice
 
 OF_STATES = {  # objectives on the true states: what of them is summed over steps
-    SCORE: recursion.SQUARES,
-    MSE: recursion.SQUARES,
-    LOG_SCORE: recursion.LOG_SCORE,
+    SCORE: differentiated.SQUARES,
+    MSE: differentiated.SQUARES,
+    LOG_SCORE: differentiated.LOG_SCORE,
 }
 LARGE_STEP = 1e-2  # of differences of the objective itself
 COVARIANCES = "process_noise_cov", "measurement_noise_cov", "prior_cov"
@@ -305,9 +305,9 @@ class Objective:
 
         The lead-in of runs, in which the filter settles, is left out; so is what a run was padded with.
         """
-        score, robust = OF_STATES.get(self.objective, recursion.LIKELIHOOD), self.innovations
+        score, robust = OF_STATES.get(self.objective, differentiated.LIKELIHOOD), self.innovations
         moving = bool(slopes.constants.any()) or robust is not None
-        wanted = recursion.Wanted(self.informative, constants=moving, tails=robust is not None, score=score)
+        wanted = differentiated.Wanted(self.informative, constants=moving, tails=robust is not None, score=score)
         density = None if robust is None else Density(float(robust.degrees), 1.0 - np.array(self.unseen))
 
         def of(runs: Data) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.differentiated.runs import ModelSlopes
+from filters.sensitivity import ModelSlopes
 from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.equal_functions import bound_call, captured_numbers, differ_in_numbers_alone, with_numbers
 from thruster_env.graphs.graphs import Number

@@ -1,4 +1,10 @@
-"""The recursion of a filter over runs, with derivatives along parameters.
+"""The recursion of a filter over runs, with derivatives of its log-likelihood along parameters of the model.
+
+Derivatives are made from the page by the rules of matrix calculus and of `thruster_env.graphs`. Tuning follows
+them in three steps: a `ParametricModel` makes a model and its slopes from parameters, an objective its value,
+gradient and information from runs, and `tuning.likelihood.ascent` climbs. `filters.sensitivity` differentiates
+the *model* along each parameter in one recursion, of which Fisher's scoring needs a tenth of the evaluations of
+L-BFGS-B.
 
 In order: the layout of the memory, with the matrices that stand for its numbers; the score of a step and its
 slope; the compiled recursion. A stage works on several runs side by side in memory, but sums are kept for each
@@ -165,9 +171,6 @@ def score_of_truth(
     w = quotient(off, of)
     slope = density_slope(w, w, inverse(of, known), *slopes_of([off, s], moves))
     return {memory.level: density(off, of, known)}, {memory.slope: slope}
-
-
-__all__ = ["LIKELIHOOD", "LOG_SCORE", "SQUARES", "Recursion", "Wanted", "recursion_of", "stages_of"]
 
 
 class Recursion(NamedTuple):
