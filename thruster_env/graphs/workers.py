@@ -2,7 +2,7 @@
 
 A thread that has gone to sleep wakes up tens of microseconds after it is called. So worker threads wait for the
 next call spinning, for half a millisecond, in machine code that holds no lock, before they go to sleep, unless the
-wait policy (`core.threads`) is "passive".
+wait policy (`core.parallel`) is "passive".
 
 One integer is the number of the current call. For each part of a call that a worker thread may do, another one
 says whether the part is open, taken or done. Every flag has a cache line of its own, so that writing one does not
