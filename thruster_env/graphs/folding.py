@@ -166,6 +166,8 @@ def divided(a: Number, b: Number) -> Number:
 
 def modulus(a: Number, b: Number) -> Number:
     """The rest a % b, with the sign of b, as Python and NumPy have it."""
+    if b.value == 1.0:
+        return difference(a, worked_out("floor", a))
     rest = worked_out("fmod", a, b)
     return _folded_choice(_turns(rest, b), total(rest, b), rest)
 

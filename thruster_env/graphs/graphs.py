@@ -110,9 +110,9 @@ class Graph:
         return number
 
     @contextmanager
-    def as_written(self) -> Iterator[None]:
-        """Within this context numbers are those of Python: divisions, and all on which a jump depends."""
-        was, self.exact = self.exact, True
+    def as_written(self, exact: bool = True) -> Iterator[None]:
+        """Within this context numbers are those of Python: divisions, and all on which a jump depends; or not."""
+        was, self.exact = self.exact, exact
         try:
             yield
         finally:

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from thruster_env.core.streams import nearest_whole
 from thruster_env.core.user_functions import Copies, Module, needs_floats
 from thruster_env.graphs.branches import on_every_side
 from thruster_env.graphs.folding import worked_out
@@ -76,6 +77,14 @@ def _extreme(choose: Callable) -> Callable:
         return where(b == b, choose(a, b), b)
 
     return function
+
+
+def _nearest_whole(x):
+    """`streams.nearest_whole`: it jumps, but a sine or cosine of the rest does not, so rounding may be free."""
+    if not isinstance(x, Number):
+        return nearest_whole(x)
+    with x.graph.as_written(False):
+        return (x + 0.5).floor()
 
 
 def _hypotenuse(x, y=0.0, *rest):
@@ -363,6 +372,8 @@ def traced(function: Callable, by_function: bool = True) -> Callable:
     now = threading.local()  # the graph, in each thread that traces the function
 
     def joined_by_itself(copy: types.FunctionType) -> Callable:
+        if copy.__code__ is nearest_whole.__code__:
+            return _nearest_whole
         return _on_all_sides(copy, now) if by_function and _may_decide(copy.__code__) else copy
 
     copies = Copies(_replacement, BUILTINS, silent=True, of_array=_open, of_function=joined_by_itself)

@@ -10,7 +10,10 @@ from thruster_env.auv.dynamics import (
     in_earth_axes,
 )
 from thruster_env.core.streams import cosine_and_sine
+from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.loops import Loops
+from thruster_env.graphs.programs import Place, values_of
+from thruster_env.graphs.tracing import traced
 from tuning.experiments.vehicle.estimators import planar_kinematics
 
 
@@ -83,7 +86,15 @@ def on_floats(angles):
     return np.transpose([cosine_and_sine(angle) for angle in angles.tolist()])
 
 
-@pytest.mark.parametrize("way", [cosine_and_sine, on_floats, on_tensors, in_machine_code])
+def traced_by_programs(angles):
+    """Without calls of `fmod`, which is no instruction of vectors, and rounded freely."""
+    graph = Graph()
+    numbers = list(traced(cosine_and_sine)(graph.given(Place("numbers", 0))))
+    assert all(number.operation != "fmod" and not number.exact for number in graph.numbers)
+    return values_of(numbers, angles[None])
+
+
+@pytest.mark.parametrize("way", [cosine_and_sine, on_floats, on_tensors, in_machine_code, traced_by_programs])
 def test_cosine_and_sine_are_the_library_s(way):
     for limit, tolerance in ((np.pi / 2, 6e-16), (12.6, 1e-14)):
         angles = ANGLES[np.abs(ANGLES) <= limit]
