@@ -33,7 +33,7 @@ from filters.algebra.operations import (
     wrap,
 )
 from filters.algebra.points import density, density_slope, dot, heavier, outlier_weight, root
-from filters.algebra.tangents import differences
+from filters.algebra.tangents import differences, local_at
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.pages.kernels import Stage, as_calls, as_programs, as_tuple, stage_of, with_extras
 from filters.pages.page import Equations, NumbersMemory, Page, PagedModel
@@ -87,12 +87,15 @@ class Memory(NumbersMemory):
         of_extras = starts_of(self.extras_from, *(prod(matrix.shape) for matrix in started.values()))[1:]
         self.state = of_extras[-1]
         self.left, self.input, self.measured, self.level, self.true, self.length = starts_of(
-            self.state, self.state, shape.inputs, m, 1, n
+            self.state, self.state, shape.inputs, shape.channels, 1, n
         )[1:]
         self.slope = self.state  # of the score
         self.noted, self.weighed, self.depth = starts_of(self.state + 1, self.notes, self.notes)[1:]
         r, c, size, self.prior, own_slopes = starts_of(t * t, m * m, shape.constants, 1, self.begun)[1:]
-        self.u, self.z = self.read("rows", self.input, shape.inputs), self.read("rows", self.measured, m)
+        self.u, self.z = (
+            self.read("rows", self.input, shape.inputs),
+            self.read("rows", self.measured, shape.channels),
+        )
         self.ratio = self.ratio_in("rows", self.input)
         self.tails = [self.read("numbers", first, m + 2) for first in (tail, self.predicted_tail)]
         self.truth = self.read("rows", self.true, n)
@@ -139,10 +142,10 @@ class Wanted(NamedTuple):
 
 
 def density_of(
-    memory: Memory, v: Matrix, s: Matrix, moves: dict, tail: Matrix, wanted: Wanted
+    memory: Memory, z: Matrix, v: Matrix, s: Matrix, moves: dict, tail: Matrix, wanted: Wanted
 ) -> tuple[dict, dict]:
     """The log density of an innovation, its slope along a parameter, and the terms of the information."""
-    measured, of = present(memory.z), factor(s)
+    measured, of = present(z), factor(s)
     w, e = quotient(v, of), inverse(of, measured)
     level, weighted = density(v, of, measured), w
     if wanted.tails:
@@ -265,19 +268,20 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
         belief_stage(page.propagated(model, *memory.predicted, u=memory.u)),
         belief_stage(page.add_process_noise(model, *memory.predicted)),
     ]
-    mean, cov, v, s, _, changed = with_extras(page.update(model, x, p, memory.z))
+    local, z = local_at(model, memory.z, x)
+    mean, cov, v, s, _, changed = with_extras(page.update(local, x, p, z))
     if wanted.of_truth:
         known = present(differences(model, memory.truth, memory.truth) if model.turns else memory.truth)
         off = mask_missing(known, differences(model, memory.truth, mean))
         of_truth = score_of_truth(memory, known, off, cov, moves, wanted.score)
         stages.append(belief_stage((mean, cov, changed), *of_truth))
         return stages
-    stages.append(belief_stage((mean, cov, changed), *density_of(memory, v, s, moves, memory.tails[0], wanted)))
+    stages.append(belief_stage((mean, cov, changed), *density_of(memory, z, v, s, moves, memory.tails[0], wanted)))
     if wanted.tails:
-        measured = present(memory.z)
-        v = mask_missing(measured, wrap(memory.z - model.h(x), model.measurement_angles))
+        measured = present(z)
+        v = mask_missing(measured, wrap(z - local.h(x), local.measurement_angles))
         stages.append(
-            Stage(*density_of(memory, v, uncorrelated(measured, model.R), moves, memory.tails[1], wanted))
+            Stage(*density_of(memory, z, v, uncorrelated(measured, model.R), moves, memory.tails[1], wanted))
         )
     return stages
 
@@ -294,7 +298,7 @@ def _accumulator(memory: Memory, works: list[Callable], wanted: Wanted, page: Pa
     begun, state, left, first_part = memory.begun, memory.state, memory.left, 0 if page.represent is None else -1
     first_input, first_measured, level, slope = memory.input, memory.measured, memory.level, memory.slope
     prior, noted, weighed, notes = memory.prior, memory.noted, memory.weighed, memory.notes
-    inputs_count, channels, informative = memory.shape.inputs, memory.shape.m, wanted.information
+    inputs_count, channels, informative = memory.shape.inputs, memory.shape.channels, wanted.information
     first_true, true_states = memory.true, memory.shape.n if wanted.of_truth else 0
     nan = np.nan
     substeps = memory.shape.offsets.substeps

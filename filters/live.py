@@ -93,7 +93,7 @@ class Live:
         self._filter = filter_
         model = filter_.model
         self._channels = {quantity.symbol: i for i, quantity in enumerate(model.measurements)}
-        self._nothing, self._inputs = np.full(model.m, np.nan), model.inputs
+        self._nothing, self._inputs = np.full(model.channels, np.nan), model.inputs
         self._events: list[Event] = []
         self._raised: list[tuple[Alarm, ...]] = []  # by the monitor at each event
         self._acting_input = np.zeros(0)  # since the last prediction

@@ -32,7 +32,7 @@ from thruster_env.core.angles import wrapped_where
 from thruster_env.core.checks import as_floats, one_of
 from thruster_env.core.parallel import spread
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import refuse_rotations
+from thruster_env.model.turns import of_channels, refuse_rotations
 
 KINDS: tuple[type[PageFilter], ...] = (
     KalmanFilter,
@@ -192,6 +192,8 @@ class RepeatedRuns:
     ):
         """Find the compiled recursion; see the class for the arguments."""
         m, density = model.m, density or Density(np.inf, np.ones(model.m))
+        if model.measured_turns and not (density.seen > 0).all():
+            raise ValueError("predicted must be false for measurements with rotations, but some channels are true")
         begun = as_the_prior_says(model, len(measurements)) if starts is None else starts
         states, weights = truth or Truth(np.zeros((len(measurements), 0, 0)), np.zeros(0))
         self._recursion = recursion_of(model.functions, model.any_shape, wanted, page)
@@ -201,8 +203,9 @@ class RepeatedRuns:
         self._tails, self._weights = tails if turns == 2 else tails[::-1], np.diag(weights).ravel()
         arrays = inputs, measurements, states, _begins(model, begun)
         self._data = tuple(np.ascontiguousarray(array) for array in arrays)
+        fed = np.array(of_channels(density.seen.tolist(), model.measured_turns), dtype=np.float64)
         moves_prior = 1.0 - (begun.free & begun.held).astype(np.float64)  # of runs whose priors parameters move
-        self._settings = moves_prior, begun.counted_from.astype(np.float64), density.seen, turns
+        self._settings = moves_prior, begun.counted_from.astype(np.float64), fed, turns
 
     def __call__(
         self, numbers: np.ndarray, moves: np.ndarray, own_parameters: Sequence[float] | np.ndarray = ()
@@ -349,7 +352,7 @@ def check_shapes(arrays: dict[str, np.ndarray], model: StateSpaceModel, *of_slop
     """Raise ValueError unless inputs, measurements and slopes have the shapes that fit the model."""
     shapes = tuple(array.shape for array in arrays.values())
     count, steps = len(arrays["measurements"]), arrays["inputs"].shape[1] if arrays["inputs"].ndim == 3 else 0
-    wanted = (count, steps, model.inputs), (count, steps + 1, model.m), *of_slopes
+    wanted = (count, steps, model.inputs), (count, steps + 1, model.channels), *of_slopes
     if shapes != wanted:
         *names, last = arrays
         raise ValueError(f"{', '.join(names)} and {last} must have the shapes {wanted}, but got {shapes}")

@@ -209,7 +209,9 @@ def _states_and_cause(
         u: input (p,); None without a prediction.
         z: measurement (m,).
     """
-    if filter_.model.turns:  # whose covariance is in another space than the Jacobians that are tried
+    if (
+        filter_.model.turns or filter_.model.measured_turns
+    ):  # whose covariance is in another space than the Jacobians that are tried
         return (), UNKNOWN
     modes = filter_.mode_filters if isinstance(filter_, MultipleModelFilter) else ()
     models = [mode.kernel_model for mode in modes] or [_model_of_numbers(filter_.kernel_model, numbers)]
@@ -427,17 +429,30 @@ def _begun_at(model: StateSpaceModel, z: np.ndarray) -> np.ndarray:
     shape, c, of, mean = model.any_shape, model.given_constants, model.turns, model.prior_mean
     fed, scales, measured = shape.fed(as_value(np.zeros(model.inputs))), as_value(model.scales), ~np.isnan(z)
     slopes, steps = observation_slopes(model.functions, shape), cast(Any, turns)  # on arrays
-    known = np.diag(model.prior_cov) > 0.0
+    known, parts, angles = np.diag(model.prior_cov) > 0.0, model.measured_turns, list(shape.measurement_angles)
+
+    def expected(x: np.ndarray) -> np.ndarray:
+        return np.array(model.functions.observe(as_value(x), *fed, c))
+
+    if parts:  # in the tangent at the measurement
+        centre = np.array(steps.completed(z, expected(mean), parts))
+        z = np.array(steps.innovation(z, centre, parts))
+        measured, angles = ~np.isnan(z), steps.tangent_flags(angles, parts)
     of_r = np.linalg.cholesky(model.measurement_noise_cov[np.ix_(measured, measured)])
     of_p = np.linalg.cholesky(model.prior_cov[np.ix_(known, known)])
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        v = difference(z, np.array(model.functions.observe(as_value(x), *fed, c)), shape.measurement_angles)
+        y = np.array(steps.difference(expected(x), centre, parts)) if parts else expected(x)
+        v = difference(z, y, tuple(angles))
         off = np.array(steps.difference(x, mean, of))
         return np.concatenate([np.linalg.solve(of_r, v[measured]), np.linalg.solve(of_p, off[known])])
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        h = np.array(slopes(as_value(x), scales, *fed, c)).reshape(model.m, model.n)
+        h = np.array(slopes(as_value(x), scales, *fed, c)).reshape(model.channels, model.n)
+        if parts:
+            y = expected(x)
+            back = steps.inverse_reset_slopes(centre, steps.difference(y, centre, parts), parts)
+            h = np.array(back) @ np.array(steps.slopes_of_tangent(y, parts)) @ h
         h = h @ np.array(steps.slopes_of_stored(x, of))
         off = np.array(steps.inverse_reset_slopes(mean, steps.difference(x, mean, of), of))
         rows = np.linalg.solve(of_r, -h[measured][:, known]), np.linalg.solve(of_p, off[np.ix_(known, known)])

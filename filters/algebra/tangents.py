@@ -6,6 +6,7 @@ Of a model without rotations each is the plain operation: a sum, or nothing.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from functools import cache
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 from filters.algebra.matrices import Operation, never, operation, same
 from filters.algebra.operations import sym, wrap
 from filters.algebra.points import ones, outer
+from filters.algebra.roots import zeros
 from thruster_env.graphs.graphs import Number
 from thruster_env.graphs.tracing import traced
 from thruster_env.model import turns as steps
@@ -72,9 +74,7 @@ def points_around(model, x, D):
 
 def differences(model, Y, y):
     """The d with move(model, y, d) = Y of a state, or of each column of Y, (t, points): Y - y, angles wrapped."""
-    angles = list(model.state_angles)
-    for turn in reversed(model.turns):
-        del angles[turn.stored]
+    angles = steps.tangent_flags(model.state_angles, model.turns)
     if model.turns:
         return wrap(apart(Y, y, model.turns), angles)
     return wrap(Y - y if len(Y.shape) == 1 else Y - outer(y, ones(Y)), angles)
@@ -111,6 +111,38 @@ def unit(x, turns):
     return normalised(x, turns) if turns else x
 
 
+def local_at(model, z, x):
+    """The model and the measurement z in the tangent at h(x), of `about`; without rotations there as they are."""
+    return about(model, z, model.h(x)) if model.measured_turns else (model, z)
+
+
+def about(model, z, y):
+    """The model and the measurement z in the tangent of measurements at y.
+
+        z becomes difference(z, y),  h(x) difference(h(x), y),  H the derivative of that
+
+    so that a page's innovation z - h(x) and its S have the components of R. At y = h(x) of the mean they are those
+    of the extended filter. At y = z, if z is a rotation or a pose, z = move(h(x), e) is exactly h(x) + e = 0 for
+    these, and H that of Gauss and Newton's method (`at_measurement` of the model that is returned).
+    """
+    turns = model.measured_turns
+    local, centre = copy(model), unit(y, turns)
+    local.measured_turns, local.measurement_angles = (), steps.tangent_flags(model.measurement_angles, turns)
+
+    def h(x):
+        at_x = model.h(x)
+        return zeros(model.R, len(model.R)) if at_x is y else apart(unit(at_x, turns), centre, turns)
+
+    def H(x):  # noqa: N802
+        at_x = model.h(x)
+        slopes = slopes_of_tangent(at_x, turns) @ model.H(x)
+        return slopes if at_x is y else inverse_reset_slopes(centre, h(x), turns) @ slopes
+
+    local.h, local.H = h, H
+    local.at_measurement = lambda _: about(model, z, completed(z, centre, turns))
+    return local, innovation(z, centre, turns)
+
+
 def rows_in_tangent(a, y, turns):
     """A matrix of changes of the state y, (n, k), as one of its tangent, (t, k)."""
     return slopes_of_tangent(y, turns) @ a if turns else a
@@ -125,6 +157,18 @@ def columns_in_tangent(a, x, turns):
 def moved(x, d, turns):
     """`move` and `points_around`, if there are rotations."""
     return _computed(steps.move, turns, x, d)
+
+
+@operation(lambda z, y, turns: (z[0] - len(turns),))
+def innovation(z, y, turns):
+    """The difference of a measurement from y, of `thruster_env.model.turns`."""
+    return _computed(steps.innovation, turns, z, y)
+
+
+@operation(same)
+def completed(z, y, turns):
+    """A measurement with numbers of y in parts that miss one."""
+    return _computed(steps.completed, turns, z, y)
 
 
 @operation(lambda x, y, turns: (x[0] - len(turns), *x[1:]))
@@ -166,6 +210,8 @@ def reset_slopes(x, d, turns):
 for _operation, _function in (
     (moved, steps.move),
     (apart, steps.difference),
+    (innovation, steps.innovation),
+    (completed, steps.completed),
     (normalised, steps.unit),
     (slopes_of_stored, steps.slopes_of_stored),
     (slopes_of_tangent, steps.slopes_of_tangent),

@@ -213,6 +213,8 @@ def c_filter(
     programs = programs_of(filter_)
 
     def called(name: str) -> CFilter:
+        if monitor is not None and programs.model.measured_turns:
+            raise ValueError("alarms in C must be of measurements without rotations, but got some with them")
         tests = None if monitor is None else TestsWriter(monitor, name, programs.model.m, single)
         writer = (EnsembleWriter if programs.members else Writer)(name, programs, single, tests)
         return CFilter(name, writer.header(filter_.name), writer.source())

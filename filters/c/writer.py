@@ -71,7 +71,7 @@ class Writer:
 extern "C" {{
 #endif
 
-enum {{ {guard}_STATES = {n}, {guard}_INPUTS = {model.inputs}, {guard}_MEASUREMENTS = {m} }};
+enum {{ {guard}_STATES = {n}, {guard}_INPUTS = {model.inputs}, {guard}_MEASUREMENTS = {model.channels} }};
 
 {types}typedef struct {{
     {real} x[{n}];            /* estimate: {_listed(model.states)} */
@@ -173,10 +173,7 @@ void {name}_update({name} *filter{z})
 {{
 {self.before_update()}    correct(filter, z);
     filter->channels = 0;
-    for (int i = 0; i < {m}; i++) {{
-        filter->channels += !isnan(z[i]);
-    }}
-    if (is_lost(filter)) {{
+{self.counted()}    if (is_lost(filter)) {{
         become_prior(filter);
         filter->restarts++;
     }}
@@ -236,6 +233,21 @@ void {name}_update({name} *filter{z})
         loop = f"    for (int k = 0; k < {self.model.substeps}; k++) {{\n{step}    }}\n"
         return f"{begin}{loop}    add_process_noise(filter{points});\n"
 
+    def counted(self) -> str:
+        """Statements that count components of the innovation; a rotation with a missing number is missing."""
+        lines, first = "", 0
+        for turn in self.model.measured_turns:
+            lines += self._counted_numbers(first, turn.stored)
+            first = turn.stored + turn.size + 1
+            missing = " || ".join(f"isnan(z[{i}])" for i in range(turn.stored, first))
+            lines += f"    filter->channels += {missing} ? 0 : {turn.size};\n"
+        return lines + self._counted_numbers(first, self.model.channels)
+
+    @staticmethod
+    def _counted_numbers(first: int, end: int) -> str:
+        each = f"    for (int i = {first}; i < {end}; i++) {{\n        filter->channels += !isnan(z[i]);\n    }}\n"
+        return each * (first < end)
+
     def before_update(self) -> str:
         """Statements before a correction."""
         return ""
@@ -253,7 +265,7 @@ void {name}_update({name} *filter{z})
         return f"static void {name}({arguments})\n{{\n{body}\n}}\n"
 
     def _input_parameters(self) -> list[str]:
-        sizes = self.model.inputs, self.model.m
+        sizes = self.model.inputs, self.model.channels
         return [f", const {self.real} {key}[{size}]" * (size > 0) for key, size in zip("uz", sizes, strict=True)]
 
     def _array(self, name: str, values: np.ndarray) -> str:

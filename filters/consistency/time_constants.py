@@ -124,7 +124,7 @@ def time_constants(filter_: Filter, runs: Sequence[Run], constants: Sequence[int
     Source: Anderson, Moore (1979), Optimal Filtering, section 4.4; Benettin, Galgani, Giorgilli, Strelcyn (1980),
     "Lyapunov characteristic exponents for smooth dynamical systems", for the mean growth.
     """
-    if not filter_.has_covariance or filter_.kernel_model.turns:
+    if not filter_.has_covariance or filter_.kernel_model.turns or filter_.kernel_model.measured_turns:
         return None
     path = slopes_along(filter_, runs)
     if path is None or not _is_regular(path):

@@ -90,7 +90,7 @@ def run(
     """
     single = is_single(keys, inputs, measurements)
     keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
-    n, t, (count, times, m) = filter_.kernel_model.n, filter_.kernel_model.t, z.shape
+    (n, t, m), (count, times, _) = (getattr(filter_.kernel_model, name) for name in "ntm"), z.shape
     out = Estimates(
         np.empty((count, times, n)),
         np.empty((count, times, t, t)),
@@ -146,8 +146,8 @@ def trajectories(
         rule = "keys, inputs, measurements must have shapes (B, 2), (B, K, p), (B, K + 1, m)"
         raise ValueError(f"{rule}, but got {keys.shape}, {inputs.shape}, {z.shape}")
     count, times, m = z.shape
-    if inputs.shape != (count, times - 1, model.inputs) or m != model.m:
-        shapes = f"{(count, times - 1, model.inputs)} and {(count, times, model.m)}"
+    if inputs.shape != (count, times - 1, model.inputs) or m != model.channels:
+        shapes = f"{(count, times - 1, model.inputs)} and {(count, times, model.channels)}"
         without = ", because the model has no inputs" if not model.inputs else ""
         rule = f"inputs and measurements must have shapes {shapes}{without}"
         raise ValueError(f"{rule}, but got {inputs.shape} and {z.shape}")
@@ -378,12 +378,13 @@ def _in_rows(model: StateSpaceModel, keys: Any, inputs: Any, measurements: Any) 
     if not z.size and (z.ndim < 3 or not z.shape[1]):  # a batch without runs has rows
         raise ValueError(f"measurements must have at least one row, but got {short_repr(measurements)}")
     no_batch = keys is None and (u is None or u.ndim < 3 or u.shape[1:] == (model.inputs, 1))
-    if z.ndim == 3 and z.shape[1:] == (model.m, 1) and len(z) > 1 and (no_batch or model.m > 1):
+    m = model.channels
+    if z.ndim == 3 and z.shape[1:] == (m, 1) and len(z) > 1 and (no_batch or m > 1):
         z = z[:, :, 0]  # rows of columns (m, 1)
-    if z.ndim == 2 and z.shape[1] != model.m:
-        rule = f"measurements of one trajectory must have shape (K + 1, {model.m})"
-        way = f": z[..., None] for {len(z)} trajectories" if model.m == 1 and z.shape[0] < z.shape[1] else ""
-        way = ": z.T" if len(z) == model.m else way
+    if z.ndim == 2 and z.shape[1] != m:
+        rule = f"measurements of one trajectory must have shape (K + 1, {m})"
+        way = f": z[..., None] for {len(z)} trajectories" if m == 1 and z.shape[0] < z.shape[1] else ""
+        way = ": z.T" if len(z) == m else way
         raise ValueError(f"{rule}, but got {z.shape}{way}")
     if z.ndim < 3 and u is not None:
         if u.ndim == 3 and u.shape[1:] == (model.inputs, 1):
@@ -443,7 +444,10 @@ class Beliefs:
         row, table, _ = self._own = new_memory(self._kernels, self._size)
         self._rows = np.zeros((count, len(row)))
         self._tables = np.zeros((count, self._kernels.kept_rows, table.shape[1]))
-        self._u, self._z = np.zeros((count, filter_.kernel_model.inputs)), np.zeros((count, self._kernels.m))
+        self._u, self._z = (
+            np.zeros((count, filter_.kernel_model.inputs)),
+            np.zeros((count, self._kernels.channels)),
+        )
         operation = _operation(self._kernels, self._u.shape[1], is_interpreting())
         beliefs = self._rows, self._tables, self._u, self._z, self._numbers
         self._operate = operation.on(count, (*self._own, self._size, *beliefs), (count,))
@@ -495,7 +499,7 @@ def _operation(kernels: Kernels, inputs: int, interpreting: bool) -> InParts:
     from thruster_env.graphs.workers import InParts
 
     operate = build_operation(kernels)
-    kept_rows, m, p = kernels.kept_rows, kernels.m, inputs
+    kept_rows, m, p = kernels.kept_rows, kernels.channels, inputs
 
     def operate_many(first, last, row_like, table_like, draws_like, size, rows, tables, us, zs, numbers, tasks):
         # Each thread has its own memory: slices of shared arrays cost contended reference counts.

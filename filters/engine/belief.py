@@ -135,11 +135,17 @@ class Kernels(NamedTuple):
     vectors: tuple[Callable, ...] = ()
     acting: tuple[int, ...] = ()
     turns: int = 0  # rotations: rows of the covariance are so many fewer than states
+    measured_turns: int = 0  # rotations among measurements, which have so many numbers more than innovations
 
     @property
     def t(self) -> int:
         """Rows of the covariance."""
         return self.n - self.turns
+
+    @property
+    def channels(self) -> int:
+        """Numbers of a measurement."""
+        return self.m + self.measured_turns
 
     @property
     def layout(self) -> MemoryOffsets:

@@ -89,7 +89,7 @@ def _lanes(side_by_side: bool) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=64)
-def build_batch(n: int, m: int, t: int, side_by_side: bool) -> Callable:
+def build_batch(n: int, m: int, t: int, channels: int, side_by_side: bool) -> Callable:
     """`run` of `batch` for beliefs of this size, one after the other or side by side, as a Python function.
 
     Copies of the last trajectory fill up a group.
@@ -138,7 +138,7 @@ def build_batch(n: int, m: int, t: int, side_by_side: bool) -> Callable:
                         numbers[r_offset + i] = rs[k, i]
                 for g in range(used):
                     for j in range(width):
-                        for i in range(m):
+                        for i in range(channels):
                             zs[g, i * width + j] = measurements[b + min(g * width + j, count - 1), k, i]
                 total, least = 0.0, 0.0
                 for g in range(used):
@@ -177,12 +177,12 @@ REFUSED = -1  # the result for an input that is not finite or an infinite measur
 def build_operation(kernels: Kernels) -> Callable:
     """`operation` as a Python function."""
     start, predict, update, summarise = kernels.start, kernels.predict, kernels.update, kernels.summarise
-    layout, m = kernels.layout, kernels.m
+    layout, channels = kernels.layout, kernels.channels
     step, divergences = layout.step, layout.divergences
     restart = restart_if_lost(kernels)
 
     def operate(row, table, draws, size, values, numbers, task):
-        memory, inputs = (row, table, draws), values.shape[0] - m
+        memory, inputs = (row, table, draws), values.shape[0] - channels
         for i in range(values.shape[0]):
             if i < inputs:
                 wrong = task & PREDICT and not abs(values[i]) < inf
@@ -227,7 +227,7 @@ def batch(kernels: Kernels) -> Callable:
     measurement, in place of the model's, or no rows. They are written into `numbers`, so threads must not share
     these; `memory` is that of `batch_memory`.
     """
-    size = kernels.n, kernels.m, kernels.t, bool(kernels.vectors)
+    size = kernels.n, kernels.m, kernels.t, kernels.channels, bool(kernels.vectors)
     code = None if is_interpreting() else _code_of_stages(kernels)
     loops = None if code is None else _code_of_batch(*size)
     if code is None or loops is None:
@@ -270,7 +270,7 @@ def _entries(kernels: Kernels) -> list[Entry]:
     width, _ = _lanes(bool(kernels.vectors))
     ensemble = () if kernels.vectors else (*_memory_shapes(kernels)[1:], None)
     row = (row_length(kernels) * width,)
-    lengths = {"update": kernels.m * width, "start": row_length(kernels), "restart": row_length(kernels)}
+    lengths = {"update": kernels.channels * width, "start": row_length(kernels), "restart": row_length(kernels)}
     stages = [(name, stage) for name, stage in _stages(kernels)._asdict().items() if stage is not None]
     return [Entry(stage, (row, (lengths.get(name),), (None,), *ensemble), name=name) for name, stage in stages]
 
@@ -280,7 +280,7 @@ def _memory_shapes(kernels: Kernels) -> tuple:
 
 
 @lru_cache(maxsize=64)
-def _code_of_batch(n: int, m: int, t: int, side_by_side: bool) -> Code | None:
+def _code_of_batch(n: int, m: int, t: int, channels: int, side_by_side: bool) -> Code | None:
     """Machine code of the loops around the stages of any filter of this size."""
     from thruster_env.graphs.loops import ADDRESS, machine_code_of
 
@@ -288,10 +288,10 @@ def _code_of_batch(n: int, m: int, t: int, side_by_side: bool) -> Code | None:
     noise = [(None, None), (None, 2 * m * m)]
     out = [(None, None, *part) for part in ((n,), (t, t), (m,), (m, m), ())] + [(None,)]
     ensemble = [] if side_by_side else [(None, None), (None,), None]
-    memory = [*((groups, size) for size in (None, None, m * width)), (None,), ensemble]
-    data = (None, 2), (None, None, None), (None, None, m), (None,)
+    memory = [*((groups, size) for size in (None, None, channels * width)), (None,), ensemble]
+    data = (None, 2), (None, None, None), (None, None, channels), (None,)
     shapes = Stages(*[ADDRESS] * len(Stages._fields)), *data, noise, out, memory, None, None
-    return machine_code_of(build_batch(n, m, t, side_by_side), shapes, unrolled=not side_by_side)
+    return machine_code_of(build_batch(n, m, t, channels, side_by_side), shapes, unrolled=not side_by_side)
 
 
 def row_length(kernels: Kernels) -> int:
@@ -309,5 +309,5 @@ def new_memory(kernels: Kernels, size: int) -> tuple[np.ndarray, np.ndarray, np.
 def batch_memory(kernels: Kernels, size: int, inputs: int) -> tuple:
     """The memory of a batch: groups of rows, inputs and measurements; a belief's row; table, draws and size."""
     (row, *ensemble), (width, groups) = new_memory(kernels, size), _lanes(bool(kernels.vectors))
-    in_groups = (np.zeros((groups, count * width)) for count in (len(row), inputs, kernels.m))
+    in_groups = (np.zeros((groups, count * width)) for count in (len(row), inputs, kernels.channels))
     return *in_groups, row, () if kernels.vectors else (*ensemble, size)

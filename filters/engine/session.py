@@ -25,7 +25,7 @@ from thruster_env.core.checks import covariance, finite, positive
 from thruster_env.logs.log import sample_time_place
 from thruster_env.model.continuous import same_dt
 from thruster_env.model.shape import with_root
-from thruster_env.model.turns import unit_mean
+from thruster_env.model.turns import of_channels, unit_mean
 
 if TYPE_CHECKING:
     from filters.filter import Filter
@@ -78,10 +78,10 @@ class Session:
         self._memory = new_memory(kernels, size)
         self._row, self._table, _ = self._memory
         self._extras = self._row[layout.extras : layout.extras + kernels.extras]
-        values = np.append(np.zeros(model.inputs), np.full(m, np.nan))
+        values = np.append(np.zeros(model.inputs), np.full(kernels.channels, np.nan))
         self._u, self._z, self._values = values[: model.inputs], values[model.inputs :], values
-        self._p, self._m = model.inputs, m
-        self._scalar = self._p == m == 1
+        self._p, self._m = model.inputs, kernels.channels
+        self._scalar = self._p == self._m == 1
         self._prior_variances = model.prior_cov.diagonal()
         self._first_values = values.copy()
         self._noise_was: np.ndarray | None = None  # numbers before another Q or R
@@ -465,7 +465,7 @@ class GatedSession(Session):
         if far.any():
             for saved, part in zip(self._kept, self._memory, strict=True):
                 part[...] = saved
-            self._z[far] = np.nan
+            self._z[of_channels(far, self._filter.kernel_model.measured_turns)] = np.nan
             self.rejected += far
             self.divergences = self._operate(UPDATE)
 

@@ -182,6 +182,7 @@ def update_iterated(model, x, P, z):
     """Update with the measurement z, linearised again in each iteration; NaN marks missing channels."""
     measured, R, at, d, innovations = present(z), uncorrelated(present(z), model.R), x, None, []
     for i in range(model.own.iterations):
+        model, z = model.at_measurement(z) if i == 1 else (model, z)
         H, y = mask_missing(measured, model.H(at)), model.h(at)
         on_tangent = y - H @ d if i else y
         H = reset_columns(model, H, x, d) if i else H

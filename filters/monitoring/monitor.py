@@ -19,6 +19,8 @@ import numpy as np
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import as_floats, at_least, one_of, positive, short_repr
 from thruster_env.core.compiled import is_interpreting
+from thruster_env.model.turns import Turn
+from thruster_env.model.turns import innovation as difference
 
 if TYPE_CHECKING:
     from filters.filter import Filter
@@ -375,7 +377,7 @@ def watch_of(monitor: Monitor | None, filter_: Filter) -> Watch | None:
         return None
     if not filter_.has_covariance:
         raise ValueError(f"a monitor needs a filter with a covariance, but {filter_.name!r} has none")
-    return monitor.watch(filter_.model.m)
+    return Watch(monitor, filter_.model.m, filter_.model.measured_turns)
 
 
 @cache
@@ -407,8 +409,8 @@ class Watch:
         latest: the latest alarm of each channel, None before the first.
     """
 
-    def __init__(self, monitor: Monitor, channels: int):
-        self.monitor, self._limits = monitor, monitor.limits(channels)
+    def __init__(self, monitor: Monitor, channels: int, turns: tuple[Turn, ...] = ()):
+        self.monitor, self._limits, self._turns = monitor, monitor.limits(channels), turns
         shape = len(TESTS), channels
         self._out = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         self._state = new_state(channels, monitor.window)
@@ -431,9 +433,11 @@ class Watch:
         self.latest = list(latest)
 
     def step(self, innovation: np.ndarray, cov: np.ndarray, z: np.ndarray) -> Health:
-        """Take the innovation (m,), its covariance (m, m) and the measurement (m,), NaN where there was none."""
+        """Take the innovation (m,), its covariance (m, m) and the measurement z, NaN where there was none."""
         raised, since, sizes = self._out
         innovation, cov, z = (np.ascontiguousarray(part, dtype=np.float64) for part in (innovation, cov, z))
+        if self._turns:  # of which only NaN matter
+            z = np.array(difference(z, z, self._turns))
         count = (len(self._state),)
         if innovation.shape != count or z.shape != count or cov.shape != 2 * count:
             rule = f"a monitor of {count[0]} channels must get as many innovations and measurements"

@@ -20,8 +20,9 @@ from typing import Any
 
 from filters.algebra.members import covariance, mean
 from filters.algebra.operations import wrap
-from filters.algebra.tangents import differences, inverse_reset_slopes, moved, unit
+from filters.algebra.tangents import differences, inverse_reset_slopes, local_at, moved, unit
 from filters.pages.page import Page
+from thruster_env.model.turns import tangent_flags
 
 ROUNDS = 6  # of the mean, from the normalised mean of the stored numbers: to 1e-9 for a spread of half a radian
 
@@ -52,6 +53,17 @@ def on_tangent(page: Page) -> Page:
     )
 
 
+@cache
+def measured_about_mean(page: Page) -> Page:
+    """The page of a measurement with rotations, in its tangent at h of the mean, from one for numbers."""
+
+    def update(model: Any, x: Any, z: Any, e: Any) -> Any:
+        local, z = local_at(model, z, mean(x))
+        return page.update(local, x, z, e)
+
+    return page._replace(update=update)
+
+
 def _charted(function: Callable, *, with_noise: bool) -> Callable:
     """A function of a page, of members in the tangent at their mean."""
 
@@ -59,10 +71,7 @@ def _charted(function: Callable, *, with_noise: bool) -> Callable:
         m = mean_of(model, x)
         D = differences(model, x, m)
         chart = copy(model)
-        chart.turns, angles = (), list(model.state_angles)
-        for turn in reversed(model.turns):
-            del angles[turn.stored]
-        chart.state_angles = tuple(angles)
+        chart.turns, chart.state_angles = (), tangent_flags(model.state_angles, model.turns)
         chart.h = lambda d: model.h(moved(m, d, model.turns))
         if with_noise:
             chart.Q_root = inverse_reset_slopes(m, D, model.turns) @ model.Q_root

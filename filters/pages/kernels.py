@@ -21,9 +21,9 @@ from filters.algebra.calls import arguments_of, calls_of
 from filters.algebra.matrices import Matrix, Operation, evaluate, in_order, input_matrix
 from filters.algebra.members import on_branch
 from filters.algebra.operations import present, quotient, slopes_of
-from filters.algebra.tangents import moved
+from filters.algebra.tangents import local_at, moved
 from filters.engine.belief import Kernels, filter_offset, memory_offsets, row_access
-from filters.pages.charts import moments, on_tangent
+from filters.pages.charts import measured_about_mean, moments, on_tangent
 from filters.pages.page import Equations, NumbersMemory, Page, PagedModel, RowMemory, acting_places
 from thruster_env.core.sources import matrix_reader, vector_reader
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
@@ -311,7 +311,8 @@ def stages_of(page: Page, memory: RowMemory, model: PagedModel) -> list[Stage]:
     predicted = (x, p) if page.represent is None else [memory.another(matrix) for matrix in begun]
     advanced = page.propagated(model, *predicted, u=memory.u)
     outputs = layout.innovation, layout.innovation_cov, layout.log_likelihood
-    corrected = updated(pure(page.update, model, x, p, memory.z), x, p, m=shape.m)
+    local, z = local_at(model, memory.z, x)
+    corrected = updated(pure(page.update, local, x, p, z), x, p, m=shape.m)
     return [
         stored((started,), (), memory.extras),
         Stage({}, {}) if page.represent is None else stored(begun, predicted),
@@ -351,6 +352,7 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
         extras=extras_size,
         scratch=memory.end - layout.extras - extras_size,
         turns=len(shape.turns),
+        measured_turns=len(shape.measured_turns),
         vectors=vectors[1:],
         acting=acting_places(memory.extras),
     )
@@ -402,7 +404,7 @@ class MembersMemory(NumbersMemory):
         x = input_matrix(Place("table", 0), (shape.n,), member=True)
         p = input_matrix(Place("rows", row.cov), (shape.t, shape.t), symmetric=True, like=x)
         super().__init__(shape, page, x, p, filter_offset(shape))
-        self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
+        self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.channels)
         self.ratio = self.ratio_in("given", 0)
         self.w, self.e = (
             input_matrix(Place("draws", 0), (size,), member=True, like=x) for size in (shape.t, shape.m)
@@ -413,6 +415,7 @@ class MembersMemory(NumbersMemory):
 def member_stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str, Stage]:
     """Stages of a page by name: the start, a substep, the end of a step, the update, and the belief's moments."""
     x, layout = memory.x, memory_offsets(memory.shape.n, memory.shape.m, memory.shape.t)
+    page = measured_about_mean(page) if model.measured_turns else page
     page = on_tangent(page) if model.turns else page
     outputs = layout.innovation, layout.innovation_cov, layout.log_likelihood
     w = model.prior_root @ memory.w
@@ -577,5 +580,9 @@ def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
     acting = acting_places(memory.keep(page.started(PagedModel(memory))))
     parts = start, predictor(works, shape), update, summarise
     return Kernels(
-        n, m, rows, max(n, m), *parts, extras=extras_size(page, shape), acting=acting, turns=len(shape.turns)
+        *(n, m, rows, max(n, m), *parts),
+        extras=extras_size(page, shape),
+        acting=acting,
+        turns=len(shape.turns),
+        measured_turns=len(shape.measured_turns),
     )

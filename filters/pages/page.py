@@ -192,7 +192,7 @@ class RowMemory(NumbersMemory):
         x = input_matrix(Place("rows", row.mean), (shape.n,))
         p = input_matrix(Place("rows", row.cov), (shape.t, shape.t), symmetric=True, like=x)
         super().__init__(shape, page, x, p, filter_offset(shape))
-        self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.m)
+        self.u, self.z = self.read("given", 0, shape.inputs), self.read("given", 0, shape.channels)
         self.ratio = self.ratio_in("given", 0)
 
 
@@ -220,7 +220,7 @@ def called_parts(functions: Functions, shape: Shape, which: str, constants_move:
         rows, angles, inputs = shape.n, shape.state_angles, "u, c"
     else:
         value, matrix = functions.observe, observation_slopes(functions, shape)
-        rows, angles, inputs = shape.m, shape.measurement_angles, shape.observe_arguments
+        rows, angles, inputs = shape.channels, shape.measurement_angles, shape.observe_arguments
     by_constants = _by_constants(value, rows, shape, angles, inputs)
     size = rows, shape.n
     entry = "(a[{0}][{1}] - b[{0}][{1}]) / (2.0 * h)"
@@ -347,7 +347,8 @@ def called_at_points(
     if which == "motion":
         value, rows, angles, inputs = functions.transition, shape.n, shape.state_angles, "u, c"
     else:
-        value, rows, angles, inputs = functions.observe, shape.m, shape.measurement_angles, shape.observe_arguments
+        value, rows, inputs = functions.observe, shape.channels, shape.observe_arguments
+        angles = shape.measurement_angles
     plain = written_out("plain", f"x, scales, {inputs}", f"value(x, {inputs})", value=value)
     slope = slope_of(plain, difference_of_values(rows, angles), shape, inputs, constants_move)
     behind = ", dc, size" if constants_move else ""
@@ -394,14 +395,14 @@ class PagedModel:
         extras: what the filter keeps besides mean and covariance, by name.
         feed: number of inputs that h takes, all or none.
         state_angles, measurement_angles: flags of components that are angles.
-        turns: rotations among the states.
+        turns, measured_turns: rotations among the states, and among the measurements.
     """
 
     def __init__(self, memory: NumbersMemory):
         shape, self._constants = memory.shape, memory.constants
         self.feed = shape.feed
         self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
-        self.turns = shape.turns
+        self.turns, self.measured_turns = shape.turns, shape.measured_turns
         self.Q, self.R, self.Q_root, self.R_root = memory.Q, memory.R, memory.Q_root, memory.R_root
         if shape.step_ratio and memory.ratio is not None:
             self.Q = memory.Q * memory.ratio
@@ -414,6 +415,10 @@ class PagedModel:
         other = copy(self)
         other._constants = constants
         return other
+
+    def at_measurement(self, z: Matrix) -> tuple[Self, Matrix]:
+        """Model and measurement z in the tangent at z: see `filters.algebra.tangents.about`."""
+        return self, z
 
     def _seen(self) -> tuple[Matrix, ...]:
         """The arguments of h besides x: the input that acts, if it takes that, and the constants."""
@@ -458,8 +463,8 @@ class Equations(PagedModel):
                 *chosen, which, bool(self._moves), points
             )
         self._f, self._F = self._operations("f", parts[0], shape.n, shape.n, trace)
-        self._h, self._H = self._operations("h", parts[1], shape.m, shape.n, trace)
-        self._traced, self._rows = trace, {"motion": shape.n, "sight": shape.m}
+        self._h, self._H = self._operations("h", parts[1], shape.channels, shape.n, trace)
+        self._traced, self._rows = trace, {"motion": shape.n, "sight": shape.channels}
         self._of_points: dict[tuple[str, int], Operation] = {}
 
     def f(self, x: Matrix, u: Matrix) -> Matrix:
@@ -479,7 +484,7 @@ class Equations(PagedModel):
         return (self._h if len(x.shape) == 1 else self._at_points("sight", x))(x, *self._seen())
 
     def H(self, x: Matrix) -> Matrix:  # noqa: N802
-        """dh/dx, of a state with rotations in the tangent at x, (m, t)."""
+        """dh/dx, of a state with rotations in the tangent at x, (channels, t)."""
         return columns_in_tangent(self._H(x, self._scales, *self._seen()), x, self.turns)
 
     def _operations(

@@ -328,7 +328,7 @@ def _box(name: str, space: gym.Space) -> gym.spaces.Box:
 def split_of(env, model: StateSpaceModel) -> Split:
     """The split of an env's channels for a model; without the hook all channels are measurements."""
     declared = getattr(env.unwrapped, HOOK, lambda model: None)(model)
-    return Split((), tuple(range(model.m)), model.m) if declared is None else declared
+    return Split((), tuple(range(model.channels)), model.channels) if declared is None else declared
 
 
 class WithMeasuredInputs:

@@ -20,6 +20,9 @@ class OfArrays:
     def at(self, constants):
         return OfArrays(self._model, self.own, tuple(constants))
 
+    def at_measurement(self, z):
+        return self, z
+
     def f(self, x, u):
         if x.ndim == 2:
             return np.stack([self.f(point, u) for point in x.T], axis=1)

@@ -23,19 +23,25 @@ class Shape(NamedTuple):
     """Sizes of a model, and other data needed to compile its code."""
 
     n: int  # states, as they are stored
-    m: int  # measurements
+    m: int  # measurements: components of an innovation
     inputs: int
     form: type | int  # of the constants: their NamedTuple class, or how many
     state_angles: tuple[bool, ...]  # (n,), which states wrap at 2 pi
-    measurement_angles: tuple[bool, ...]  # (m,), which measurements do
+    measurement_angles: tuple[bool, ...]  # (channels,), which measurements do
     step_ratio: bool = False  # whether the last input is one, by which pages multiply Q: `steps.in_any_steps`
     feeds: bool = False  # whether h takes the input: h(x, u, c)
     turns: tuple[Turn, ...] = ()  # rotations among the states, whose errors have fewer components
+    measured_turns: tuple[Turn, ...] = ()  # those among the measurements
 
     @property
     def t(self) -> int:
         """Number of components of an error of the state, and so rows of P and Q."""
         return self.n - len(self.turns)
+
+    @property
+    def channels(self) -> int:
+        """Number of stored numbers of a measurement: m, and one for each rotation."""
+        return self.m + len(self.measured_turns)
 
     @property
     def offsets(self) -> NumberOffsets:
@@ -93,9 +99,9 @@ def transition_slopes(functions: Functions, shape: Shape) -> Callable:
 
 
 def observation_slopes(functions: Functions, shape: Shape) -> Callable:
-    """Return `slopes(x, scales, c)`, or of an h with input `slopes(x, scales, u, c)`: dh/dx, (m, n)."""
+    """Return `slopes(x, scales, c)`, or of an h with input `slopes(x, scales, u, c)`: dh/dx, (channels, n)."""
     h, analytic = functions.observe, functions.observe_jacobian
-    return jacobian(h, analytic, shape.m, shape.n, shape.observe_arguments, shape.measurement_angles)
+    return jacobian(h, analytic, shape.channels, shape.n, shape.observe_arguments, shape.measurement_angles)
 
 
 @lru_cache(maxsize=64)

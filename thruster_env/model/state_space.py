@@ -68,7 +68,7 @@ class StateSpaceModel:
         transition: f, or one of its `substeps` equal parts: the function is applied `substeps` times in a step.
         observe: h, without noise; with three arguments it takes the input, too.
         process_noise_cov: Q, (n, n) or n variances, per step.
-        measurement_noise_cov: R, (m, m) or m variances, of each measurement; positive definite.
+        measurement_noise_cov: R, (m, m) or m variances, of each error of a measurement; positive definite.
         prior_mean: mean of the initial state, (n,).
         prior_cov: covariance of the initial state, (n, n) or n variances; zero allowed.
         inputs: number p of inputs; if None as many as `input_quantities`, and without these none, or one if f does
@@ -94,9 +94,9 @@ class StateSpaceModel:
             probable state within (`filters.engine.belief`).
         states: a `Quantity` or a name for each state, or a `Rotation` for four; x_1, x_2, ... if None.
         input_quantities: the same for the inputs; u_1, ... if None.
-        measurements: the same for the measurements; z_1, ... if None.
+        measurements: the same for the measurements; z_1, ... if None. Of a `Rotation`, h returns four numbers.
         outputs: outputs of the model by symbol: an `Output` each, a quantity and a function of (x, c).
-        turns: rotations of the state; they follow from `states`.
+        turns, measured_turns: rotations; they follow from `states` and `measurements`.
         positions: `Positions` of states and measurements, for ensembles with localisation; None if unknown.
 
     Raises:
@@ -129,6 +129,7 @@ class StateSpaceModel:
     outputs: Mapping[str, Any] = field(default_factory=dict)
     positions: Positions | None = None
     turns: tuple[Turn, ...] = ()
+    measured_turns: tuple[Turn, ...] = ()
 
     def __post_init__(self):
         """Check shapes and signs, and try the functions; raise ValueError that states the rule and the value."""
@@ -136,9 +137,11 @@ class StateSpaceModel:
         n, r = len(mean), self.measurement_noise_cov
         m = _channels(r)
         states, turns = with_rotations(self.states, self.turns)
-        t = n - len(turns)
+        measurements, measured_turns = with_rotations(self.measurements, self.measured_turns)
+        t, channels = n - len(turns), m + len(measured_turns)
         checked: dict[str, Any] = {
             "turns": turns,
+            "measured_turns": measured_turns,
             "prior_mean": unit_mean(mean, turns),
             "prior_cov": covariance("prior_cov", self.prior_cov, t),
             "process_noise_cov": covariance("process_noise_cov", self.process_noise_cov, t),
@@ -146,10 +149,9 @@ class StateSpaceModel:
             "substeps": at_least("substeps", self.substeps, 1, 10_000),
             "constants": checked_constants(self.constants),
         }
-        inputs = self.inputs
+        inputs, u = self.inputs, self.input_quantities
         if inputs is None:
-            unnamed = self.input_quantities is None
-            inputs = _needed_inputs(self, checked) if unnamed else count_of(self.input_quantities)
+            inputs = _needed_inputs(self, checked) if u is None else count_of(u)
         checked["inputs"] = at_least("inputs", inputs, 0)
         sizes = {"operating_state": n, "operating_input": checked["inputs"], "state_low": n, "state_high": n}
         for name, size in sizes.items():
@@ -157,15 +159,13 @@ class StateSpaceModel:
                 checked[name] = vector(name, getattr(self, name), size)
         if self.analytic:
             checked["transition_jacobian"] = self._exact("transition", n, n, "u, c")
-            checked["observe_jacobian"] = self._exact("observe", m, n, "u, c" if self.feeds else "c")
+            checked["observe_jacobian"] = self._exact("observe", channels, n, "u, c" if self.feeds else "c")
         checked["states"] = quantities("states", states, n, "x", "prior_mean")
-        checked["input_quantities"] = quantities(
-            "input_quantities", self.input_quantities, checked["inputs"], "u", "inputs, or b,"
-        )
-        checked["measurements"] = quantities("measurements", self.measurements, m, "z", "measurement_noise_cov")
+        checked["input_quantities"] = quantities("input_quantities", u, checked["inputs"], "u", "inputs, or b,")
+        checked["measurements"] = quantities("measurements", measurements, channels, "z", "measurement_noise_cov")
         checked["outputs"] = outputs(self.outputs)
         if self.positions is not None:
-            checked["positions"] = Positions(*self.positions).checked(n, m)
+            checked["positions"] = Positions(*self.positions).checked(n, channels)
         checked["bounds"] = checked_bounds(self.bounds, checked["states"], turns)
         one_of("bounded_by", self.bounded_by, ("truncation", "projection"))
         for name, value in checked.items():
@@ -199,8 +199,13 @@ class StateSpaceModel:
 
     @property
     def m(self) -> int:
-        """Number of measurements."""
+        """Number of components of an innovation: of measurements, without one for each rotation among them."""
         return len(self.measurement_noise_cov)
+
+    @property
+    def channels(self) -> int:
+        """Number of numbers of a measurement."""
+        return self.m + len(self.measured_turns)
 
     @cached_property
     def feeds(self) -> bool:
@@ -209,7 +214,7 @@ class StateSpaceModel:
 
     @property
     def shape(self) -> Shape:
-        """Sizes of the model, and other data needed to compile its code; ValueError if its state has rotations."""
+        """Sizes of the model, and other data needed to compile its code; ValueError if it has rotations."""
         refuse_rotations(self)
         return self.any_shape
 
@@ -217,19 +222,16 @@ class StateSpaceModel:
     def any_shape(self) -> Shape:
         """`shape`, for what takes rotations, too."""
         states, channels = (tuple(part.angle for part in parts) for parts in (self.states, self.measurements))
-        form = constants_form(self.constants)
-        return Shape(self.n, self.m, self.inputs, form, states, channels, feeds=self.feeds, turns=self.turns)
+        sizes = self.n, self.m, self.inputs, constants_form(self.constants)
+        return Shape(*sizes, states, channels, False, self.feeds, self.turns, self.measured_turns)
 
     @property
     def functions(self) -> Functions:
         """The model's functions, ready for compiled code: large results are always arrays."""
-        n, m, slopes = self.n, self.m, first_equal((self.transition_jacobian, self.observe_jacobian))
+        n, m, slopes = self.n, self.channels, first_equal((self.transition_jacobian, self.observe_jacobian))
         shape = self.any_shape
-        form, sizes, arguments_of_h = (
-            shape.form,
-            (n, self.inputs, len(self.constants)),
-            f"x, {shape.observe_arguments}",
-        )
+        form, arguments_of_h = shape.form, f"x, {shape.observe_arguments}"
+        sizes = n, self.inputs, len(self.constants)
 
         def ready(function: Callable | None, arguments: str, *shape: int) -> Any:
             if function is None or by_complex_step(function):
@@ -361,9 +363,10 @@ def checked_constants(constants) -> tuple:
 
 def check_functions(model) -> None:
     """Raise ValueError unless a model's f and h, and their Jacobians if given, have the shapes of its numbers."""
-    n, m, arguments_of_h = model.n, model.m, "x, u, c" if model.feeds else "x, c"
+    n, m, arguments_of_h = model.n, model.channels, "x, u, c" if model.feeds else "x, c"
     states, measured = _count(n, "state"), _count(m, "measurement")
-    by_states, by_noise = f"as prior_mean has {n}", f"as measurement_noise_cov is {m} x {m}"
+    by_states, by_noise = f"as prior_mean has {n}", f"as measurement_noise_cov is {model.m} x {model.m}"
+    by_noise += " and a rotation, direction or pose has one more" * bool(model.measured_turns)
     rules = {
         "transition": ("x, u, c", (n,), f"a tuple{_or_array(n)} of {states}, {by_states}"),
         "observe": (arguments_of_h, (m,), f"a tuple{_or_array(m)} of {measured}, {by_noise}"),
@@ -376,7 +379,7 @@ def check_functions(model) -> None:
             _check_arguments(name, function, arguments)
             _check_result(name, function, model, arguments, shape, rule)
     if model.turns:
-        refuse_signs(lambda x: model.observe(*_arguments(arguments_of_h, model, x)), model.prior_mean, model.turns)
+        refuse_signs(lambda x: model.observe(*_arguments(arguments_of_h, model, x)), model)
 
 
 def _refuse_slopes(name: str, model, arguments: str, value_text: str) -> None:
@@ -470,12 +473,9 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
                 continue
             sizes = f"{_count(model.n, 'state')}{_form(model.n)} and {_count(model.inputs, 'input')}"
             where = _place(function)
-            more = (
-                ": inputs=, or input_quantities=, says how many there are" if isinstance(error, IndexError) else ""
-            )
-            raise ValueError(
-                f"{name}{where} must work for {sizes}, but raised {error_line(error)}{more}"
-            ) from error
+            more = ": inputs=, or input_quantities=, says how many there are" * isinstance(error, IndexError)
+            text = f"{name}{where} must work for {sizes}, but raised {error_line(error)}{more}"
+            raise ValueError(text) from error
         result_shape = _shape(result)
         if result_shape != shape:
             raise ValueError(f"{name} must return {rule}, but returned {_said(result_shape, result)}")
@@ -548,8 +548,7 @@ def digest_of(model: StateSpaceModel) -> str:
         "transition": _values(model.transition, model, (model.n, model.inputs)),
         "observe": _values(model.observe, model, (model.n, model.inputs) if model.feeds else (model.n,)),
     }
-    if model.turns:
-        parts["turns"] = model.turns
+    parts |= {name: getattr(model, name) for name in ("turns", "measured_turns") if getattr(model, name)}
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:LENGTH]
 
 

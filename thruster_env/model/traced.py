@@ -155,7 +155,7 @@ class Traced:
         moves = which == "motion"
         self._input_count = 2 if moves or shape.feeds else 1
         sizes = (shape.n, shape.inputs, shape.constants) if self._input_count == 2 else (shape.n, shape.constants)
-        rows = shape.n if moves else shape.m
+        rows = shape.n if moves else shape.channels
         self._function = traced_function(function, sizes, shape.form, (rows,))
         self._jacobian = None
         if jacobian is not None and not by_complex_step(jacobian):

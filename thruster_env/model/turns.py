@@ -1,4 +1,4 @@
-"""Parts of a model's state that are no numbers: rotations, directions, poses; the steps between such states.
+"""Parts of a state or a measurement that are no numbers: rotations, directions, poses; the steps between these.
 
 The state x of n stored numbers has a tangent of t = n - (number of such parts): each stores one more number than
 its errors have. Errors, and so P, Q and the prior covariance, live there, with a rotation vector [rad] in the
@@ -12,6 +12,8 @@ A pose has the exponential of its group (`thruster_env.model.poses`), a directio
 stored numbers, and after an update by d it turns P, which is about the old estimate, into the tangent at the new
 one (the reset): G P G', with G = J_r(d) for an error of the body, J_l(d) for one of the world. With this the
 estimates of an extended filter do not depend on the side.
+
+A measurement z = move(h(x), e), e ~ N(0, R), has its own parts: innovations, S and R live in their tangent.
 
 Source: Hertzberg, Wagner, Frese, Schroeder (2013), "Integrating generic sensor fusion algorithms with sound state
 representations through encapsulation of manifolds", Information Fusion 14(1); on the reset: Mueller, Hehn,
@@ -131,7 +133,7 @@ PARTS = {Rotation: "rotation", Direction: "direction", Pose: "pose", ExtendedPos
 
 
 class Turn(NamedTuple):
-    """A part of a state that is no number: where its stored numbers and its error begin, and what it is."""
+    """A part of a state or a measurement that is no number: where it and its error begin, and what it is."""
 
     stored: int
     tangent: int
@@ -193,19 +195,25 @@ def unit_mean(mean: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
 
 
 def refuse_rotations(model: Any) -> None:
-    """Raise ValueError for a model whose state has rotations, directions or poses."""
-    if model.turns:
-        names = " and ".join(repr(turn.name) for turn in model.turns)
-        kinds = " and ".join(dict.fromkeys(f"{turn.kind}s" for turn in model.turns))
+    """Raise ValueError for a model whose state or measurement has rotations, directions or poses."""
+    turns = *model.turns, *model.measured_turns
+    if turns:
+        names = " and ".join(dict.fromkeys(repr(turn.name) for turn in turns))
+        kinds = " and ".join(dict.fromkeys(f"{turn.kind}s" for turn in turns))
+        what = " and ".join(["states"] * bool(model.turns) + ["measurements"] * bool(model.measured_turns))
         raise ValueError(
-            f"states must be numbers and angles here, but {names} {'is' if len(model.turns) == 1 else 'are'} of "
+            f"{what} must be numbers and angles here, but {names} {'is' if len(turns) == 1 else 'are'} of "
             f"{kinds}: 'ekf', 'iekf', 'ukf', 'ckf', their kin and 'enkf' take these, in filters.run, "
             "sessions, C and EstimateState around an env of your own; problems, ModelEnv and tensors do not"
         )
 
 
-def refuse_signs(observe: Callable[[np.ndarray], Any], mean: np.ndarray, turns: Sequence[Turn]) -> None:
-    """Raise ValueError if h(x) differs between q and -q of a rotation: no filter knows which one a sensor has."""
+def refuse_signs(observe: Callable[[np.ndarray], Any], model: Any) -> None:
+    """Raise ValueError if h(x) differs between q and -q of a rotation: no filter knows which one a sensor has.
+
+    Of rotations among the measurements q and -q are equal.
+    """
+    mean, turns, measured = model.prior_mean, model.turns, model.measured_turns
     x = np.array(move(mean, np.linspace(0.2, 0.4, len(mean) - len(turns)), turns))
     for turn in turns:
         if turn.kind == "direction":
@@ -217,12 +225,14 @@ def refuse_signs(observe: Callable[[np.ndarray], Any], mean: np.ndarray, turns: 
                 first, second = (np.asarray(observe(at), dtype=np.float64) for at in (x, other))
         except (ArithmeticError, ValueError):  # not defined there
             continue
+        for part in measured:
+            if part.kind != "direction" and first[part.quaternion] @ second[part.quaternion] < 0.0:
+                second[part.quaternion] *= -1.0
         near = 1e-9 * float(np.nanmax(abs(first), initial=1.0))
         if not np.allclose(first, second, rtol=1e-6, atol=near, equal_nan=True):
             raise ValueError(
                 f"observe must be the same for q and -q of {turn.name!r}, which are one attitude, but returned "
-                f"{short_repr(first)} and {short_repr(second)}: in place of a quaternion measure the columns of "
-                "its matrix, rotations.to_world(q, (1, 0, 0)) and so on"
+                f"{short_repr(first)} and {short_repr(second)}: make a quaternion a Rotation of `measurements`"
             )
 
 
@@ -294,6 +304,52 @@ def unit(x: Any, turns: Sequence[Turn]) -> list:
     result: list[Any] = []
     for turn, i, _ in _parts(len(x), turns):
         result += [x[i]] if turn is None else _unit(turn, turn.of_state(x))
+    return result
+
+
+def innovation(z: Any, y: Any, turns: Sequence[Turn]) -> list:
+    """The d (t) with move(y, d) = z of measurements; NaN in parts of z with a missing number.
+
+    It is infinite where a part of z has no difference from y, as opposite directions have none, or y is NaN: no
+    filter is to take such a part for a missing one.
+    """
+    d, result = difference(unit(z, turns), y, turns), []
+    for turn, i, j in _parts(len(z), turns):
+        known = _known(z, turn, i)
+        for component in d[j : j + (1 if turn is None else turn.size)]:
+            result.append(np.where(known, np.where(component == component, component, np.inf), np.nan))
+    return result
+
+
+def completed(z: Any, y: Any, turns: Sequence[Turn]) -> list:
+    """The measurement z with the numbers of y in each part that misses one."""
+    result: list[Any] = []
+    for turn, i, _ in _parts(len(z), turns):
+        part = slice(i, i + (1 if turn is None else turn.size + 1))
+        known, parts = _known(z, turn, i), zip(unit(z, turns)[part], y[part], strict=True)
+        result += [np.where(known, measured, other) for measured, other in parts]
+    return result
+
+
+def _known(z: Any, turn: Turn | None, i: int) -> Any:
+    """Whether no number of a part of a measurement is NaN."""
+    known = z[i] == z[i]
+    for entry in () if turn is None else turn.of_state(z)[1:]:
+        known = known & (entry == entry)
+    return known
+
+
+def tangent_flags(angles: Sequence[bool], turns: Sequence[Turn]) -> tuple[bool, ...]:
+    """Which numbers of a tangent are angles, of those of stored numbers."""
+    firsts = {turn.stored for turn in turns}
+    return tuple(angle for i, angle in enumerate(angles) if i not in firsts)
+
+
+def of_channels(flags: Sequence, turns: Sequence[Turn]) -> list:
+    """Flags of numbers of a tangent for each stored number: those of a part are true if one of them is."""
+    result = list(flags)
+    for turn in turns:
+        result[turn.stored : turn.stored + turn.size] = [any(turn.of_tangent(flags))] * (turn.size + 1)
     return result
 
 
