@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -160,6 +159,8 @@ def filter_of(name: str, n: int, m: int) -> Filter:
 
 def timed_use(filter_: Filter) -> tuple[float, float]:
     """Processor time [s] and growth of memory [MB] of a filter's first use."""
+    import resource  # not on Windows
+
     memory, begin = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     use_once(filter_)
     spent = time.process_time() - begin

@@ -165,7 +165,7 @@ def machine() -> dict[str, str | int | bool]:
 
 def _cpu() -> str:
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:  # no Linux
         lines = []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -190,7 +190,7 @@ def machine_lines(facts: dict) -> list[str]:
 def check_page(path: Path) -> None:
     """Raise ValueError unless a page has a place for the table, before minutes of measuring."""
     try:
-        page = path.read_text()
+        page = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         raise ValueError(f"--page must be a page that can be read, but got {short_repr(str(path))}") from None
     if MARK not in page:
@@ -199,7 +199,7 @@ def check_page(path: Path) -> None:
 
 def write_page(path: Path, rows: Sequence[Row], facts: dict, memory: Sequence[str]) -> None:
     """Replace this machine's section or append it; those of other machines stay."""
-    page, name = path.read_text(), f"speed: {machine_name(facts)}"
+    page, name = path.read_text(encoding="utf-8"), f"speed: {machine_name(facts)}"
     mark = f"<!-- table {name} -->"
     if mark not in page:
         last = [match.end() for match in re.finditer(f"{MARK}.*?{END}", page, flags=re.DOTALL)][-1]

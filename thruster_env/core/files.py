@@ -125,7 +125,7 @@ def _replace(target: Path, content: bytes, before: os.stat_result | None) -> Non
     try:
         with os.fdopen(descriptor, "wb") as stream:
             stream.write(content)
-        if before is not None:
+        if before is not None and hasattr(os, "chown"):
             with contextlib.suppress(OSError):  # for root, or a group of one's own
                 os.chown(aside, before.st_uid, before.st_gid)
             os.chmod(aside, before.st_mode & 0o777)

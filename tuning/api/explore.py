@@ -6,7 +6,6 @@ import gc
 import html
 import os
 import shutil
-import stat
 import tempfile
 import webbrowser
 from contextlib import suppress
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from thruster_env.core.checks import at_least, short_repr
+from thruster_env.core.files import is_private
 from tuning.api.evaluate import subject_of
 from tuning.api.markers import (
     INPUT,
@@ -191,7 +191,5 @@ def _remove_left_over() -> None:
     for folder in Path(tempfile.gettempdir()).glob(f"{FOLDER}*-*"):
         process = folder.name.removeprefix(FOLDER).partition("-")[0]
         with suppress(OSError):
-            status = folder.lstat()
-            ours = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid()
-            if ours and process.isdecimal() and not is_alive(int(process)):
+            if is_private(folder) and process.isdecimal() and not is_alive(int(process)):
                 shutil.rmtree(folder, ignore_errors=True)

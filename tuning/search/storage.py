@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import ctypes
 import json
 import os
+import platform
 import re
+import sys
 import time
 import uuid
 import warnings
@@ -59,6 +62,7 @@ BEGINNING = b'{"op_code":'  # of each entry of a journal
 # Of locks and running trials.
 LOCK_SECONDS = 5  # after which a lock counts as left behind
 SIGNATURE_SECONDS = 2 * LOCK_SECONDS  # by which a living process has signed its trial
+SYNCHRONIZE, ACCESS_DENIED, WAIT_TIMEOUT = 0x00100000, 5, 0x102  # of Windows: a right, an error, an answer
 PROCESS, RETRY_OF = "process", "retry_of"  # trial attributes: who runs it, and which one it repeats
 
 
@@ -437,7 +441,7 @@ def storage_text(storage: Any) -> str:
 
 def this_process() -> str:
     """Name of this process for trials that it runs: host and process number."""
-    return f"{os.uname().nodename}:{os.getpid()}"
+    return f"{platform.node()}:{os.getpid()}"
 
 
 def retry_orphans(study: optuna.Study) -> int:
@@ -486,13 +490,15 @@ def _may_live(process: str | None) -> bool:
     if process is None:
         return False
     host, _, number = process.rpartition(":")
-    return host != os.uname().nodename or is_alive(int(number))
+    return host != platform.node() or is_alive(int(number))
 
 
 def is_alive(process: int) -> bool:
     """Whether there is a process of this number on this host."""
     if process <= 0:
         return False
+    if sys.platform == "win32":  # where os.kill would end it
+        return _is_alive_on_windows(process)
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -500,6 +506,18 @@ def is_alive(process: int) -> bool:
     except PermissionError:
         return True
     return True
+
+
+def _is_alive_on_windows(process: int) -> bool:
+    library = ctypes.WinDLL("kernel32", use_last_error=True)  # type: ignore[attr-defined]
+    library.OpenProcess.restype = ctypes.c_void_p
+    handle = ctypes.c_void_p(library.OpenProcess(SYNCHRONIZE, False, process))
+    if not handle:
+        return ctypes.get_last_error() == ACCESS_DENIED  # type: ignore[attr-defined]
+    try:
+        return library.WaitForSingleObject(handle, 0) == WAIT_TIMEOUT
+    finally:
+        library.CloseHandle(handle)
 
 
 def quiet_optuna() -> ExitStack:

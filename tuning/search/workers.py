@@ -11,9 +11,9 @@ import base64
 import json
 import os
 import pickle
-import select
 import subprocess
 import sys
+import threading
 import time
 import warnings
 import zlib
@@ -42,6 +42,12 @@ from tuning.search.study import (
 
 MODULE = "tuning.search.workers"
 POLL_SECONDS = 0.2
+# Of a process that Ctrl-C shall not reach: POSIX has sessions, Windows has groups.
+OWN_SESSION: dict[str, Any] = {
+    "start_new_session": True,
+    "creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+}
+_input_ended = threading.Event()
 
 
 def orders_of(plan: Plan) -> dict[str, Any]:
@@ -94,7 +100,7 @@ def start(module: str, orders: dict[str, Any], **options: Any) -> subprocess.Pop
     """Start the main program of a module of ours with its orders; options are those of `Popen`."""
     with without_interrupts():
         command = as_module(module)
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True, **options)
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, **OWN_SESSION, **options)
     assert process.stdin is not None  # a pipe
     with suppress(BrokenPipeError):  # it has died already, which its exit code shows
         process.stdin.write(json.dumps(orders) + "\n")
@@ -117,13 +123,21 @@ def end(process: subprocess.Popen) -> None:
 
 
 def read_orders() -> dict[str, Any]:
-    """The orders of this process, which its parent wrote."""
-    return json.loads(sys.stdin.readline())
+    """The orders of this process, which its parent wrote; from then on `parent_says_stop`."""
+    orders = json.loads(sys.stdin.readline())
+    threading.Thread(target=_wait_for_end, daemon=True).start()
+    return orders
+
+
+def _wait_for_end() -> None:
+    while os.read(sys.stdin.fileno(), 4096):  # past Python's buffer, whose lock a waiting thread would keep
+        pass
+    _input_ended.set()
 
 
 def parent_says_stop() -> bool:
     """Whether the parent of this process has closed its standard input, or has ended."""
-    return bool(select.select([sys.stdin], [], [], 0)[0])
+    return _input_ended.is_set()
 
 
 def run_in_workers(

@@ -182,6 +182,6 @@ def test_folders_of_killed_explorers_are_removed_at_the_next_start(tmp_path, mon
     dead.wait()
     names = f"thruster-explore-{dead.pid}-x", f"thruster-explore-{os.getpid()}-x", "thruster-explore-abc", "other"
     for name in names:
-        (tmp_path / name).mkdir()
+        (tmp_path / name).mkdir(mode=0o700)
     explore._remove_left_over()
     assert {one.name for one in tmp_path.iterdir()} == set(names[1:])
