@@ -90,6 +90,11 @@ def test_a_method_that_lacks_something_is_no_failure_and_one_that_breaks_is():
     assert best.score < em.last.score * 1.01
 
 
+def test_the_reference_of_an_ensemble_is_scored_though_its_search_has_spent_its_passes(monkeypatch):
+    monkeypatch.setattr(runs, "SIMPLEX", 2)
+    assert reference(WALK._replace(filter="enkf", members=5), FAST._replace(many=4)).last.score > 0
+
+
 def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     few = FAST._replace(methods=("likelihood", "noise-estimation"), sets=2)
     with ThreadPoolExecutor(1) as pool:

@@ -255,6 +255,7 @@ def reference(case: Case, protocol: Protocol) -> Result:
                 continue
             simplex = Task(case.filter, problem, fewer, options=case.options, start=begun, budget=budget)
             find_method("nelder-mead").run("nelder-mead", simplex)
+            simplex.budget = Budget()  # the search may have spent it, and its best is yet to be scored
             value = simplex.value(simplex.best)
             if value < least:
                 least, choice = value, simplex.best
