@@ -33,6 +33,7 @@ PARTS = {  # with the modules and functions that measure their rows
     **{"batches": "batches.rows", "c_code": "c_code.rows", "horizon": "steps.horizon_rows"},
     **{"vehicles": "vehicles.rows", "trajectories": "batches.trajectory_rows", "studies": "studies.rows"},
     **{"assimilation": "studies.assimilation_rows", "policies": "policies.rows", "processes": "first_use.rows"},
+    "peers": "peers.rows",
 }
 
 

@@ -10,7 +10,7 @@ import signal
 import pytest
 
 from tests.repository.test_house import FLOORS, ROOT
-from thruster_env.core import executors, files, threads
+from thruster_env.core import files, parallel
 from thruster_env.graphs import machine_code
 from tuning.api import explore
 from tuning.search import storage
@@ -43,9 +43,9 @@ def test_files_are_replaced_and_caches_and_left_overs_known_on_windows(windows, 
 
 
 def test_processes_share_cores_and_sign_trials_on_windows(windows):
-    executors.take_share(2)
-    with executors.without_interrupts():
-        assert threads.cores.__wrapped__() == os.cpu_count()
+    parallel.take_share(2)
+    with parallel.without_interrupts():
+        assert parallel.cores.__wrapped__() == os.cpu_count()
     assert storage.this_process() == f"{platform.node()}:{os.getpid()}"
 
 
