@@ -1,4 +1,4 @@
-"""Two recordings of BROAD, for `tests.tuning.identification.test_attitude`: python -m tests.data.broad FOLDER
+"""Two recordings of BROAD, for `tests.tuning.test_attitude`: python -m tests.data.broad FOLDER
 
 D. Laidig, M. Caruso, A. Cereatti, T. Seel (2021), "BROAD - A Benchmark for Robust Inertial Orientation
 Estimation", Data 6(7):72, doi 10.3390/data6070072; github.com/dlaidig/broad, licence CC BY 4.0. Changes: the first

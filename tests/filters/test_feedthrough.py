@@ -35,7 +35,7 @@ from thruster_env.logs.read import read_log
 from thruster_env.logs.write import EXACT, write_columns, write_log
 from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.simulate import inputs_until, simulate
-from tuning.identification.objective import likelihood_of
+from tuning.likelihood.recorded import likelihood_of
 from tuning.problems.log_problem import LogProblem, as_rows
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Coordinates, Parameter

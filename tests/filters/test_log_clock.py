@@ -19,7 +19,7 @@ from thruster_env.logs.read import at_own_stamps, read_log
 from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.quantities import Quantity
 from thruster_env.thruster.model import logged_model, thruster_model
-from tuning.identification.family import ModelFamily
+from tuning.likelihood.parametric import ModelFamily
 from tuning.problems.log_problem import LogProblem
 
 

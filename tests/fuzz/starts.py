@@ -13,8 +13,8 @@ from tests.tuning.test_identify_starts import NOISE, OWN, PRESET, thruster_logs
 from tests.tuning.test_null_tests import EFFECTS
 from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
-from tuning.identification.identify import identify
-from tuning.identification.result import Identification
+from tuning.likelihood.identify import identify
+from tuning.likelihood.result import Identification
 from tuning.thruster.logs import ThrusterFamily
 
 SENSORS = ("thrust", "speed")

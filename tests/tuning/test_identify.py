@@ -17,11 +17,10 @@ from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.logs.log import Log
 from thruster_env.model import simulate
 from tuning.api.identify import fall_sentence, with_ranges
-from tuning.identification.family import ModelFamily
-from tuning.identification.identify import identify
-from tuning.identification.profiles import profile_figure, profiles, validate
-from tuning.identification.result import covariance, read_values, with_values, write_values
-from tuning.identification.starts import runs_of
+from tuning.likelihood.identify import identify, profile_figure, profiles, validate
+from tuning.likelihood.parametric import ModelFamily
+from tuning.likelihood.recorded import runs_of
+from tuning.likelihood.result import covariance, read_values, with_values, write_values
 from tuning.problems.data import Data
 from tuning.problems.problem import Parameter
 
@@ -168,7 +167,7 @@ def test_ctrl_c_before_any_start_is_an_interrupt_not_an_error_of_the_starts(data
         signal.raise_signal(signal.SIGINT)
         return objective
 
-    monkeypatch.setattr("tuning.identification.identify._with_starts", interrupted)
+    monkeypatch.setattr("tuning.likelihood.identify._with_starts", interrupted)
     with pytest.raises(KeyboardInterrupt):
         identify(data, pendulum, FREE, starts=2)
 

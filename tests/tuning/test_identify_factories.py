@@ -12,7 +12,7 @@ from thruster_env.core.streams import filter_keys
 from thruster_env.logs.log import in_any_steps
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.objective import likelihood_of
+from tuning.likelihood.recorded import likelihood_of
 from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates, Parameter
 

@@ -9,7 +9,7 @@ import tuning
 from thruster_env.core.streams import episode_keys
 from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
-from tuning.identification.profiles import validate
+from tuning.likelihood.identify import validate
 from tuning.logs.problem import LoggedFamily, remarks
 
 DT, COOLING, SPEED = 0.1, 52_000.0, 55.0  # [s], [J/(min K)], [rad/s/V]

@@ -19,8 +19,8 @@ from thruster_env.logs.log import Log, in_any_steps, in_steps
 from thruster_env.logs.read import read_log
 from thruster_env.model.continuous import noise_of_densities
 from tuning.evaluation.evaluate import evaluate
-from tuning.identification.objective import likelihood_of
-from tuning.identification.profiles import validate
+from tuning.likelihood.identify import validate
+from tuning.likelihood.recorded import likelihood_of
 from tuning.logs.problem import family_of
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Coordinates

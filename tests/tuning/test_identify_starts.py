@@ -13,9 +13,8 @@ from thruster_env.logs.log import Log
 from thruster_env.model.simulate import simulate
 from thruster_env.thruster.model import Recorder, logged_model
 from thruster_env.thruster.plant import make_plant
-from tuning.identification.identify import identify
-from tuning.identification.profiles import validate
-from tuning.identification.starts import starts_of
+from tuning.likelihood.identify import identify, validate
+from tuning.likelihood.recorded import starts_of
 from tuning.problems.data import Data
 from tuning.problems.excitation import held_levels
 from tuning.problems.problem import Parameter

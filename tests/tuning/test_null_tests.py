@@ -10,9 +10,9 @@ from tests.tuning.test_identify import FREE, TRUTH, recorded
 from tests.tuning.test_identify_starts import NOISE, OWN, PRESET, thruster_logs
 from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
-from tuning.identification.identify import identify
-from tuning.identification.result import NullTest
+from tuning.likelihood.identify import identify
 from tuning.likelihood.objective import kept_variance, lost_information
+from tuning.likelihood.result import NullTest
 from tuning.problems.problem import Parameter
 from tuning.thruster.logs import ThrusterFamily
 

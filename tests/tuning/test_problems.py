@@ -15,8 +15,8 @@ from tests.tuned_files import write_untuned
 from tuning.evaluation import held_out as summary
 from tuning.evaluation.baselines import Scaled
 from tuning.evaluation.tuned import read_choice, read_tuned
-from tuning.likelihood.family import Family
 from tuning.likelihood.objective import Objective
+from tuning.likelihood.parametric import Family
 from tuning.problems import model_problem
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem

@@ -35,12 +35,11 @@ from tuning.api.markers import (
 from tuning.api.progress import console_for
 from tuning.api.read_logs import recorded_runs
 from tuning.api.result import Result, drawn, frame
-from tuning.identification.identify import STARTS
-from tuning.identification.identify import identify as identify_runs
-from tuning.identification.objective import likelihood_of
-from tuning.identification.profiles import Profile, Validation, profile_figure, profiles, validate
-from tuning.identification.result import Identification, covariance, is_narrow
+from tuning.likelihood.identify import STARTS, Profile, Validation, profile_figure, profiles, validate
+from tuning.likelihood.identify import identify as identify_runs
 from tuning.likelihood.objective import Objective
+from tuning.likelihood.recorded import likelihood_of
+from tuning.likelihood.result import Identification, covariance, is_narrow
 from tuning.logs.problem import AnyStepFamily, check_offsets, family_of, remarks, split_runs, write_found
 from tuning.logs.read import pairs
 from tuning.problems.problem import Coordinates, Parameter

@@ -44,10 +44,10 @@ from tuning.api.study import STUDIES, MethodAnswer, Study
 from tuning.evaluation.baselines import noise_estimated, same_filter
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import check_keepable
-from tuning.likelihood.family import check_gradient
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import identify
 from tuning.likelihood.objective import OF_STATES
+from tuning.likelihood.parametric import check_gradient
 from tuning.methods.registry import DEFAULT, GRADIENT_METHOD, METHODS, ONLY, find_method
 from tuning.methods.task import Budget, Refused, Task
 from tuning.problems.assumed import AssumedProblem, within

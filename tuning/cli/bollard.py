@@ -22,8 +22,8 @@ from thruster_env.thruster.plant import make_plant
 from tuning.api.identify import DEFAULT_OUT
 from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, Argument, Option, PresetOption
 from tuning.api.result import Printed
-from tuning.identification.identify import identify as identify_logs
-from tuning.identification.result import Identification
+from tuning.likelihood.identify import identify as identify_logs
+from tuning.likelihood.result import Identification
 from tuning.logs.read import read_named
 from tuning.problems.problem import Parameter
 from tuning.thruster.bollard import FITTED, Identified, identify, read_table, relative_errors

@@ -24,8 +24,8 @@ from thruster_env.thruster.plant import make_plant
 from tuning.api.markers import RUNS, Option
 from tuning.api.result import Printed
 from tuning.cli.output import progress_of
-from tuning.identification.identify import identify
-from tuning.identification.result import Identification
+from tuning.likelihood.identify import identify
+from tuning.likelihood.result import Identification
 from tuning.problems.excitation import held_levels
 from tuning.thruster.logs import ThrusterFamily
 

@@ -1,1 +1,1 @@
-"""Noise covariances by maximum likelihood, and what data determine of them."""
+"""Parameters by maximum likelihood, of noise and of plants, and what data determine of them."""

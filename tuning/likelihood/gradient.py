@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tuning.likelihood.ascent import Evaluation, lbfgs
-from tuning.likelihood.family import Family, check_gradient
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
 from tuning.likelihood.objective import Objective
+from tuning.likelihood.parametric import Family, check_gradient
 from tuning.problems.data import Data
 from tuning.problems.problem import Parameter, Problem
 from tuning.search.objectives import LIKELIHOOD

@@ -12,8 +12,8 @@ from filters.registry import filter_type
 from filters.tuned_file import NOISE
 from thruster_env.core.checks import in_words
 from tuning.evaluation.residuals import heavy_innovations, tails_in_words
-from tuning.likelihood.family import Family, has_gradient
 from tuning.likelihood.objective import Objective
+from tuning.likelihood.parametric import Family, has_gradient
 from tuning.problems.data import Data, estimates_in_parts, where_true
 from tuning.problems.problem import Problem
 from tuning.search.parameters import index_pairs, model_parameters, places_in

@@ -25,10 +25,10 @@ from thruster_env.logs.findings import has_outliers, remarks_on
 from thruster_env.logs.log import FEWEST_STEPS, Log, in_any_steps, piece_of
 from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.clocks import CLOCK, clock_offsets, shifted
-from tuning.identification.family import ModelFamily
-from tuning.identification.identify import identify
-from tuning.identification.result import Identification, write_values
+from tuning.likelihood.identify import identify
+from tuning.likelihood.parametric import ModelFamily
+from tuning.likelihood.recorded import CLOCK, clock_offsets, shifted
+from tuning.likelihood.result import Identification, write_values
 from tuning.logs.read import check_model, name_of, offer_of, read_named, texts
 from tuning.problems.assumed import name_and_unknown
 from tuning.problems.find import logs_package, named
@@ -524,7 +524,7 @@ def write_found(path: str | Path, result: Identification, family: Any, logs: Seq
 
     Args:
         path: path of a file that ends in .toml.
-        result: from `tuning.identification.identify`.
+        result: from `tuning.likelihood.identify`.
         family: from `family_of`.
         logs: names of the training runs.
 

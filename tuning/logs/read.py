@@ -25,8 +25,8 @@ from thruster_env.logs.table import SUFFIXES
 from thruster_env.model.affine import LETTERS, AffineModel, affine_model
 from thruster_env.model.continuous import ContinuousModel, in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.clocks import CLOCK
-from tuning.identification.result import read_values
+from tuning.likelihood.recorded import CLOCK
+from tuning.likelihood.result import read_values
 from tuning.problems.find import logs_package
 from tuning.series.named import is_auto, maker_of, read_columns, with_values_of
 
@@ -86,7 +86,7 @@ def read_named(
     elif name is not None:
         options["name"] = name
     if model is not None and preset is not None:
-        from tuning.identification.result import values_in, with_values
+        from tuning.likelihood.result import values_in, with_values
 
         if not isinstance(path, Log):  # a user's offsets have priority
             options["clock_offset"] = clock_offsets_in(preset) | options["clock_offset"]

@@ -15,7 +15,7 @@ from filters.tuned_file import NOISE
 from thruster_env.model.affine import linearize
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import with_covariances
-from tuning.likelihood.family import Family
+from tuning.likelihood.parametric import Family
 from tuning.methods.task import Task
 from tuning.problems.data import Data, estimates_in_parts
 from tuning.search.space import Choice

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from filters.registry import filter_type
 from thruster_env.core.checks import one_of
 from thruster_env.core.modules import to_install
-from tuning.likelihood.family import check_gradient
+from tuning.likelihood.parametric import check_gradient
 from tuning.methods.correlations import als, desroziers, mehra, stationary
 from tuning.methods.em import em, squarem
 from tuning.methods.okf import okf

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from optuna.distributions import FloatDistribution, IntDistribution
 
+STEP = 1e-4  # of differences of a model, in coordinates
 PART = 0.1  # fraction of its range that is the unit of a parameter on a linear scale
 BOUND = "the posterior Cramér-Rao bound"  # what a scale is, in words
 PATH_BOUND = "the bound along noise-free paths"
@@ -201,7 +202,7 @@ class Coordinates:
         """Derivative of each value by its coordinate, (p,)."""
         return np.where(self.log, self.values(at), 1.0) * self.units
 
-    def neighbours(self, at: np.ndarray, index: int, step: float) -> tuple[np.ndarray, np.ndarray]:
+    def neighbours(self, at: np.ndarray, index: int, step: float = STEP) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates a step above and below in one place; at an end of the range both are within it."""
         middle, steps = np.array(at, dtype=np.float64), step * np.eye(len(at))[index]
         middle[index] = np.clip(middle[index], self.low[index] + step, self.high[index] - step)

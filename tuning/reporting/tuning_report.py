@@ -27,9 +27,9 @@ from tuning.evaluation.held_out import Comparison, numbers
 from tuning.evaluation.sizes import SIZE_TOLERANCE, left_out
 from tuning.evaluation.tuned import consistency, metrics
 from tuning.evaluation.worth import memory_numbers, memory_sentence
-from tuning.likelihood.family import has_gradient
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
+from tuning.likelihood.parametric import has_gradient
 from tuning.logs.problem import model_named_in
 from tuning.problems.assumed import within
 from tuning.problems.data import Data, estimates_in_parts

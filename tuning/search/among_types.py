@@ -22,9 +22,9 @@ from filters.registry import filter_type
 from tuning.evaluation.baselines import competing_baselines, noise_estimated
 from tuning.evaluation.held_out import sizes_as_data, stored_sizes
 from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
-from tuning.likelihood.family import has_gradient
 from tuning.likelihood.gradient import goal_of, optimum, start_at, starts_of
 from tuning.likelihood.objective import OF_STATES, Objective
+from tuning.likelihood.parametric import has_gradient
 from tuning.problems.data import Data
 from tuning.search.objectives import LIKELIHOOD, SCORE, reported
 from tuning.search.parameters import R, model_parameters

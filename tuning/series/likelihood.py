@@ -22,8 +22,7 @@ from filters.models import Scales, Sum, in_unit
 from filters.signals import Signal, with_level
 from thruster_env.model.affine import AffineModel
 from tuning.likelihood.ascent import Evaluation
-from tuning.likelihood.parametric import STEP
-from tuning.problems.problem import Coordinates, Parameter, squared
+from tuning.problems.problem import STEP, Coordinates, Parameter, squared
 from tuning.series.column import Column
 from tuning.series.recursion import Beginning, StepTables, Sums, filtered_runs
 
@@ -188,7 +187,7 @@ class ColumnLikelihood:
         r, here = math.exp(at[-1]), self._signal(self.coordinates.values(at).tolist())
         signals, noises = [here], [r]
         for j in along:
-            for point in self.coordinates.neighbours(at, j, STEP):
+            for point in self.coordinates.neighbours(at, j):
                 is_noise = j == len(at) - 1
                 signals.append(here if is_noise else self._signal(self.coordinates.values(point).tolist()))
                 noises.append(r * math.exp(point[j] - at[j]) if is_noise else r)
@@ -253,7 +252,7 @@ class ColumnLikelihood:
         middle = 0.5 * (self.coordinates.low + self.coordinates.high)
         moving = []
         for j in range(len(middle) - 1):
-            above, below = self.coordinates.neighbours(middle, j, STEP)
+            above, below = self.coordinates.neighbours(middle, j)
             first, other = (self._signal(self.coordinates.values(side).tolist()).slope for side in (above, below))
             moving += [j] * (not np.array_equal(first, other))
         return frozenset(moving)

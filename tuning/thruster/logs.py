@@ -16,8 +16,8 @@ from thruster_env.thruster.env import ModelledThruster
 from thruster_env.thruster.model import NO_BAND, Recorder, lag_weights, logged_plant, model_of_plant, with_recorder
 from thruster_env.thruster.parameters import PRESETS, ThrusterParameters, checked, is_file, read_preset
 from thruster_env.thruster.plant import Plant
-from tuning.identification.clocks import clock_offsets, offsets_of, shifted
-from tuning.identification.family import about, variance_about
+from tuning.likelihood.parametric import about, variance_about
+from tuning.likelihood.recorded import clock_offsets, offsets_of, shifted
 from tuning.problems.problem import Parameter, Problem
 from tuning.problems.scenario import FILE_SEQUENCES, PlantScenario
 from tuning.search.parameters import r_name
@@ -122,7 +122,7 @@ def preset_of(identification: Any, family: Any, logs: Sequence[str]):
     """The identified thruster as the content of a preset file, `thruster_env.thruster.parameters.PresetFile`.
 
     Args:
-        identification: from `tuning.identification.identify`.
+        identification: from `tuning.likelihood.identify`.
         family: its `ThrusterFamily`.
         logs: names of the runs.
     """

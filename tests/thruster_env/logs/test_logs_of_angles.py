@@ -14,7 +14,7 @@ from thruster_env.core.streams import filter_keys
 from thruster_env.logs.grid import Series, mean_held, sampled
 from thruster_env.logs.log import Log, at_offset
 from thruster_env.logs.read import read_log
-from tuning.identification.profiles import validation_of
+from tuning.likelihood.identify import validation_of
 from tuning.problems.data import Data
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem

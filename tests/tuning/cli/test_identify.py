@@ -17,7 +17,7 @@ from thruster_env.model.simulate import simulate
 from thruster_env.thruster.model import logged_model, thruster_model
 from thruster_env.thruster.parameters import TUNNEL_PHYSICAL, PresetFile, read_preset, write_preset
 from tuning.experiments.identification import TRUTH, record
-from tuning.identification.result import with_values
+from tuning.likelihood.result import with_values
 from tuning.problems.find import find_problem, scenario_of
 from tuning.thruster.logs import of_preset
 

@@ -8,7 +8,7 @@ import pytest
 from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
 from tuning.experiments.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study
-from tuning.identification.objective import likelihood_of
+from tuning.likelihood.recorded import likelihood_of
 from tuning.problems.problem import Coordinates
 from tuning.thruster.logs import ThrusterFamily
 

@@ -33,7 +33,7 @@ from tuning.experiments.recordings.identification import (
     thrusts,
 )
 from tuning.experiments.recordings.model import DT, clock_offset, model, read_recordings, to_identify
-from tuning.identification.result import valued
+from tuning.likelihood.result import valued
 
 RECORDED = Path(__file__).parents[4] / "shared" / "data" / "rov_thruster"
 TRUTH = {"inertia": 0.01, "thrust_factor": 1.2e-3, "dead_band_high": 0.9, "Q11": 1.0, "Q22": 0.04, "R22": 0.04}

@@ -44,8 +44,8 @@ from tuning.experiments.methods.problems import (
     lidar,
 )
 from tuning.experiments.users import holm
-from tuning.likelihood.family import DIFFERENTIABLE
 from tuning.likelihood.gradient import optimum
+from tuning.likelihood.parametric import DIFFERENTIABLE
 from tuning.methods.registry import ALONE, ONLY, find_method
 from tuning.methods.task import Answer, Budget, Task
 from tuning.problems.data import Data

@@ -31,9 +31,9 @@ from tuning.experiments.recordings.model import (
     read_recordings,
     to_identify,
 )
-from tuning.identification.identify import identify
-from tuning.identification.result import Identification, valued
-from tuning.identification.starts import runs_of
+from tuning.likelihood.identify import identify
+from tuning.likelihood.recorded import runs_of
+from tuning.likelihood.result import Identification, valued
 from tuning.problems.digest import digest_of
 from tuning.problems.problem import Parameter
 

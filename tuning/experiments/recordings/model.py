@@ -30,7 +30,7 @@ from thruster_env.logs.log import Log, at_offset
 from thruster_env.logs.table import read_table
 from thruster_env.model.quantities import Output, Quantity
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.result import read_values, valued
+from tuning.likelihood.result import read_values, valued
 
 DT = 0.04  # of the recordings [s]
 SUBSTEPS = 4  # of 10 ms: stable for rates of up to 278 1/s

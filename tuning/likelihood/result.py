@@ -23,11 +23,11 @@ from thruster_env.core.files import as_toml, read_toml, write_whole
 from thruster_env.logs.write import check_not_among
 from thruster_env.model.continuous import noise_for_dt, same_dt
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.identification.clocks import CLOCK
-from tuning.identification.family import ModelFamily
 from tuning.likelihood.ascent import Ascent, climb
 from tuning.likelihood.identifiability import COMPANION, KNOWN_WITHIN, TWO_SIDED
 from tuning.likelihood.objective import Objective, lost_information
+from tuning.likelihood.parametric import ModelFamily
+from tuning.likelihood.recorded import CLOCK
 from tuning.problems.problem import Coordinates
 
 LEGS = 25  # iterations of the other parameters, at most
