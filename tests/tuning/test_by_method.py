@@ -15,9 +15,9 @@ from tuning.api import tune
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import tune_by_gradient
-from tuning.methods.correlations import stationary, steady_gain
+from tuning.methods.innovations import steady_gain
 from tuning.methods.registry import ALONE, METHODS, find_method
-from tuning.methods.task import Budget, Task
+from tuning.methods.task import Budget, Task, stationary
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import RunsProblem
 from tuning.search.objectives import reported, reported_name

@@ -1,144 +1,179 @@
-"""Methods that search an objective, by gradients, simplex or samplers, and methods that run adaptive filters.
+"""Methods that search without a gradient, and the mean of the posterior, by random walk or no-U-turn sampler.
 
-In order: L-BFGS-B along an objective's gradient from several starts; searches without a gradient; Optuna's
-samplers; the mean Q and R of adaptive filters that ran until convergence; Anderson's adaptive inflation.
+In order: draws from the posterior; the downhill simplex and coordinate steps; Optuna's samplers.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 
 import numpy as np
 import optuna
 from optuna.distributions import BaseDistribution
 
-from filters import make_filter
-from filters.engine.session import Session
 from thruster_env.core.angles import difference
-from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.residuals import predicted
-from tuning.likelihood.gradient import optimum, start_at, starts_of
-from tuning.methods.task import Task
+from tuning.likelihood.ascent import DIVERGED
+from tuning.methods.task import COVARIANCE, GRADIENT, MODEL, NUTPIE, TRUTH, Spent, Task, method
 from tuning.problems.data import estimates_in_parts
 from tuning.problems.problem import Coordinates
-from tuning.search.parameters import FILTER_PARAMETERS
+from tuning.search.objectives import LIKELIHOOD
 from tuning.search.space import Choice
 from tuning.search.storage import quiet_optuna
 from tuning.search.trials import make_sampler
 
-HIDDEN_PART = 0.5  # of the times, at which `masked` hides all channels
-INFLATION = "inflation"  # the parameter of a filter with an ensemble
+TPE = "Bergstra, Bardenet, Bengio, Kegl (2011)"
+HANSEN = "Hansen (2016), arXiv 1604.00772"
+GAUSSIAN = "Optuna's GPSampler"
+UNIFORM = "Bergstra, Bengio (2012)"
+CHEN = "Chen, Heckman, Julier, Ahmed (2018), arXiv 1807.08855"
+
+# Of draws from the posterior.
+DRAWS, WARM_UP = 2000, 500
+DEVIATION = math.log(10.0)  # of the prior, in coordinates: a factor of ten, or a tenth of a linear range
+AIM_OF_ONE, AIM = 0.44, 0.234  # accepted part of the proposals, of one number and of many
+NUTS_WARM_UP, NUTS_DRAWS = 300, 500
+EDGE = 1e-3  # part of a range that a start keeps from its ends
+LEAST_SHARE = 1e-300  # below which s (1 - s) has no logarithm
 
 # Of the simplex and of coordinate steps.
+HIDDEN_PART = 0.5  # of the times, at which `masked` hides all channels
 FORWARD, BACKWARD = math.log(1.1), math.log(0.5)  # steps in coordinates
 ITERATIONS, LIMIT = 20, 0.1  # MATLAB's defaults: passes over all numbers, and the RMS error that is small enough
 SIDE = math.log(10.0)  # of the first simplex, in coordinates
 FEW = 4  # numbers, up to which the simplex has its first coefficients
 CLOSE = 1e-3  # size of a simplex, in coordinates, and relative spread of its values, at which it ends
 
-# Of samplers and of adaptive filters.
+# Of samplers.
 MOST_TRIALS = 10_000
 SLOWER = 10  # steps from one measurement to the next at the second sample time: 0.1 s and 1 s in the source
-FORGETTING = 0.995  # of Q and R a step
-
-# Of Anderson's adaptive inflation.
-DEVIATION = 0.1  # s at the beginning: how well lambda is known
-LEAST_DEVIATION = 0.02  # below which s does not fall, so that lambda may go on to change
-NEWTON = 8  # steps to the mode
-SETTLED = 0.25  # part of a run whose lambdas do not count
 
 
-def ascend(objective: str) -> Callable[[Task], None]:
-    """The method that follows the gradient of an objective from the task's start, then from those of `starts_of`.
+@method(
+    "posterior",
+    "the mean of the posterior by a Metropolis random walk",
+    "without true states and with few runs, if time does not count",
+    "Haario, Saksman, Tamminen (2001)",
+    (COVARIANCE, MODEL),
+)
+def posterior(task: Task) -> None:
+    """The mean over a Metropolis random walk of p(theta | z) in coordinates, with normal priors about the start.
 
-    It is what `tune_by_gradient` does, which adds standard errors.
+        theta' = theta + s N(0, C),   accepted with min(1, p(z | theta') p(theta') / (p(z | theta) p(theta)))
+
+    C is that of the draws so far, from 100 on, times 2.38^2/p; s follows the accepted part during the warm-up,
+    which does not count. It needs no gradient, so it works for every filter with a likelihood.
+
+    Sources: Haario, Saksman, Tamminen (2001), "An adaptive Metropolis algorithm", Bernoulli 7(2); Roberts,
+    Rosenthal (2001), "Optimal scaling for various Metropolis-Hastings algorithms", Statistical Science 16(4).
     """
+    coordinates = Coordinates(task.free)
+    centre = coordinates.clip(coordinates.of(task.values_of(task.start, task.free)))
+    runs = task.passes / len(task.problems)  # the likelihood objective is the mean of a run and of problems
+    p, generator = len(centre), task.generator
 
-    def run(task: Task) -> None:
-        goal = task.goal(objective)
-        coordinates = goal.coordinates
-        best = optimum(goal, goal.start)
-        task.keep(goal.choice_at(coordinates.of(best.parameters)))
-        for factors in starts_of(coordinates.free)[1:]:
-            other = optimum(goal, coordinates.clip(start_at(goal, factors)))
-            if other.value > best.value:
-                best = other
-            task.keep(goal.choice_at(coordinates.of(best.parameters)))
-
-    return run
-
-
-class Descent:
-    """An objective over the coordinates of what is searched, whose least value is kept."""
-
-    def __init__(self, task: Task, evaluate: Callable[[Choice], float]):
-        """Begin at the task's start."""
-        self.task, self.coordinates, self._evaluate = task, Coordinates(task.searched), evaluate
-        start = self.coordinates.of(task.values_of(task.start, task.searched))
-        self.first = self.coordinates.clip(start)
-        self.least = math.inf
-
-    def __call__(self, point: np.ndarray) -> float:
-        """The value at coordinates, which are put within the box."""
-        point = self.coordinates.clip(point)
-        choice = self.task.with_values(self.coordinates.values(point), self.task.searched)
-        value = self._evaluate(choice)
-        if value < self.least:
-            self.least = value
-            self.task.keep(choice)
-        return value
-
-
-def nelder_mead(task: Task, evaluate: Callable[[Choice], float] | None = None) -> None:
-    """The downhill simplex in coordinates, begun once more at its end; of many numbers with adapted coefficients.
-
-    Sources: Nelder, Mead (1965), "A simplex method for function minimization", Computer J. 7(4); Gao, Han (2012),
-    "Implementing the Nelder-Mead simplex algorithm with adaptive parameters", Comput. Optim. Appl. 51; for a
-    filter T. D. Powell (2002), "Automated tuning of an extended Kalman filter using the downhill simplex
-    algorithm", J. Guidance, Control, Dynamics 25(5).
-    """
-    from scipy.optimize import minimize
-
-    descent = Descent(task, evaluate or task.value)
-    point, p = descent.first, len(descent.first)
-    for _ in range(2):
-        corners = np.vstack([point, point + SIDE * np.eye(p)])
-        over = corners > descent.coordinates.high
-        corners = np.where(over, 2.0 * point - corners, corners)
-        options = {"initial_simplex": corners, "adaptive": p > FEW, "xatol": CLOSE, "fatol": CLOSE * CLOSE}
-        options |= {"maxiter": 200 * p, "maxfev": 400 * p}
-        point = np.clip(
-            minimize(descent, point, method="Nelder-Mead", options=options).x,
-            descent.coordinates.low,
-            descent.coordinates.high,
+    def density(point: np.ndarray) -> float:
+        if (point < coordinates.low).any() or (point > coordinates.high).any():
+            return -math.inf
+        choice = task.with_values(coordinates.values(point), task.free)
+        return -len(task.problems) * runs * task.value(choice, LIKELIHOOD) - 0.5 * float(
+            ((point - centre) ** 2).sum() / DEVIATION**2
         )
 
+    point, here = centre, density(centre)
+    spread, size, draws = 0.1 * np.eye(p), 1.0, []
+    aim = AIM_OF_ONE if p == 1 else AIM
+    for step in range(WARM_UP + DRAWS):
+        root = np.linalg.cholesky(spread + 1e-12 * np.eye(p))
+        other = point + size * root @ generator.standard_normal(p)
+        proposed = density(other)
+        chance = math.exp(min(proposed - here, 0.0))
+        if generator.random() < chance:
+            point, here = other, proposed
+        draws.append(point)
+        if step < WARM_UP:
+            size *= math.exp((chance - aim) / math.sqrt(step + 1.0))
+            if step >= 100 and step % 50 == 0:
+                spread = 2.38**2 / p * np.atleast_2d(np.cov(np.array(draws[step // 2 :]), rowvar=False))
+                size = 1.0
+        if step % 100 == 99:
+            counted = draws[WARM_UP:] if step >= WARM_UP else draws[len(draws) // 2 :]
+            task.keep(task.with_values(coordinates.values(np.mean(counted, axis=0)), task.free))
 
-def coordinate_steps(task: Task) -> None:
-    """Each number in turn times 1.1, or else times 0.5, wherever the objective falls; twenty times over all.
 
-    Of numbers on linear scales the steps are as long in coordinates. It ends where no step helps.
+@method(
+    "nuts",
+    "the same mean by the no-U-turn sampler with exact gradients, of the package nutpie",
+    "like `posterior`, from six parameters on",
+    "Hoffman, Gelman (2014)",
+    (GRADIENT, NUTPIE),
+)
+def nuts(task: Task) -> None:
+    """The mean of p(theta | z) in coordinates, with normal priors about the start, by Hamiltonian dynamics.
 
-    Source: the documented defaults of `tune` and `tunerconfig` of MATLAB's Sensor Fusion and Tracking Toolbox
-    (StepForward 1.1, StepBackward 0.5, MaxIterations 20); their order is our reading of them.
+        theta = low + (high - low) s(y),   s(y) = 1 / (1 + exp(-y))
+        log p(y | z) = log p(z | theta) - |theta - theta_0|^2 / (2 d^2) + sum log s(y) (1 - s(y)),   d = log 10
+
+    It is the posterior of `posterior`, from fewer draws, each of which takes several gradients. Draws of the
+    warm-up count until others are there. The sampler is nutpie's.
+
+    Source: Hoffman, Gelman (2014), "The No-U-Turn Sampler", J. Machine Learning Research 15.
     """
-    descent = Descent(task, task.value)
-    point = descent.first
-    least = descent(point)
-    for _ in range(ITERATIONS):
-        before = least
-        for i in range(len(point)):
-            for step in (FORWARD, BACKWARD):
-                other = descent.coordinates.clip(point + step * np.eye(len(point))[i])
-                value = descent(other)
-                if value < least:
-                    point, least = other, value
-                    break
-        if least == before:
-            return
+    with task.uncounted(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the packages that it imports
+        import nutpie
+        from nutpie.compiled_pyfunc import from_pyfunc
+
+    goal = task.goal(LIKELIHOOD, keeps=False)
+    low, high = goal.coordinates.low, goal.coordinates.high
+    centre = goal.start
+    p, draws, evaluated = len(centre), list[np.ndarray](), set[bytes]()
+
+    def point_at(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        s = 0.5 * (1.0 + np.tanh(0.5 * y))
+        return low + (high - low) * s, s
+
+    def density(y: np.ndarray) -> tuple[float, np.ndarray]:
+        point, s = point_at(y)
+        try:
+            task.check()
+            here, away = goal(point), (point - centre) / DEVIATION**2
+            evaluated.add(y.tobytes())
+        except Spent:  # an exception would end the process: the other draws are of something cheap, and not kept
+            return -0.5 * float(y @ y), -y
+        except ValueError:  # the filter diverges
+            return -DIVERGED, np.zeros(p)
+        value = here.value - 0.5 * (point - centre) @ away + np.log(np.maximum(s * (1.0 - s), LEAST_SHARE)).sum()
+        by_point = here.gradient - away
+        slope = by_point * (high - low) * s * (1.0 - s) + 1.0 - 2.0 * s
+        if not (np.isfinite(value) and np.isfinite(slope).all()):
+            return -DIVERGED, np.zeros(p)
+        return float(value), slope
+
+    def keep(y: np.ndarray) -> dict[str, np.ndarray]:
+        if y.tobytes() in evaluated:  # within the budget: it comes from another thread, which may be late
+            draws.append(point_at(y)[0])
+            counted = draws[NUTS_WARM_UP:] or draws[len(draws) // 2 :]
+            task.keep(goal.choice_at(np.mean(counted, axis=0)), late=True)
+        return {"y": y}
+
+    inside = np.clip((centre - low) / (high - low), EDGE, 1.0 - EDGE)
+    first = np.log(inside / (1.0 - inside))  # nutpie itself would begin within factors of a thousand about it
+    form = [np.dtype(np.float64)], [(p,)], ["y"]
+    model = from_pyfunc(p, lambda: density, lambda *_: keep, *form, make_initial_point_fn=lambda seed: first)
+    settings = {"draws": NUTS_DRAWS, "tune": NUTS_WARM_UP, "chains": 1, "seed": task.seed, "progress_bar": False}
+    nutpie.sample(model, return_raw_trace=True, **settings)
 
 
+@method(
+    "masked",
+    "the downhill simplex on the error of measurements withheld from the filter",
+    "without true states, if no likelihood can be trusted",
+    "Barratt, Boyd (2020)",
+    (COVARIANCE,),
+)
 def masked(task: Task) -> None:
     """Nelder and Mead's simplex on the error of predicted measurements, half of which the filter does not see.
 
@@ -183,6 +218,88 @@ def _squares(task: Task, choice: Choice, index: int, hidden: np.ndarray) -> np.n
     return totals / np.maximum(counts, 1)
 
 
+class Descent:
+    """An objective over the coordinates of what is searched, whose least value is kept."""
+
+    def __init__(self, task: Task, evaluate: Callable[[Choice], float]):
+        """Begin at the task's start."""
+        self.task, self.coordinates, self._evaluate = task, Coordinates(task.searched), evaluate
+        start = self.coordinates.of(task.values_of(task.start, task.searched))
+        self.first = self.coordinates.clip(start)
+        self.least = math.inf
+
+    def __call__(self, point: np.ndarray) -> float:
+        """The value at coordinates, which are put within the box."""
+        point = self.coordinates.clip(point)
+        choice = self.task.with_values(self.coordinates.values(point), self.task.searched)
+        value = self._evaluate(choice)
+        if value < self.least:
+            self.least = value
+            self.task.keep(choice)
+        return value
+
+
+@method(
+    "nelder-mead",
+    "the downhill simplex on the objective",
+    "for any filter, with up to six parameters",
+    "Powell (2002)",
+)
+def nelder_mead(task: Task, evaluate: Callable[[Choice], float] | None = None) -> None:
+    """The downhill simplex in coordinates, begun once more at its end; of many numbers with adapted coefficients.
+
+    Sources: Nelder, Mead (1965), "A simplex method for function minimization", Computer J. 7(4); Gao, Han (2012),
+    "Implementing the Nelder-Mead simplex algorithm with adaptive parameters", Comput. Optim. Appl. 51; for a
+    filter T. D. Powell (2002), "Automated tuning of an extended Kalman filter using the downhill simplex
+    algorithm", J. Guidance, Control, Dynamics 25(5).
+    """
+    from scipy.optimize import minimize
+
+    descent = Descent(task, evaluate or task.value)
+    point, p = descent.first, len(descent.first)
+    for _ in range(2):
+        corners = np.vstack([point, point + SIDE * np.eye(p)])
+        over = corners > descent.coordinates.high
+        corners = np.where(over, 2.0 * point - corners, corners)
+        options = {"initial_simplex": corners, "adaptive": p > FEW, "xatol": CLOSE, "fatol": CLOSE * CLOSE}
+        options |= {"maxiter": 200 * p, "maxfev": 400 * p}
+        point = np.clip(
+            minimize(descent, point, method="Nelder-Mead", options=options).x,
+            descent.coordinates.low,
+            descent.coordinates.high,
+        )
+
+
+@method(
+    "coordinate-steps",
+    "one parameter at a time, a step up or half of it, on the objective",
+    "to compare: what MATLAB's tune documents",
+    "The MathWorks, `tune`",
+)
+def coordinate_steps(task: Task) -> None:
+    """Each number in turn times 1.1, or else times 0.5, wherever the objective falls; twenty times over all.
+
+    Of numbers on linear scales the steps are as long in coordinates. It ends where no step helps.
+
+    Source: the documented defaults of `tune` and `tunerconfig` of MATLAB's Sensor Fusion and Tracking Toolbox
+    (StepForward 1.1, StepBackward 0.5, MaxIterations 20); their order is our reading of them.
+    """
+    descent = Descent(task, task.value)
+    point = descent.first
+    least = descent(point)
+    for _ in range(ITERATIONS):
+        before = least
+        for i in range(len(point)):
+            for step in (FORWARD, BACKWARD):
+                other = descent.coordinates.clip(point + step * np.eye(len(point))[i])
+                value = descent(other)
+                if value < least:
+                    point, least = other, value
+                    break
+        if least == before:
+            return
+
+
 def sample(sampler: str, objective: str | None = None, slower: int | None = None) -> Callable[[Task], None]:
     """The method that minimises an objective, by default the task's, over trials of a sampler, from the start on.
 
@@ -219,115 +336,67 @@ def sample(sampler: str, objective: str | None = None, slower: int | None = None
     return run
 
 
-def converged(name: str, numbers: dict[str, float]) -> Callable[[Task], None]:
-    """The method that runs an adaptive filter over each training run in turn, from the values of the last one.
-
-    What a run finds is the mean over its second half of the filter's R, and of its Q where it learns that. In the
-    end it is the mean over the second half of the runs.
-    """
-
-    def run(task: Task) -> None:
-        model = task.model(task.start)
-        q, r = model.process_noise_cov, model.measurement_noise_cov
-        estimates: list[tuple[np.ndarray, np.ndarray]] = []
-        for i, (_, data) in enumerate(zip(task.problems, task.data, strict=True)):
-            for index in range(len(data.seeds)):
-                try:
-                    model = task.model(task.start, i).replace(process_noise_cov=q, measurement_noise_cov=r)
-                    q, r = _means(make_filter(name, model, **numbers), data.one(index))
-                except ValueError:  # a belief that is none
-                    raise ValueError(
-                        f"method {name!r} failed: its Q or R is no covariance after {len(estimates)} runs"
-                    ) from None
-                task.charge(1)
-                estimates.append((q, r))
-                half = estimates[len(estimates) // 2 :]
-                means = (np.mean([estimate[side] for estimate in half], axis=0) for side in (0, 1))
-                task.keep(with_covariances(task.start, *_diagonals(task, *means)))
-
-    return run
-
-
-def _means(filter_, data) -> tuple[np.ndarray, np.ndarray]:
-    """Mean Q (n, n) and R (m, m) over the second half of a run."""
-    belief, qs, rs = filter_.init(), [], []
-    for k in range(data.measurements.shape[1]):
-        if k:
-            belief = filter_.predict(belief, data.inputs[0, k - 1])
-        belief, _ = filter_.update(belief, data.measurements[0, k])
-        if 2 * k >= data.measurements.shape[1]:
-            rs.append(filter_.estimated_noise(belief))
-            learns = hasattr(filter_, "estimated_process_noise")
-            qs.append(filter_.estimated_process_noise(belief) if learns else filter_.model.process_noise_cov)
-    return np.mean(qs, axis=0), np.mean(rs, axis=0)
-
-
-def _diagonals(task: Task, q: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Q and R without correlations, unless these are tuned."""
-    q = q if task.options.get("full_q") or not task.start.model else np.diag(np.diag(q))
-    if task.options.get("hold_r"):
-        return q, None
-    return q, r if task.options.get("full_r") else np.diag(np.diag(r))
-
-
-sage_husa = converged("sage-husa", {"forgetting_factor": FORGETTING, "process_forgetting_factor": FORGETTING})
-vb = converged("vb", {"forgetting_factor": FORGETTING})
-
-
-def anderson(task: Task) -> None:
-    """Follow the factor lambda on the members' variance from innovation to innovation; then take its mean root.
-
-        d ~ N(0, lambda p + R_jj),   p = (S_jj - R_jj) / lambda before,   lambda ~ N(l, s^2)
-        l <- the mode of lambda given d,   1/s^2 <- the curvature of the log density there
-
-    for one channel after the other. The next step has it. Q and R stay; a spread that is too small because Q is
-    shows here, too. It needs one pass of the filter, step by step.
-
-    Source: Anderson (2007), "An adaptive covariance inflation error correction algorithm for ensemble filters",
-    Tellus A 59, with a lambda for all states alike; Anderson (2009), Tellus A 61.
-    """
-    parameter, levels_of_runs, start = (
-        FILTER_PARAMETERS[INFLATION],
-        [],
-        1.0 + 1e-9,
-    )  # so that there is one to change
-    choice = task.start._replace(numbers={**task.start.numbers, INFLATION: start})
-    for i, (problem, data) in enumerate(zip(task.problems, task.data, strict=True)):
-        filter_, variances = choice.filter(problem), np.diag(task.model(choice, i).measurement_noise_cov)
-        for run in range(len(data.seeds)):
-            session, level, spread = Session(filter_), 1.0, DEVIATION
-            inputs, z = data.seen.inputs[run], data.seen.measurements[run]
-            session.start(data.filter_keys[run], z[0])
-            levels = []
-            for k in range(1, int(data.rows[run])):
-                session.set_parameter(INFLATION, level**0.5)
-                session.step(inputs[k - 1], z[k])
-                plain = (np.diag(session.innovation_cov) - variances) / level
-                for d, p, r in zip(session.innovation, plain, variances, strict=True):
-                    if d == d and d != 0.0 and p > 0.0:
-                        level, spread = updated(level, spread, d * d, p, r)
-                levels.append(level)
-            task.charge(1)
-            levels_of_runs += levels[int(SETTLED * len(levels)) :]
-    mean = float(np.clip(np.sqrt(levels_of_runs).mean(), parameter.low, parameter.high))
-    task.keep(task.start._replace(numbers={**task.start.numbers, INFLATION: mean}))
-
-
-def updated(level: float, spread: float, square: float, plain: float, noise: float) -> tuple[float, float]:
-    """Mode and deviation of lambda after an innovation with this square, by Newton's method with safe steps.
-
-    Args:
-        level: mean of lambda before.
-        spread: its standard deviation before.
-        square: d^2.
-        plain: variance p of what the members expect, without inflation.
-        noise: variance of the measurement.
-    """
-    at, curvature = level, 1.0 / spread**2
-    for _ in range(NEWTON):
-        total = at * plain + noise
-        slope = (level - at) / spread**2 + 0.5 * plain * (square - total) / total**2
-        # The expected curvature: always positive, so that each step climbs.
-        curvature = 1.0 / spread**2 + 0.5 * (plain / total) ** 2
-        at = max(at + slope / curvature, 0.25 * at)
-    return at, max(curvature**-0.5, LEAST_DEVIATION)
+method(
+    "tpe-only",
+    "Optuna's tree-structured Parzen estimator on the objective, without baselines, band and validation",
+    "to compare with the study `tpe`",
+    TPE,
+    by_trials=True,
+)(sample("tpe"))
+method(
+    "gp-only",
+    "Optuna's Gaussian process on the objective, alone",
+    "to compare with the study `gp`",
+    GAUSSIAN,
+    by_trials=True,
+)(sample("gp"))
+method(
+    "cma-es-only",
+    "covariance matrix adaptation on the objective, alone",
+    "to compare with the study `cma-es`",
+    HANSEN,
+    by_trials=True,
+)(sample("cma-es"))
+method(
+    "random-only", "independent draws alone", "to compare: every search has to beat it", UNIFORM, by_trials=True
+)(sample("random"))
+method(
+    "nis",
+    "trials that minimise abs(log(mean NIS / m)), by the sampler tpe",
+    "to compare: it is zero on a curve, whatever the error",
+    CHEN,
+    (COVARIANCE,),
+    by_trials=True,
+)(sample("tpe", "nis"))
+method(
+    "c-nis",
+    "the same of mean and variance of the NIS",
+    "to compare",
+    "Chen, Biggie, Ahmed, Julier, Heckman, arXiv 2306.07225",
+    (COVARIANCE,),
+    by_trials=True,
+)(sample("tpe", "c-nis"))
+method(
+    "c-nis-two-rates",
+    "the larger one of c-nis at the sample time and at one ten times as long",
+    "to compare: two sample times separate Q and R, one leaves a curve of zeros",
+    "Chen, Biggie, Ahmed, Julier, Heckman, arXiv 2306.07225",
+    (COVARIANCE,),
+    by_trials=True,
+)(sample("tpe", "c-nis", SLOWER))
+method(
+    "nees",
+    "trials that minimise abs(log(mean NEES / n)), by the sampler tpe",
+    "to compare",
+    CHEN,
+    (TRUTH, COVARIANCE),
+    by_trials=True,
+)(sample("tpe", "nees"))
+method(
+    "c-nees",
+    "the same of mean and variance of the NEES",
+    "to compare",
+    "Chen, Biggie, Ahmed, Julier, Heckman, arXiv 2306.07225",
+    (TRUTH, COVARIANCE),
+    by_trials=True,
+)(sample("tpe", "c-nees"))

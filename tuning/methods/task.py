@@ -1,7 +1,11 @@
-"""`Task`: what a method of tuning works on: it runs the filter, counts passes and keeps the best choice so far."""
+"""`Task`: what a method of tuning works on, and `Method`: what one needs, with the decorator that registers it.
+
+A task runs the filter, counts passes and keeps the best choice so far.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.registry import filter_type
+from thruster_env.core.modules import to_install
 from thruster_env.core.streams import METHOD_OF_TUNING, derived_generator
+from thruster_env.model.affine import linearize
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.evaluate import compute_metrics
@@ -21,15 +27,32 @@ from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.ascent import Evaluation
 from tuning.likelihood.gradient import objective_of
 from tuning.likelihood.objective import Objective
+from tuning.likelihood.parametric import check_gradient
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.problem import Parameter, Problem
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORES, NEES, SCORE, VARIANCES, find_objective, penalised
-from tuning.search.parameters import model_parameters
-from tuning.search.space import Choice, neutral, parameters, untuned_choice
+from tuning.search.parameters import Q, R, model_parameters
+from tuning.search.space import Choice, has_search_space, neutral, parameters, untuned_choice
 
 FEW = 32  # runs, by which passes are priced
 TIMED = 3  # calls, of which the shortest counts, of what is priced
+ALIKE = 1e-9  # relative difference, up to which two linearisations are the same
 ROUNDING = 1e-6  # part of an objective: an answer that is worse by less is as good
+
+
+# What a method may need.
+TRUTH = "truth"  # true states
+GRADIENT = "gradient"  # a Kalman filter with derivatives
+COVARIANCE = "covariance"  # a filter with a covariance
+LINEAR = "linear"  # a linear model with a stationary filter
+NUTPIE = "nutpie"  # the package
+NOISE = "noise"  # that Q and R are tuned, and not a model's own parameters
+MODEL = "model"  # that some number of the model is tuned
+INFLATION = "inflation"  # the parameter of a filter with an ensemble
+
+OPTIONS = ("hold_r", "full_q", "full_r", "prior", "where")  # of a model's numbers
+DIAGONAL = ("hold_r", "prior")
+MATRICES = (*DIAGONAL, "full_q", "full_r")  # of methods that find matrices as a whole, and know no relations
 
 
 class Budget(NamedTuple):
@@ -52,6 +75,16 @@ class Refused(NamedTuple):
 
     before: float  # the objective of what the method was given
     after: float  # that of the answer
+
+
+class Stationary(NamedTuple):
+    """A linear model x' = A x + B u + a, z = C x + d."""
+
+    a: np.ndarray
+    b: np.ndarray
+    offset: np.ndarray
+    c: np.ndarray
+    zero: np.ndarray
 
 
 class Spent(Exception):
@@ -282,6 +315,22 @@ class Task:
         return choice.filter(self.problems[index]).kernel_model
 
 
+def stationary(model: StateSpaceModel, name: str, method: str) -> Stationary:
+    """The matrices of a linear model; ValueError for another one."""
+    about = np.zeros(model.n), np.zeros(model.inputs)
+    away = np.ones(model.n) * model.scales, np.ones(model.inputs)
+    matrices, other = (linearize(model, *point).matrices() for point in (about, away))
+    pairs = zip(matrices, other, strict=True)
+    if not all(
+        np.allclose(first, two, rtol=ALIKE, atol=ALIKE * max(abs(first).max(initial=0), 1.0))
+        for first, two in pairs
+    ):
+        raise ValueError(
+            f"method {method!r} needs a linear model, such as that of the filter kf, but {name} has another one"
+        )
+    return Stationary(*matrices)
+
+
 def shortest(call: Callable[[], object]) -> float:
     """The shortest of some calls, after one that may compile [s of processor time]."""
     call()
@@ -310,3 +359,88 @@ def within_first_range(parameter: Parameter) -> Parameter:
         if parameter.first is None
         else replace(parameter, low=parameter.first[0], high=parameter.first[1], default=None)
     )
+
+
+class Method(NamedTuple):
+    """A method that finds a filter's numbers."""
+
+    about: str  # what it does, in one sentence
+    when: str  # when to use it
+    function: Callable[[Task], None]  # keeps choices of a task until it is done, or the task raises Spent
+    source: str
+    needs: tuple[str, ...] = ()  # of the above
+    # Options of the model's numbers with which it can work.
+    options: tuple[str, ...] = OPTIONS
+    by_trials: bool = False  # whether it ends after a number of trials; others have their own criterion
+    sampler: str = ""  # of a study; empty if the method runs alone
+
+    @property
+    def is_study(self) -> bool:
+        """Whether it is a study, which draws its runs, tries the baselines and validates its best trials."""
+        return bool(self.sampler)
+
+    def check(self, name: str, task: Task) -> None:
+        """Raise ValueError if a task lacks what the method needs."""
+        if not has_search_space(task.filter):
+            raise ValueError(f"filter must be one that has something to tune, but got {task.filter!r}")
+        if GRADIENT in self.needs:
+            check_gradient(task.filter, f"a filter for method {name!r}")
+        if COVARIANCE in self.needs and not filter_type(task.filter).has_covariance:
+            raise ValueError(f"method {name!r} needs a filter with a covariance, but got {task.filter!r}")
+        if INFLATION in self.needs and INFLATION not in filter_type(task.filter).numbers:
+            raise ValueError(f"method {name!r} tunes the inflation of an ensemble, but {task.filter!r} has none")
+        if TRUTH in self.needs and not task.has_truth:
+            pairs = zip(task.problems, task.data, strict=True)
+            lacking = next(problem.name for problem, data in pairs if problem.scale is None or data.states is None)
+            raise ValueError(f"method {name!r} needs true states, but {lacking} has none")
+        if NOISE in self.needs and not {Q, R} <= set(task.start.model):
+            raise ValueError(
+                f"method {name!r} tunes Q and R, but {task.problems[0].name} has parameters of its own"
+            )
+        if MODEL in self.needs and not task.free:
+            raise ValueError(
+                f"method {name!r} tunes the model, but {task.problems[0].name} has no free parameter of it"
+            )
+        if LINEAR in self.needs:
+            stationary(task.model(task.start), task.problems[0].name, name)
+        if NUTPIE in self.needs and importlib.util.find_spec(NUTPIE) is None:
+            raise ValueError(f"method {name!r} needs {NUTPIE}, which is not installed: {to_install('nuts')}")
+        unable = [option for option, wanted in task.options.items() if wanted and option not in self.options]
+        if unable:
+            rest = f": P0 is tuned{way_out('P0')}" if "prior" in unable else ""
+            raise ValueError(f"method {name!r} must come without {', '.join(unable)}{rest}")
+
+    def run(self, name: str, task: Task, guarded: bool = True) -> None:
+        """Run the method until it is done or the budget spent; ValueError if the task lacks what it needs.
+
+        The answer is `task.best`; `task.answers` holds those for smaller budgets. If the answer is worse than the
+        start or the model's own numbers, these replace it (`task.refused`).
+        """
+        self.check(name, task)
+        try:
+            self.function(task)
+        except Spent:
+            pass
+        if guarded and not task.stop():  # whoever asks for an end waits for no more
+            task.refuse_worse()
+
+
+ALONE: dict[str, Method] = {}  # methods that run alone, by name: `method` registers them
+
+
+def method(
+    name: str,
+    about: str,
+    when: str,
+    source: str,
+    needs: tuple[str, ...] = (),
+    options: tuple[str, ...] = OPTIONS,
+    by_trials: bool = False,
+) -> Callable[[Callable[[Task], None]], Callable[[Task], None]]:
+    """The decorator that registers a function as the method of a name; for the other arguments see `Method`."""
+
+    def register(function: Callable[[Task], None]) -> Callable[[Task], None]:
+        ALONE[name] = Method(about, when, function, source, needs, options, by_trials)
+        return function
+
+    return register

@@ -10,18 +10,17 @@ from thruster_env.model.simulate import simulate
 from tuning.evaluation.residuals import estimated_from
 from tuning.experiments.methods.problems import ring
 from tuning.likelihood.objective import symmetric_units
-from tuning.methods.correlations import (
+from tuning.methods.innovations import (
     Noise,
     autocovariances,
     lagged,
     mehra_equations,
     semidefinite,
-    stationary,
     steady_gain,
+    updated,
 )
 from tuning.methods.registry import find_method
-from tuning.methods.searches import updated
-from tuning.methods.task import Budget, Task
+from tuning.methods.task import Budget, Task, stationary
 from tuning.problems.model_problem import ModelProblem, RunsProblem
 from tuning.problems.problem import Parameter
 from tuning.search.objectives import LIKELIHOOD

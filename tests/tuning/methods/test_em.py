@@ -5,7 +5,7 @@ import pytest
 
 from tests.tuning.methods.problems import P0, A, C, at, linear, task_of
 from tuning.evaluation.evaluate import values_of
-from tuning.methods.em import counts_of
+from tuning.methods.gradients import counts_of
 from tuning.methods.registry import find_method
 from tuning.methods.task import Budget
 from tuning.search.objectives import LIKELIHOOD

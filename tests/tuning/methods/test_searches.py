@@ -8,7 +8,7 @@ import pytest
 from tests.tuning.methods.problems import P0, A, C, Q, R, at, linear, task_of
 from tuning.evaluation.evaluate import values_of
 from tuning.likelihood.gradient import tune_by_gradient
-from tuning.methods.okf import Factors
+from tuning.methods.gradients import Factors
 from tuning.methods.registry import METHODS, find_method
 from tuning.methods.searches import BACKWARD, FORWARD, _squares
 from tuning.methods.task import Budget, Task

@@ -1,6 +1,7 @@
-"""Q and R from the autocovariance of a fixed-gain filter's innovations.
+"""Methods by innovations: Q and R from their covariances, and what filters find that adapt to them.
 
-In order: the autocovariances; autocovariance least squares; Mehra's covariance matching; Desroziers' diagnostics.
+In order: autocovariances of a fixed gain's innovations, autocovariance least squares, Mehra's covariance matching;
+Desroziers' diagnostics; Anderson's adaptive inflation; the mean Q and R of adaptive filters over all runs.
 """
 
 from __future__ import annotations
@@ -10,22 +11,36 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters import make_filter
 from filters.bounds import steady_state
-from filters.tuned_file import NOISE
-from thruster_env.model.affine import linearize
-from thruster_env.model.state_space import StateSpaceModel
+from filters.engine.session import Session
+from filters.tuned_file import NOISE as NOISE_OPTIONS
 from tuning.evaluation.baselines import with_covariances
 from tuning.likelihood.parametric import Family
-from tuning.methods.task import Task
+from tuning.methods.task import (
+    COVARIANCE,
+    DIAGONAL,
+    GRADIENT,
+    INFLATION,
+    LINEAR,
+    MATRICES,
+    NOISE,
+    Stationary,
+    Task,
+    method,
+    stationary,
+)
 from tuning.problems.data import Data, estimates_in_parts
+from tuning.search.parameters import FILTER_PARAMETERS
 from tuning.search.space import Choice
 
 LAGS = 15
 DROPPED = 100  # rows at the beginning, at most a fifth of a run
 ITERATIONS = 3  # the gain of each is that of the Q and R found before
 LEAST_DECAY = 1e-9  # of an error in a step
-ALIKE = 1e-9  # relative difference, up to which two linearisations are the same
-LINEAR = 1e-6  # part of Q or R that numbers may not stand for: slopes of a model's own numbers are differences
+UNEXPLAINED = (
+    1e-6  # part of Q or R that numbers may not stand for: slopes of a model's own numbers are differences
+)
 
 # Of autocovariance least squares.
 LEAST = 1e-10  # part of the start's variances below which none falls, so that a gain exists
@@ -36,15 +51,12 @@ DESROZIERS_ITERATIONS = 30
 CLOSE = 1e-3  # relative change that ends it
 MOST_CHANGE = 10.0  # factor on Q or R in an iteration
 
-
-class Stationary(NamedTuple):
-    """A linear model x' = A x + B u + a, z = C x + d."""
-
-    a: np.ndarray
-    b: np.ndarray
-    offset: np.ndarray
-    c: np.ndarray
-    zero: np.ndarray
+# Of Anderson's adaptive inflation, and of adaptive filters.
+DEVIATION = 0.1  # s at the beginning: how well lambda is known
+LEAST_DEVIATION = 0.02  # below which s does not fall, so that lambda may go on to change
+NEWTON = 8  # steps to the mode
+SETTLED = 0.25  # part of a run whose lambdas do not count
+FORGETTING = 0.995  # of Q and R a step
 
 
 class Noise(NamedTuple):
@@ -74,8 +86,7 @@ def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np
         raise ValueError(
             f"method {name!r} needs Q and R linear in positive numbers, but a number is on a linear scale"
         )
-    model = task.model(task.start)
-    linear = stationary(model, task.problems[0].name, name)
+    linear = stationary(task.model(task.start), task.problems[0].name, name)
     point = coordinates.clip(coordinates.of(task.values_of(task.start, task.free)))
     for _ in range(ITERATIONS):
         model, slopes = family.at(point)
@@ -83,7 +94,7 @@ def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np
         units = [slope / each[:, None, None] for slope in (slopes.process_noise_cov, slopes.measurement_noise_cov)]
         of_model = model.process_noise_cov, model.measurement_noise_cov
         q, r = (of - np.tensordot(each, unit, 1) for of, unit in zip(of_model, units, strict=True))
-        if any(abs(rest).max() > LINEAR * abs(of).max() for rest, of in zip((q, r), of_model, strict=True)):
+        if any(abs(rest).max() > UNEXPLAINED * abs(of).max() for rest, of in zip((q, r), of_model, strict=True)):
             if not task.options.get("hold_r"):
                 raise ValueError(
                     f"method {name!r} needs Q and R linear in the numbers that are tuned, but they are not"
@@ -104,22 +115,6 @@ def observed(task: Task, linear: Stationary, q: np.ndarray, r: np.ndarray) -> tu
     measured = autocovariances([_innovations(linear, gain, runs, first) for runs in task.data], lags)
     task.charge(task.passes)
     return gain, measured
-
-
-def stationary(model: StateSpaceModel, name: str, method: str) -> Stationary:
-    """The matrices of a linear model; ValueError for another one."""
-    about = np.zeros(model.n), np.zeros(model.inputs)
-    away = np.ones(model.n) * model.scales, np.ones(model.inputs)
-    matrices, other = (linearize(model, *point).matrices() for point in (about, away))
-    pairs = zip(matrices, other, strict=True)
-    if not all(
-        np.allclose(first, two, rtol=ALIKE, atol=ALIKE * max(abs(first).max(initial=0), 1.0))
-        for first, two in pairs
-    ):
-        raise ValueError(
-            f"method {method!r} needs a linear model, such as that of the filter kf, but {name} has another one"
-        )
-    return Stationary(*matrices)
 
 
 def steady_gain(linear: Stationary, q: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -179,6 +174,14 @@ def autocovariances(parts: list[list[np.ndarray]], lags: int) -> np.ndarray:
     return np.array(means)
 
 
+@method(
+    "als",
+    "least squares of lagged covariances of a fixed gain's innovations, full Q and R semidefinite",
+    "without true states, for a linear model on long stationary runs: a few passes",
+    "Odelson, Rajamani, Rawlings (2006)",
+    (GRADIENT, LINEAR),
+    ("hold_r", "full_q", "full_r"),
+)
 def als(task: Task) -> None:
     """Least squares of lagged covariances of innovations, with variances not below zero; three times over.
 
@@ -200,7 +203,7 @@ def als(task: Task) -> None:
         return np.column_stack(design), (measured - lagged(linear, gain, *noise.rest, lags)).ravel()
 
     wanted = [bool(task.options.get(option)) for option in ("full_q", "full_r")]
-    if any(wanted) and set(NOISE) <= set(task.start.model):
+    if any(wanted) and set(NOISE_OPTIONS) <= set(task.start.model):
         _matrices(task, *wanted)
     else:
         by_lags(task, "als", equations)
@@ -290,6 +293,14 @@ def _responses(linear: Stationary, gain: np.ndarray, lags: int, side: int, size:
     return responses
 
 
+@method(
+    "mehra",
+    "P H', R and Q in turn from lagged covariances of the innovations of a fixed gain",
+    "to compare: the ancestor of `als`, which scatters less",
+    "Mehra (1970)",
+    (GRADIENT, LINEAR),
+    ("hold_r",),
+)
 def mehra(task: Task) -> None:
     """The equations of `mehra_equations`, for numbers that are not below zero; three times over.
 
@@ -347,6 +358,14 @@ def mehra_equations(
     return np.concatenate([of_r, of_q]), np.concatenate([r.ravel(), np.ravel(ends) - lagged_sums(known)])
 
 
+@method(
+    "desroziers",
+    "R and one factor on Q from innovations before and after updates, repeated",
+    "for ensembles, without true states: some thirty passes",
+    "Desroziers, Berre, Chapnik, Poli (2005)",
+    (COVARIANCE, NOISE),
+    DIAGONAL,
+)
 def desroziers(task: Task) -> None:
     """Repeat until neither R nor a factor on Q changes.
 
@@ -393,3 +412,139 @@ def _moments(task: Task, choice: Choice) -> tuple[np.ndarray, float, float] | No
             totals[1].append(np.trace(s - r, axis1=1, axis2=2))
     means = np.concatenate(left).mean(axis=0), *(float(np.concatenate(values).mean()) for values in totals)
     return means if all(np.isfinite(mean).all() for mean in means) and means[2] > 0 else None
+
+
+@method(
+    "anderson",
+    "the inflation of an ensemble that its innovations imply, step by step, then its mean",
+    "for ensembles, without true states, if Q and R are known: one pass",
+    "Anderson (2007)",
+    (COVARIANCE, INFLATION),
+    ("hold_r",),
+)
+def anderson(task: Task) -> None:
+    """Follow the factor lambda on the members' variance from innovation to innovation; then take its mean root.
+
+        d ~ N(0, lambda p + R_jj),   p = (S_jj - R_jj) / lambda before,   lambda ~ N(l, s^2)
+        l <- the mode of lambda given d,   1/s^2 <- the curvature of the log density there
+
+    for one channel after the other. The next step has it. Q and R stay; a spread that is too small because Q is
+    shows here, too. It needs one pass of the filter, step by step.
+
+    Source: Anderson (2007), "An adaptive covariance inflation error correction algorithm for ensemble filters",
+    Tellus A 59, with a lambda for all states alike; Anderson (2009), Tellus A 61.
+    """
+    parameter, levels_of_runs, start = (
+        FILTER_PARAMETERS[INFLATION],
+        [],
+        1.0 + 1e-9,
+    )  # so that there is one to change
+    choice = task.start._replace(numbers={**task.start.numbers, INFLATION: start})
+    for i, (problem, data) in enumerate(zip(task.problems, task.data, strict=True)):
+        filter_, variances = choice.filter(problem), np.diag(task.model(choice, i).measurement_noise_cov)
+        for run in range(len(data.seeds)):
+            session, level, spread = Session(filter_), 1.0, DEVIATION
+            inputs, z = data.seen.inputs[run], data.seen.measurements[run]
+            session.start(data.filter_keys[run], z[0])
+            levels = []
+            for k in range(1, int(data.rows[run])):
+                session.set_parameter(INFLATION, level**0.5)
+                session.step(inputs[k - 1], z[k])
+                plain = (np.diag(session.innovation_cov) - variances) / level
+                for d, p, r in zip(session.innovation, plain, variances, strict=True):
+                    if d == d and d != 0.0 and p > 0.0:
+                        level, spread = updated(level, spread, d * d, p, r)
+                levels.append(level)
+            task.charge(1)
+            levels_of_runs += levels[int(SETTLED * len(levels)) :]
+    mean = float(np.clip(np.sqrt(levels_of_runs).mean(), parameter.low, parameter.high))
+    task.keep(task.start._replace(numbers={**task.start.numbers, INFLATION: mean}))
+
+
+def updated(level: float, spread: float, square: float, plain: float, noise: float) -> tuple[float, float]:
+    """Mode and deviation of lambda after an innovation with this square, by Newton's method with safe steps.
+
+    Args:
+        level: mean of lambda before.
+        spread: its standard deviation before.
+        square: d^2.
+        plain: variance p of what the members expect, without inflation.
+        noise: variance of the measurement.
+    """
+    at, curvature = level, 1.0 / spread**2
+    for _ in range(NEWTON):
+        total = at * plain + noise
+        slope = (level - at) / spread**2 + 0.5 * plain * (square - total) / total**2
+        # The expected curvature: always positive, so that each step climbs.
+        curvature = 1.0 / spread**2 + 0.5 * (plain / total) ** 2
+        at = max(at + slope / curvature, 0.25 * at)
+    return at, max(curvature**-0.5, LEAST_DEVIATION)
+
+
+def converged(name: str, numbers: dict[str, float]) -> Callable[[Task], None]:
+    """The method that runs an adaptive filter over each training run in turn, from the values of the last one.
+
+    What a run finds is the mean over its second half of the filter's R, and of its Q where it learns that. In the
+    end it is the mean over the second half of the runs.
+    """
+
+    def run(task: Task) -> None:
+        model = task.model(task.start)
+        q, r = model.process_noise_cov, model.measurement_noise_cov
+        estimates: list[tuple[np.ndarray, np.ndarray]] = []
+        for i, (_, data) in enumerate(zip(task.problems, task.data, strict=True)):
+            for index in range(len(data.seeds)):
+                try:
+                    model = task.model(task.start, i).replace(process_noise_cov=q, measurement_noise_cov=r)
+                    q, r = _means(make_filter(name, model, **numbers), data.one(index))
+                except ValueError:  # a belief that is none
+                    raise ValueError(
+                        f"method {name!r} failed: its Q or R is no covariance after {len(estimates)} runs"
+                    ) from None
+                task.charge(1)
+                estimates.append((q, r))
+                half = estimates[len(estimates) // 2 :]
+                means = (np.mean([estimate[side] for estimate in half], axis=0) for side in (0, 1))
+                task.keep(with_covariances(task.start, *_diagonals(task, *means)))
+
+    return run
+
+
+def _means(filter_, data) -> tuple[np.ndarray, np.ndarray]:
+    """Mean Q (n, n) and R (m, m) over the second half of a run."""
+    belief, qs, rs = filter_.init(), [], []
+    for k in range(data.measurements.shape[1]):
+        if k:
+            belief = filter_.predict(belief, data.inputs[0, k - 1])
+        belief, _ = filter_.update(belief, data.measurements[0, k])
+        if 2 * k >= data.measurements.shape[1]:
+            rs.append(filter_.estimated_noise(belief))
+            learns = hasattr(filter_, "estimated_process_noise")
+            qs.append(filter_.estimated_process_noise(belief) if learns else filter_.model.process_noise_cov)
+    return np.mean(qs, axis=0), np.mean(rs, axis=0)
+
+
+def _diagonals(task: Task, q: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Q and R without correlations, unless these are tuned."""
+    q = q if task.options.get("full_q") or not task.start.model else np.diag(np.diag(q))
+    if task.options.get("hold_r"):
+        return q, None
+    return q, r if task.options.get("full_r") else np.diag(np.diag(r))
+
+
+method(
+    "sage-husa",
+    "Sage and Husa's adaptive filter over all runs, then its mean Q and R",
+    "to compare: one pass, seldom near the optimum",
+    "Sage, Husa (1969)",
+    (GRADIENT, NOISE),
+    MATRICES,
+)(converged("sage-husa", {"forgetting_factor": FORGETTING, "process_forgetting_factor": FORGETTING}))
+method(
+    "vb",
+    "the variational Bayesian filter over all runs, then its mean R; Q stays",
+    "without true states, if Q is known and R is not: one pass",
+    "Sarkka, Nummenmaa (2009)",
+    (GRADIENT, NOISE),
+    MATRICES,
+)(converged("vb", {"forgetting_factor": FORGETTING}))
