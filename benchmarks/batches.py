@@ -23,9 +23,9 @@ from thruster_env.graphs.loops import Loops
 from thruster_env.thruster.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.thruster.plant import Plant
 from tuning.evaluation.evaluate import evaluate
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import Data, training_seeds
 from tuning.search.space import oracle_choice
-from tuning.thruster.scenario import find_scenario
 
 SEEDS, ENSEMBLE_SIZE = 64, 50
 EVALUATE_GOAL, RUN_GOAL = 2.1, 1.8  # of the floor's time

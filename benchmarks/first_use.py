@@ -31,7 +31,7 @@ env.step(env.action_space.high)
 """
 TUNING_IMPORTS = """
 from tuning.evaluation.evaluate import evaluate
-from tuning.thruster.scenario import find_scenario
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import training_seeds
 from tuning.search.space import oracle_choice
 """

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.timing import Measure, Row, alone, side_by_side
+from tuning.plants.thruster import find_scenario
 from tuning.policies.setup import TrainingConfiguration
 from tuning.problems.data import training_seeds
-from tuning.thruster.scenario import find_scenario
 
 if TYPE_CHECKING:
     from tuning.policies.setup import TrainingConfiguration

@@ -20,13 +20,13 @@ from filters.engine.batch import run
 from tuning.evaluation import sizes
 from tuning.experiments.lorenz96 import STEPS, problem
 from tuning.likelihood import objective
+from tuning.plants.thruster import Scenario, find_scenario
 from tuning.problems import data as in_parts
 from tuning.search import parameters, trials
 from tuning.search import plan as plans
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.storage import quiet_optuna
 from tuning.search.study import StudyResult, open_study, run_study
-from tuning.thruster.scenario import Scenario, find_scenario
 
 TRIALS = 200
 SIZES, PEER_STEPS = (20, 200), 200  # FilterPy's time a step is a straight line over N
@@ -40,7 +40,7 @@ FILTERS_AND_SCORES = {  # what runs filters or rates their runs, where a study c
 WARM_UP = 25  # trials, with the first search of the likeliest Q and R
 IN_A_PROCESS = """
 from tuning.search.plan import Plan
-from tuning.thruster.scenario import find_scenario
+from tuning.plants.thruster import find_scenario
 from tuning.search.storage import quiet_optuna
 from tuning.search.study import open_study, run_study
 quiet_optuna()

@@ -5,11 +5,11 @@ import shutil
 import gymnasium as gym
 import pytest
 
+from tuning.plants.thruster import find_scenario
 from tuning.policies.environments import make_environments
 from tuning.policies.learn import train
 from tuning.policies.saved import load, read_configuration
 from tuning.policies.setup import make_configuration
-from tuning.thruster.scenario import find_scenario
 
 COPIES, LIMIT = 4, 30
 SMALL = {

@@ -3,9 +3,9 @@
 import numpy as np
 
 from tests.models import wide_model
+from tuning.plants.thruster import find_scenario
 from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem
-from tuning.thruster.scenario import find_scenario
 
 UNITS = {"states": ["p", ("q", "q", "m"), "r"], "measurements": [("one", "a", "N"), "b"]}
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from filters.tuned_file import OLD_FORMAT, sealed
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
+from tuning.plants.thruster import Scenario, find_scenario
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import StudyResult
-from tuning.thruster.scenario import Scenario, find_scenario
 
 
 def write_untuned(

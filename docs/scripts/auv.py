@@ -22,8 +22,8 @@ from thruster_env.core.text_tables import markdown_table
 from thruster_env.env.env import ObserveStateVector
 from thruster_env.model import rotations
 from thruster_env.model.turns import difference
-from tuning.auv.scenario import Scenario, find_scenario
 from tuning.evaluation.compare import Contender, Row, contender
+from tuning.plants.auv import Scenario, find_scenario
 from tuning.problems.problem import Problem
 from tuning.search.space import Choice
 

@@ -21,6 +21,7 @@ from thruster_env.core.text_tables import markdown_table
 from tuning.api.train_estimator import FOLDER, train_estimator
 from tuning.evaluation.compare import Contender, Row, contender
 from tuning.evaluation.evaluate import evaluate
+from tuning.plants.thruster import Scenario, find_scenario
 from tuning.problems.check import data_of
 from tuning.problems.data import held_out_seeds
 from tuning.problems.problem import Problem
@@ -28,7 +29,6 @@ from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.storage import quiet_optuna
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import Scenario, find_scenario
 
 TRIALS = 50
 TRAINED_ON = ("mismatch", "outliers")
@@ -78,7 +78,7 @@ def network_elsewhere() -> str:
 
 def network_further() -> str:
     """Scores over the tuned EKF's on held-out runs, on runs twice as long, and with four times the R."""
-    from tuning.learning.training import HELD_OUT, LONGER, NOISIER, standings
+    from tuning.learning import HELD_OUT, LONGER, NOISIER, standings
 
     rows = []
     for name in TRAINED_ON:

@@ -19,13 +19,13 @@ from thruster_env.core.text_tables import markdown_table
 from thruster_env.model.simulate import simulate
 from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
 from tuning.experiments import mixed_linear
+from tuning.plants.thruster import SCENARIOS, find_scenario
 from tuning.problems.data import held_out_seeds
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Problem
 from tuning.reporting.leaderboard import unless_blank
 from tuning.search.parameters import KALMAN_SIZES, ensemble_sizes_of
-from tuning.thruster.scenario import SCENARIOS, find_scenario
 
 SEEDS = 200
 REFERENCE_SEEDS, REFERENCE_SIZE = 20, 100_000

@@ -17,6 +17,7 @@ from thruster_env.logs.log import Log
 from thruster_env.model.affine import affine_model
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.experiments.benchmark import run_in_memory
+from tuning.plants.thruster import find_scenario
 from tuning.problems.log_parts import Block, parts_of
 from tuning.problems.log_problem import LogProblem
 from tuning.search.measures import Measured, Runs, over, signed_rank
@@ -24,7 +25,6 @@ from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS,
 from tuning.search.space import Choice, choice_of
 from tuning.search.trials import measure
 from tuning.search.validation import Choosing
-from tuning.thruster.scenario import find_scenario
 
 
 def held_out(choice: Choice, plan: Plan) -> Evaluation:

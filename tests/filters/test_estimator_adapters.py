@@ -8,8 +8,8 @@ from filters.estimators.libraries import FilterPyEstimator, StoneSoupEstimator
 from tests.filters.test_gaussian_peers import stone_soup_models
 from tests.models import random_affine, simulated
 from tuning.evaluation.compare import compare, contender
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds
-from tuning.thruster.scenario import find_scenario
 
 UNSCENTED = "filters.estimators.libraries:unscented"
 

@@ -17,10 +17,10 @@ from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import check_keepable
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds
 from tuning.problems.problem import Parameter
 from tuning.search.space import choice_of, distributions
-from tuning.thruster.scenario import find_scenario
 
 NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 4)
 HERE = "tests.filters.test_estimators"

@@ -17,8 +17,8 @@ from filters.learned.filters import LEARNED, GainNetwork, KalmanNet, read, write
 from filters.wrappers.envs import EstimateStates
 from tests.models import KEY, pendulum, plane_model, random_affine, simulated
 from thruster_env.model.affine import affine_model
+from tuning.plants.thruster import find_scenario
 from tuning.search.space import Choice
-from tuning.thruster.scenario import find_scenario
 
 GAIN = np.array([[0.3, 0.1], [-0.05, 0.2]])
 RUNS, STEPS = 3, 6

@@ -9,8 +9,8 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import training_seeds
-from tuning.thruster.scenario import find_scenario
 
 RNG = np.random.default_rng(0)
 

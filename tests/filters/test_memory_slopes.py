@@ -19,12 +19,12 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.programs import Place, values_of
 from thruster_env.model.traced import Traced
-from tuning.auv.scenario import find_scenario as find_vehicle
 from tuning.cli.templates.filter import Template
 from tuning.likelihood.gradient import tune_by_gradient
+from tuning.plants.auv import find_scenario as find_vehicle
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import training_seeds
 from tuning.search.space import untuned_choice
-from tuning.thruster.scenario import find_scenario
 
 KEEPING = ("ekf-robust", "sage-husa", "vb")  # more than mean and covariance
 NAMES = ("iekf", "ukf", "ckf", *KEEPING)

@@ -7,8 +7,8 @@ from scipy.stats import chi2
 from filters import make_filter, run
 from filters.consistency.nees import normalized_squares
 from tuning.evaluation.evaluate import evaluate
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import FIRST_SCORED_STEP, held_out_seeds
-from tuning.thruster.scenario import find_scenario
 
 RUNS = 200
 

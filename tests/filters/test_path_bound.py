@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters.bounds import path_bound, posterior_bound, riccati_covariances
-from tuning.thruster.scenario import find_scenario
+from tuning.plants.thruster import find_scenario
 
 pytestmark = pytest.mark.usefixtures("as_python")
 

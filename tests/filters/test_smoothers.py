@@ -21,8 +21,8 @@ from tests.models import KEY, held_voltages, pendulum, scalar_model, simulated, 
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds
-from tuning.thruster.scenario import find_scenario
 
 KEYS = np.array([KEY])
 with_gaps = partial(simulated, level=1.0, missing=0.25)

@@ -19,8 +19,8 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.core.sources import is_array
 from thruster_env.core.streams import filter_keys
 from tuning.evaluation.evaluate import evaluate
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds
-from tuning.thruster.scenario import find_scenario
 
 SIZE = 9
 SQUARE_ROOTS = EnsembleTransformFilter, SerialSquareRootFilter

@@ -11,13 +11,13 @@ from thruster_env.thruster.model import thruster_model
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import checked_first_scored_step
 from tuning.search.among_types import RESCALED
 from tuning.search.parameters import PRIOR_FACTORS
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import find_scenario
 
 STARTUP, NOMINAL = find_scenario("startup"), find_scenario("nominal")
 PLAN = Plan("ekf", (STARTUP,))

@@ -6,8 +6,8 @@ from filters.consistency.report import HEAVY, STUCK, longest_stretches, sentence
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.evaluate import check_consistency
+from tuning.plants.thruster import find_scenario
 from tuning.search.space import oracle_choice
-from tuning.thruster.scenario import find_scenario
 
 
 def _said(problem, choice, data):

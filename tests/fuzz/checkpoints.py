@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tuning.plants.thruster import find_scenario
 from tuning.policies.saved import configuration_from_json
 from tuning.policies.setup import TrainingConfiguration, make_configuration
-from tuning.thruster.scenario import find_scenario
 
 KILLS = 20
 COPIES, STEPS = 4, 8192

@@ -22,13 +22,13 @@ from filters.tuned_file import sealed
 from tests.tuned_files import write_untuned
 from thruster_env.logs.recorders.registry import fields, read
 from tuning.evaluation.tuned import read_tuned
+from tuning.plants.thruster import find_scenario
 from tuning.policies.environments import make_environments
 from tuning.policies.saved import configuration_from_json
 from tuning.policies.setup import make_configuration
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study
-from tuning.thruster.scenario import find_scenario
 
 TRAP = "tests_fuzz_trap"  # a module that nothing may import, with a function that nothing may call
 VALUES = (

@@ -15,7 +15,7 @@ from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
 from tuning.likelihood.identify import identify
 from tuning.likelihood.result import Identification
-from tuning.thruster.logs import ThrusterFamily
+from tuning.plants.thruster_logs import ThrusterFamily
 
 SENSORS = ("thrust", "speed")
 WIDE = 6.0  # standard errors: nobody meets that by chance in a year of attacks

@@ -17,9 +17,9 @@ from filters.engine.session import Session
 from tests.models import pendulum, scalar_model, small, wide_model
 from tests.thruster_env.thruster.test_robustness import AMPLIFIER, FLOW, REFERENCE, SENSORS, UNCERTAINTY
 from tuning.evaluation.evaluate import evaluate
+from tuning.plants.thruster import SCENARIOS
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
-from tuning.thruster.scenario import SCENARIOS
 
 pytestmark = pytest.mark.usefixtures("as_python")
 

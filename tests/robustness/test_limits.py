@@ -14,10 +14,10 @@ from thruster_env.core.checks import as_floats, short_repr, vector
 from thruster_env.thruster.parameters import TUNNEL
 from tuning.cli.simulate import command
 from tuning.experiments.thruster_papers import compare
+from tuning.plants.thruster import SCENARIOS
 from tuning.policies.saved import configuration_from_json
 from tuning.problems.data import held_out_seeds, training_seeds
 from tuning.problems.find import read_scenario
-from tuning.thruster.scenario import SCENARIOS
 
 pytestmark = pytest.mark.usefixtures("as_python")
 HUGE = 10**12

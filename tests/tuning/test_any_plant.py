@@ -18,6 +18,7 @@ from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_g
 from tuning.evaluation.held_out import Comparison, summary
 from tuning.evaluation.sizes import ensemble_sizes
 from tuning.evaluation.worth import tuning_effect
+from tuning.plants.thruster import find_scenario
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import score_label
 from tuning.reporting import leaderboard
@@ -30,7 +31,6 @@ from tuning.reporting.tables import choice_table
 from tuning.search.objectives import find_objective, nis_ratio
 from tuning.search.plan import Plan, check_objectives
 from tuning.search.space import oracle_choice, untuned_choice
-from tuning.thruster.scenario import find_scenario
 
 SEEDS = range(8)
 

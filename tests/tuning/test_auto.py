@@ -16,6 +16,7 @@ from tuning.api.tune import warn_of_few_trials
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
+from tuning.plants.thruster import find_scenario
 from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem, RunsProblem
 from tuning.reporting.sections import trials_of_type
@@ -45,7 +46,6 @@ from tuning.search.trials import (
     over_budget,
     violation,
 )
-from tuning.thruster.scenario import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 PLAN = Plan("auto", (MISMATCH,), budget=1.0)

@@ -8,7 +8,7 @@ import pytest
 from docs.scripts import main
 from docs.scripts.auv import EKF, FILTERS, MOTION, NAVIGATION, TABLES, about, restless, rows_of, small
 from filters.consistency.nees import Interval
-from tuning.auv.scenario import find_scenario
+from tuning.plants.auv import find_scenario
 
 PAGE = (Path(__file__).parents[2] / "docs" / "appendix" / "auv.md").read_text()
 BAND = (0.8, 1.25)  # of the mean NIS over what is right, as a study holds it

@@ -18,13 +18,13 @@ from tuning.evaluation.compare import Leaderboard, Row, compare, contender, size
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import write_tuned
+from tuning.plants.thruster import find_scenario
 from tuning.problems.assumed import default_belief
 from tuning.problems.data import held_out_seeds
 from tuning.problems.model_problem import ModelProblem
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import StudyResult
-from tuning.thruster.scenario import find_scenario
 
 EVALUATION = Evaluation(*[None] * len(Evaluation._fields))
 NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 12)

@@ -24,9 +24,9 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.core.files import save_figure
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds
 from tuning.reporting.search_figures import draw_consistency
-from tuning.thruster.scenario import find_scenario
 
 
 def scalar(**changes):

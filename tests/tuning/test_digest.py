@@ -14,7 +14,7 @@ from tests.small_problems import pair
 from tests.tuned_files import rewrite, write_untuned
 from tuning.cli.templates import env as template
 from tuning.evaluation.tuned import read_tuned
-from tuning.problems.digest import digest_of, is_older
+from tuning.problems.check import digest_of, is_older
 from tuning.problems.model_problem import ModelProblem, RunsProblem
 from tuning.problems.problem import Parameter
 from tuning.search.plan import Plan

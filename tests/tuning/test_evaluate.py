@@ -11,10 +11,10 @@ from thruster_env.model import simulate
 from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
 from tuning.evaluation.held_out import summary
 from tuning.evaluation.runs import _means_over_steps
+from tuning.plants.thruster import find_scenario
 from tuning.problems import data as in_parts
 from tuning.problems.data import held_out_seeds
 from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
-from tuning.thruster.scenario import find_scenario
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,12 @@ import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.core.streams import episode_keys
 from thruster_env.thruster.controllers import PIController
 from thruster_env.thruster.plant import make_plant
+from tuning.plants.thruster import ClosedLoop, find_scenario, voltages_of
 from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, MultiSine, Steps
-from tuning.thruster.scenario import ClosedLoop, find_scenario, voltages_of
 
 PLANT = make_plant()
 KEYS = episode_keys(range(40))
-OF_ANY_PLANT = [kind for kind in EXCITATIONS.effects.values() if not kind.__module__.startswith("tuning.auv")]
+OF_ANY_PLANT = [kind for kind in EXCITATIONS.effects.values() if kind.__module__ != "tuning.plants.auv"]
 every_excitation = pytest.mark.parametrize("kind", OF_ANY_PLANT)
 
 

@@ -5,10 +5,10 @@ import pytest
 
 from tuning.evaluation import sizes
 from tuning.evaluation.sizes import FEW, SIZE_TOLERANCE, ensemble_sizes, sufficient_size
+from tuning.plants.thruster import find_scenario
 from tuning.search import plan as plans
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
-from tuning.thruster.scenario import find_scenario
 
 NOMINAL = find_scenario("nominal")
 

@@ -14,9 +14,9 @@ from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.api.report import report
 from tuning.api.verify import verify
 from tuning.evaluation.tuned import read_tuned
+from tuning.plants.thruster import find_scenario
 from tuning.policies.saved import configuration_from_json
 from tuning.policies.setup import in_scenario, make_configuration
-from tuning.thruster.scenario import find_scenario
 
 TRAP = f"{__name__}:trap"
 SPRUNG = []

@@ -12,11 +12,11 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
+from tuning.plants.thruster import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import finished_trials, open_study, run_trials
 from tuning.search.workers import orders_of
-from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 

@@ -14,13 +14,13 @@ from filters.tuned_file import read_tuned_file, sealed
 from tuning.api.verify import verify
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
+from tuning.plants.thruster import find_scenario
 from tuning.reporting.tables import choice_table
 from tuning.search.among_types import RESCALED
 from tuning.search.parameters import correlation_slopes, correlations_of, full_covariance
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of, trial_parameters, untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 PLAN = Plan("ekf", (MISMATCH,), full_q=True)

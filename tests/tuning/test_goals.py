@@ -11,6 +11,7 @@ from tuning.api.tune import run_tuning
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import goal_of, tune_by_gradient
+from tuning.plants.thruster import find_scenario
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Parameter
 from tuning.search.among_types import BY_GRADIENT, MAXIMUM_LIKELIHOOD_AFTER
@@ -18,7 +19,6 @@ from tuning.search.objectives import LIKELIHOOD, OBJECTIVES
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import find_scenario
 
 NAMES = "startup", "nominal", "published_noise", "mismatch"
 STARTUP, NOMINAL, NOISY, MISMATCH = map(find_scenario, NAMES)

@@ -21,10 +21,10 @@ from tuning.likelihood.identifiability import (
     sentences,
     too_many,
 )
+from tuning.plants.thruster import find_scenario
 from tuning.reporting.tuning_report import as_json, report
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
-from tuning.thruster.scenario import find_scenario
 
 BOUNDS = np.log([(1e-4, 1e4)] * 3)
 TRUE = np.log([0.3, 0.2, 0.5])  # Q11, Q22, R

@@ -15,10 +15,10 @@ from thruster_env.thruster.model import Recorder, logged_model
 from thruster_env.thruster.plant import make_plant
 from tuning.likelihood.identify import identify, validate
 from tuning.likelihood.recorded import starts_of
+from tuning.plants.thruster_logs import ThrusterFamily
 from tuning.problems.data import Data
 from tuning.problems.excitation import held_levels
 from tuning.problems.problem import Parameter
-from tuning.thruster.logs import ThrusterFamily
 
 OWN = ("motor_damping", "voltage_gain", "lift_coefficient")
 NOISE = {"Q11": 1.0, "Q22": 4e-4, "R11": 0.25, "R22": 4.0}

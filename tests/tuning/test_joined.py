@@ -3,9 +3,9 @@
 import optuna
 import pytest
 
+from tuning.plants.thruster import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.study import open_study
-from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 

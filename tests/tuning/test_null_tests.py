@@ -13,8 +13,8 @@ from thruster_env.thruster.plant import make_plant
 from tuning.likelihood.identify import identify
 from tuning.likelihood.objective import kept_variance, lost_information
 from tuning.likelihood.result import NullTest
+from tuning.plants.thruster_logs import ThrusterFamily
 from tuning.problems.problem import Parameter
-from tuning.thruster.logs import ThrusterFamily
 
 EFFECTS = (
     "lag_speed",

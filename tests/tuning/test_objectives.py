@@ -10,6 +10,7 @@ from tests.linear_problem import LinearProblem
 from tuning.evaluation.evaluate import evaluate, variance_ratios
 from tuning.evaluation.runs import RunMetrics
 from tuning.experiments.benchmark import run_in_memory
+from tuning.plants.thruster import find_scenario
 from tuning.reporting.page import of_history
 from tuning.reporting.search_figures import draw_history
 from tuning.reporting.sections import of_front, reported_about
@@ -21,7 +22,6 @@ from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
 from tuning.search.trials import measure
-from tuning.thruster.scenario import find_scenario
 
 PROBLEM = LinearProblem(scale=(0.2, np.inf, 0.4))
 DATA = PROBLEM.data(range(8))

@@ -5,11 +5,11 @@ import types
 import optuna
 import pytest
 
+from tuning.plants.thruster import find_scenario
 from tuning.search import storage as database
 from tuning.search.plan import Plan
 from tuning.search.storage import PATIENCE_SECONDS, open_storage
 from tuning.search.study import open_study, run_trials
-from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 WRITES = ("set_trial_user_attr", "set_trial_state_values", "set_study_user_attr", "record_heartbeat")

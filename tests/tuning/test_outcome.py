@@ -6,12 +6,12 @@ import pytest
 from filters.consistency.nees import Interval
 from tuning.evaluation.baselines import SCALED
 from tuning.evaluation.sizes import SizeRow, sufficient_size
+from tuning.plants.thruster import find_scenario
 from tuning.search.among_types import BASELINE
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import BEST, open_study, run_study
 from tuning.search.trials import CONSISTENCY, best_trial, is_consistent
-from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),))  # whose untuned filter has a mean NIS of 0.2
 

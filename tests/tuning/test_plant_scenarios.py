@@ -20,11 +20,12 @@ from tests.tuned_files import write_untuned
 from thruster_env.core.streams import episode_keys
 from thruster_env.thruster.model import model_of_plant
 from tuning.api.verify import verify
-from tuning.auv.scenario import SAILING
-from tuning.auv.scenario import SCENARIOS as VEHICLES
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
+from tuning.plants.auv import SAILING
+from tuning.plants.auv import SCENARIOS as VEHICLES
+from tuning.plants.thruster import SCENARIOS, Scenario, is_stable
 from tuning.problems import find
 from tuning.problems.check import checked_problem
 from tuning.problems.data import held_out_seeds, training_seeds
@@ -33,7 +34,6 @@ from tuning.problems.scenario import print_scales
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import SCENARIOS, Scenario, is_stable
 
 ALL = {**SCENARIOS, **VEHICLES, **CARTS}
 SHORT = {"steps": 60, "first_scored_step": 10}

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tuning.evaluation.compare import compare, contender
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds
-from tuning.thruster.scenario import find_scenario
 
 
 def ranked(name, contenders, seeds=24):

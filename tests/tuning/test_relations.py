@@ -6,6 +6,7 @@ import pytest
 from tests.tuning.methods.problems import linear, task_of
 from tuning.likelihood.gradient import goal_of, tune_by_gradient
 from tuning.methods.registry import find_method
+from tuning.plants.thruster import find_scenario
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE
 from tuning.search.parameters import model_parameters, relation_of
 from tuning.search.plan import Plan
@@ -13,7 +14,6 @@ from tuning.search.space import parameters_of
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_study
 from tuning.search.workers import run_in_workers
-from tuning.thruster.scenario import find_scenario
 
 TIED = ("Q22 = 4 Q11", "R22 = 0.1", "Q11 = 1e-3..10")
 

@@ -13,6 +13,7 @@ from tuning.api.report import report as write_report
 from tuning.cli.main import main
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
+from tuning.plants.thruster import find_scenario
 from tuning.reporting.page import Code, Picture, Section, Table, Words, html_page, markdown_page
 from tuning.reporting.search_figures import FEWEST_TRIALS, counted_trials, early_trials, importances
 from tuning.reporting.sections import advice
@@ -20,7 +21,6 @@ from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import find_scenario
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
 VOID = {"meta", "img", "br", "link", "input", "hr"}

@@ -19,13 +19,13 @@ from tuning.evaluation.compare import contender
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds, training_seeds
 from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.space import oracle_choice, untuned_choice
-from tuning.thruster.scenario import find_scenario
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
 

@@ -12,6 +12,7 @@ from tests.slow import slow_but
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
+from tuning.plants.thruster import find_scenario
 from tuning.search import trials
 from tuning.search.among_types import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED
 from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
@@ -19,7 +20,6 @@ from tuning.search.plan import Plan
 from tuning.search.space import choice_of, distributions, oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
 from tuning.search.trials import BLOCK, SAMPLERS, best_trial, box, enqueue_new, make_sampler, measure, violation
-from tuning.thruster.scenario import find_scenario
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))
 PLAN = Plan("ekf", (MISMATCH,))

@@ -7,10 +7,10 @@ from filters.consistency.nees import Interval
 from tuning.evaluation import sizes
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, left_out, sufficient_size
+from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds, size_seeds, training_seeds
 from tuning.search.plan import HELD_OUT_SEEDS, SIZE_SEEDS, TRAINING_SEEDS, Plan
 from tuning.search.space import untuned_choice
-from tuning.thruster.scenario import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 

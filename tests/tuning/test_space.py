@@ -3,11 +3,11 @@ import pytest
 
 from filters.registry import FILTERS
 from tuning.experiments import lorenz63
+from tuning.plants.thruster import find_scenario
 from tuning.search.parameters import size_ladder
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, distributions, parameters_of, trial_parameters, untuned_choice
 from tuning.search.study import open_study
-from tuning.thruster.scenario import find_scenario
 
 NOMINAL = find_scenario("nominal")
 

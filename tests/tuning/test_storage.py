@@ -12,13 +12,13 @@ from optuna.trial import TrialState
 from rich.console import Console
 
 from tuning.api.tune import run_tuning
+from tuning.plants.thruster import find_scenario
 from tuning.problems.find import find_problem
 from tuning.search import storage as database
 from tuning.search.plan import Plan
 from tuning.search.space import distributions
 from tuning.search.storage import PROCESS, RETRY_OF, open_storage, retry_once
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 

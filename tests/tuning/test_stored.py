@@ -16,9 +16,9 @@ from tuning.evaluation.held_out import evaluate_held_out, sizes_as_data, stored_
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.tuned import metrics, read_tuned
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
+from tuning.plants.thruster import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
-from tuning.thruster.scenario import find_scenario
 
 NOMINAL = find_scenario("nominal")
 

@@ -11,11 +11,11 @@ from optuna.trial import TrialState
 from filters.tuned_file import sealed
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
+from tuning.plants.thruster import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.space import parameters_of, untuned_choice
 from tuning.search.storage import PROCESS, RETRY_OF, open_storage
 from tuning.search.study import finished_trials, open_study, run_study
-from tuning.thruster.scenario import find_scenario
 
 SCENARIO = find_scenario("mismatch")
 PLAN = Plan("ekf", (SCENARIO,))
@@ -139,7 +139,7 @@ def test_a_killed_process_loses_its_running_trial_only(tmp_path):
     path = tmp_path / "j"
     program = (
         "import optuna; optuna.logging.set_verbosity(optuna.logging.WARNING)\n"
-        "from tuning.thruster.scenario import find_scenario\n"
+        "from tuning.plants.thruster import find_scenario\n"
         "from tuning.search.storage import open_storage\n"
         "from tuning.search.plan import Plan\n"
         "from tuning.search.study import open_study, run_study\n"

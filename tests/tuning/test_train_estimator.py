@@ -15,7 +15,7 @@ from filters.learned.filters import LEARNED, read
 from tests.models import plane_model
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.evaluate import values_of
-from tuning.learning.training import (
+from tuning.learning import (
     HELD_OUT,
     LONGER,
     NOISIER,
@@ -29,9 +29,9 @@ from tuning.learning.training import (
     twice_as_long,
     with_larger_noise,
 )
+from tuning.plants.thruster import find_scenario
 from tuning.problems.check import data_of
 from tuning.problems.model_problem import ModelProblem
-from tuning.thruster.scenario import find_scenario
 
 MODEL = plane_model()
 

@@ -25,11 +25,11 @@ from tuning.api.verify import verify
 from tuning.evaluation.tuned import read_tuned
 from tuning.logs.problem import log_problem, problems_in
 from tuning.logs.read import as_tuned
+from tuning.plants.thruster import SCENARIOS, find_scenario
 from tuning.policies.setup import make_configuration
 from tuning.problems.find import scenario_of
 from tuning.reporting.subject import find_subject
 from tuning.search.plan import Plan
-from tuning.thruster.scenario import SCENARIOS, find_scenario
 
 TOML = 'base = "nominal"\nscale = [1.0, 0.05]\nsteps = 60\nflow = [{name = "gusts", std = 0.5}]\n'
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from docs.scripts.tuning import LIFT, RIGHT, SLOPES, UNKNOWNS, bought, lifted, plans
-from tuning.thruster.scenario import find_scenario
+from tuning.plants.thruster import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 

@@ -25,13 +25,13 @@ from tuning.evaluation.baselines import SCALED
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_choice, read_tuned, write_tuned
 from tuning.likelihood.gradient import tune_by_gradient
+from tuning.plants.thruster import find_scenario
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, find_same
 from tuning.search.among_types import noise_by_gradient
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import find_scenario
 
 
 @pytest.fixture(scope="module")

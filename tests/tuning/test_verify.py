@@ -12,9 +12,9 @@ from tuning.api.verify import Difference, verify
 from tuning.cli.main import main
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
+from tuning.plants.thruster import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"), find_scenario("nominal")))
 

@@ -17,13 +17,13 @@ import typer
 from optuna.trial import TrialState
 
 from tuning.cli.app import app
+from tuning.plants.thruster import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.space import distributions
 from tuning.search.storage import PROCESS, RETRY_OF, open_storage
 from tuning.search.study import finished_trials, open_study
 from tuning.search.trials import make_sampler
 from tuning.search.workers import run_in_workers
-from tuning.thruster.scenario import find_scenario
 
 PLAN = Plan("enkf", (find_scenario("mismatch"),), prune=False)
 WORKERS = 3

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from filters.learned.estimator import LearnedEstimator
-    from tuning.learning.training import Check, Standing
+    from tuning.learning import Check, Standing
 
 FOLDER = Path("out") / "estimators"
 MOST = 1_000_000
@@ -90,7 +90,7 @@ class EstimatorTraining(Result):
     @property
     def best_other(self) -> Standing:
         """The filter with the lowest held-out score, without the oracle, which knows the plant's Q and R."""
-        from tuning.learning.training import HELD_OUT
+        from tuning.learning import HELD_OUT
 
         candidates = (standing for standing in self.standings[:-1] if not standing.label.endswith(f" {ORACLE}"))
         return min(candidates, key=lambda standing: standing.evaluations[HELD_OUT].score.value)
@@ -115,7 +115,7 @@ class EstimatorTraining(Result):
 
     def tables(self) -> list[Table | str]:
         """Held-out scores, also on longer and noisier runs, whether training paid, and the file."""
-        from tuning.learning.training import HELD_OUT, LONGER, NOISIER
+        from tuning.learning import HELD_OUT, LONGER, NOISIER
 
         first, rows = self.standings[0], []
         for standing in self.standings:
@@ -154,7 +154,7 @@ class EstimatorTraining(Result):
 
     def as_dict(self) -> dict[str, Any]:
         """All results as plain data, as in `thruster train-estimator --json`."""
-        from tuning.learning.training import HELD_OUT
+        from tuning.learning import HELD_OUT
 
         first = self.standings[0]
         rows = []
@@ -175,7 +175,7 @@ class EstimatorTraining(Result):
 
     def to_frame(self) -> pandas.DataFrame:
         """A row for each filter: scores on held-out, longer and noisier runs, with their ratios to the first."""
-        from tuning.learning.training import HELD_OUT, LONGER, NOISIER
+        from tuning.learning import HELD_OUT, LONGER, NOISIER
 
         rows = []
         for standing in self.as_dict()["standings"]:
@@ -191,7 +191,7 @@ class EstimatorTraining(Result):
 
     def plot_training(self) -> Figure:
         """Validation score over updates, beside the held-out score of the first filter."""
-        from tuning.learning.training import HELD_OUT
+        from tuning.learning import HELD_OUT
 
         figure, (axis,) = panels(1, 1, (6.0, 3.6))
         steps, scores = [check.step for check in self.checks], [check.score for check in self.checks]
@@ -275,7 +275,7 @@ def train_estimator(
     """
     check_installed()
     from filters.learned.filters import LEARNED  # torch takes seconds to import
-    from tuning.learning.training import Settings, new_estimator, standings, starting_filter
+    from tuning.learning import Settings, new_estimator, standings, starting_filter
 
     one_of("an estimator", kind, tuple(LEARNED))
     chosen = problem_of(problem, preset)
@@ -327,7 +327,7 @@ def _trained(
 ) -> list[Check]:
     """The checks of a training, of which the best one is always on disk."""
     from filters.learned.filters import write_estimator
-    from tuning.learning.training import train
+    from tuning.learning import train
 
     validation = data_of(problem, problem.validation_seeds(seed, VALIDATION_SEEDS))
     origin = {"problem": problem.name, "digest": problem.digest, "seed": seed, "runs": len(data.seeds)}

@@ -25,6 +25,7 @@ from tuning.api.tune import run_tuning
 from tuning.cli.output import progress_console
 from tuning.evaluation.baselines import NOISE, ORACLE, TUNED, baselines, same_filter
 from tuning.evaluation.evaluate import score_ratio
+from tuning.plants.thruster import find_scenario
 from tuning.problems.problem import score_label
 from tuning.reporting.leaderboard import above_bound, consistency_cells
 from tuning.reporting.search_figures import draw_comparison, draw_history
@@ -32,7 +33,6 @@ from tuning.reporting.time_figures import estimates_figure
 from tuning.reporting.tuning_report import as_json
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import AUTO
-from tuning.thruster.scenario import find_scenario
 
 FILTER, SCENARIO = "ekf", "outliers"  # where tuning Q and R is worth most: docs/tuning.md
 BUDGET = 1.0  # us/step of the filters among which the second study chooses

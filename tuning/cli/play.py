@@ -38,10 +38,10 @@ from tuning.api.markers import (
 from tuning.api.progress import bar
 from tuning.api.result import Printed
 from tuning.cli.output import check_targets, progress_console, warn_beyond
+from tuning.plants.thruster import voltages_of
 from tuning.problems.data import held_out_seeds
 from tuning.problems.excitation import EXCITATIONS
 from tuning.problems.scenario import excitation_of
-from tuning.thruster.scenario import voltages_of
 
 STEPS = 500
 

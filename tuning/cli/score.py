@@ -17,13 +17,13 @@ from tuning.api.markers import INPUT, RUNS, Argument, Option, PresetOption, Seed
 from tuning.api.result import Printed
 from tuning.cli.output import progress_console
 from tuning.cli.train import LEARNABLE
+from tuning.plants.thruster_logs import of_preset
 from tuning.policies.algorithms import check_installed, find_observation_set
 from tuning.policies.setup import TrainingConfiguration, in_scenario, plant_of
 from tuning.problems.data import held_out_seeds
 from tuning.problems.scenario import PlantScenario
 from tuning.reporting.leaderboard import about, unless_blank
 from tuning.search.plan import HELD_OUT_SEEDS
-from tuning.thruster.logs import of_preset
 
 if TYPE_CHECKING:
     from tuning.policies.saved import Scores

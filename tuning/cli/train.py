@@ -21,10 +21,10 @@ from tuning.api.result import Printed
 from tuning.api.study import INTERRUPTED
 from tuning.api.tune import file_name
 from tuning.cli.output import progress_console
+from tuning.plants.thruster_logs import of_preset
 from tuning.policies.algorithms import ALGORITHMS, OBSERVATION_SETS, check_installed
 from tuning.policies.setup import PLANTS, TASKS, TrainingConfiguration, make_configuration, plant_of
 from tuning.problems.scenario import plain
-from tuning.thruster.logs import of_preset
 
 if TYPE_CHECKING:
     from tuning.policies.learn import Trained

@@ -37,7 +37,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import ROLES, Comparison, numbers, sizes_as_data, summary, versions
 from tuning.problems.assumed import augmented, name_and_unknown, suited
-from tuning.problems.digest import is_older
+from tuning.problems.check import is_older
 from tuning.problems.find import built_in, find_given, find_problem, scenario_of
 from tuning.problems.problem import Problem
 from tuning.search.objectives import NIS_BAND

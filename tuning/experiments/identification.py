@@ -26,8 +26,8 @@ from tuning.api.result import Printed
 from tuning.cli.output import progress_of
 from tuning.likelihood.identify import identify
 from tuning.likelihood.result import Identification
+from tuning.plants.thruster_logs import ThrusterFamily
 from tuning.problems.excitation import held_levels
-from tuning.thruster.logs import ThrusterFamily
 
 PRESET, SENSORS = "tunnel_physical", ("thrust", "speed")
 TRUTH = {

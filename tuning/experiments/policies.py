@@ -21,6 +21,7 @@ from scipy.stats import t as student
 from filters.consistency.nees import Interval
 from thruster_env.core.files import write_whole
 from thruster_env.core.parallel import Where, one_thread, task_map
+from tuning.plants.thruster import Scenario, find_scenario
 from tuning.policies.environments import make_environments
 from tuning.policies.learn import train
 from tuning.policies.saved import FINAL, Policy, Scores, classical_policy, load, score
@@ -29,7 +30,6 @@ from tuning.problems.data import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.storage import quiet_optuna
 from tuning.search.study import open_study, run_study
-from tuning.thruster.scenario import Scenario, find_scenario
 
 TASK = "manoeuvre"
 NOISES = {"low": "low_noise", "medium": "medium_noise", "high": "high_noise"}  # names of scenarios

@@ -34,9 +34,10 @@ from thruster_env.thruster.controllers import HORIZONS
 from thruster_env.thruster.env import BowThrusterEnv
 from thruster_env.thruster.model import MODEL_ARGUMENTS, thruster_model
 from thruster_env.thruster.plant import Plant, make_plant, thrust_scale
-from tuning.auv.scenario import SCENARIOS as VEHICLE_SCENARIOS
-from tuning.auv.scenario import Scenario as VehicleScenario
-from tuning.auv.scenario import find_scenario as find_vehicle_scenario
+from tuning.plants.auv import SCENARIOS as VEHICLE_SCENARIOS
+from tuning.plants.auv import Scenario as VehicleScenario
+from tuning.plants.auv import find_scenario as find_vehicle_scenario
+from tuning.plants.thruster import SCENARIOS, Scenario, find_scenario
 from tuning.policies.algorithms import (
     HYPERPARAMETERS,
     LAYERS,
@@ -47,7 +48,6 @@ from tuning.policies.algorithms import (
 )
 from tuning.policies.controllers import lqr, pi, predictive
 from tuning.problems.scenario import PlantScenario, plain
-from tuning.thruster.scenario import SCENARIOS, Scenario, find_scenario
 
 if TYPE_CHECKING:
     from tuning.policies.controllers import ClassicalPolicy

@@ -28,9 +28,8 @@ from thruster_env.core.angles import on_one_branch
 from thruster_env.core.checks import at_least, one_of, positive, short_repr
 from thruster_env.core.modules import error_line
 from thruster_env.model.state_space import StateSpaceModel
-from tuning.problems.check import check_data
+from tuning.problems.check import DIGEST_RUNS, check_data, digest_of, numbers_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step
-from tuning.problems.digest import RUNS, digest_of, numbers_of
 from tuning.problems.problem import GIVEN, SPREAD, Parameter, Problem
 
 RANGE_SEEDS = range(8)  # seeds whose runs determine each state's range, unless the model has it
@@ -200,10 +199,10 @@ class AssumedProblem(Problem):
 
     @cached_property  # computed at first use, for it takes some runs
     def digest(self) -> str:
-        """A hash of the problem's numbers; see `tuning.problems.digest`."""
+        """A hash of the problem's numbers; see `tuning.problems.check`."""
         ends = ({p.name: end} for p in self._parameters or () for end in (p.low, p.high))
         models = [self.model(), *map(self._model_or_none, ends)]
-        numbers = numbers_of(models, self.data(tuple(self.range_seeds)[:RUNS]))
+        numbers = numbers_of(models, self.data(tuple(self.range_seeds)[:DIGEST_RUNS]))
         of_runs = self.steps, self.first_scored_step, self._scale, self._dt
         return digest_of(self.origin, numbers, self._parameters, self._untuned, self._true, *of_runs)
 

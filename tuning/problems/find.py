@@ -23,9 +23,9 @@ from tuning.problems.scenario import FILE_SEQUENCES, PlantScenario
 
 # Modules that know a plant, named as text: they are imported when a scenario is looked up. Each has the class
 # Scenario, a `PlantScenario`, SCENARIOS by name, and the name of the NOMINAL one.
-PLANT_PACKAGES = {"thruster": "tuning.thruster.scenario", "auv": "tuning.auv.scenario"}
+PLANT_PACKAGES = {"thruster": "tuning.plants.thruster", "auv": "tuning.plants.auv"}
 PLANTS = "tuning.plants"  # group of entry points: such modules of other packages, by the plant
-LOGS = "tuning.thruster.logs"
+LOGS = "tuning.plants.thruster_logs"
 PLANT = "plant"  # the key that names the plant
 BASE = "base"
 S = TypeVar("S", bound=PlantScenario)
@@ -52,7 +52,7 @@ def plant_packages() -> dict[str, ModuleType]:
 
 
 def logs_package() -> ModuleType:
-    """The package of the plant of logs without a model, `tuning.thruster.logs`."""
+    """The package of the plant of logs without a model, `tuning.plants.thruster_logs`."""
     return importlib.import_module(LOGS)
 
 

@@ -17,9 +17,8 @@ from filters.tuned_file import NOISE
 from thruster_env.core.checks import in_words, positive, short_repr
 from thruster_env.core.modules import is_code
 from tuning.problems.assumed import may_estimate_constants
-from tuning.problems.check import checked_problem, data_of
+from tuning.problems.check import checked_problem, data_of, digest_of
 from tuning.problems.data import Data, estimates_on
-from tuning.problems.digest import digest_of
 from tuning.problems.problem import Argument, Parameter, Problem
 from tuning.search.objectives import COVARIANCE, LOG_SCORE, OBJECTIVES, OUTPUT, TRUTH, Objective, find_objective
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, filter_parameters, index_pairs

@@ -21,8 +21,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 from thruster_env.core.checks import tell
 from tuning.evaluation.sizes import SizeRow
+from tuning.problems.check import is_older
 from tuning.problems.data import Data
-from tuning.problems.digest import is_older
 from tuning.search.among_types import (
     choose_type_by_race,
     enqueue_after,

@@ -7,7 +7,7 @@ import pytest
 from thruster_env.thruster.analysis import jacobians, required_substeps, steady_state
 from thruster_env.thruster.dynamics import thrust_and_torque
 from thruster_env.thruster.parameters import PRESETS, T200, checked, derive_constants
-from tuning.thruster.bollard import (
+from tuning.cli.bollard import (
     FITTED,
     T200_PULSE_WIDTHS,
     Identified,

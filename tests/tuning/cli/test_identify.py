@@ -18,8 +18,8 @@ from thruster_env.thruster.model import logged_model, thruster_model
 from thruster_env.thruster.parameters import TUNNEL_PHYSICAL, PresetFile, read_preset, write_preset
 from tuning.experiments.identification import TRUTH, record
 from tuning.likelihood.result import with_values
+from tuning.plants.thruster_logs import of_preset
 from tuning.problems.find import find_problem, scenario_of
-from tuning.thruster.logs import of_preset
 
 FREE = ",".join(name for name in TRUTH if not name.startswith(("Q", "R")))
 WHOSE = "--preset tunnel_physical --sensor thrust --sensor speed"

@@ -9,8 +9,8 @@ from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
 from tuning.experiments.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study
 from tuning.likelihood.recorded import likelihood_of
+from tuning.plants.thruster_logs import ThrusterFamily
 from tuning.problems.problem import Coordinates
-from tuning.thruster.logs import ThrusterFamily
 
 
 @pytest.mark.slow

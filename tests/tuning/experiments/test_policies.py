@@ -27,11 +27,11 @@ from tuning.experiments.policies import (
     typical_return,
 )
 from tuning.experiments.policies_report import HEADER, answers, rows_of, summary_rows
+from tuning.plants.thruster import find_scenario
 from tuning.policies.environments import make_environments
 from tuning.policies.saved import Scores, classical_policy, run_episodes, score
 from tuning.policies.setup import FIRST_SCORED_STEP, THRUSTER, Part, make_configuration
 from tuning.problems.data import held_out_seeds
-from tuning.thruster.scenario import find_scenario
 
 MEDIUM = find_scenario("medium_noise")
 SEEDS = held_out_seeds(0, 3)

@@ -9,11 +9,11 @@ pytest.importorskip("stable_baselines3")
 
 from tuning.experiments.policies import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
 from tuning.experiments.policies_report import GOAL, HEADER, NOT_ON_PAGE, name_of
+from tuning.plants.thruster import find_scenario
 from tuning.policies.algorithms import OBSERVATION_SETS
 from tuning.policies.saved import classical_policy, score
 from tuning.policies.setup import TASKS, make_configuration
 from tuning.problems.data import held_out_seeds
-from tuning.thruster.scenario import find_scenario
 
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = "\n".join((DOCS / name).read_text() for name in ("policies.md", "appendix/policies.md"))

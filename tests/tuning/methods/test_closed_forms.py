@@ -290,7 +290,7 @@ def test_fisher_scoring_ends_where_l_bfgs_ends():
 
 
 def test_als_refuses_what_it_cannot_do():
-    from tuning.thruster.scenario import find_scenario
+    from tuning.plants.thruster import find_scenario
 
     problem = find_scenario("nominal")
     task = Task("ekf", problem, problem.data(range(2)))

@@ -12,8 +12,8 @@ from tuning.methods.gradients import Factors
 from tuning.methods.registry import METHODS, find_method
 from tuning.methods.searches import BACKWARD, FORWARD, _squares
 from tuning.methods.task import Budget, Task
+from tuning.plants.thruster import find_scenario
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
-from tuning.thruster.scenario import find_scenario
 
 FULL = {"full_q": True, "full_r": True}
 

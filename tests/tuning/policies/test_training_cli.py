@@ -12,11 +12,11 @@ pytest.importorskip("sb3_contrib")
 
 from tests.learners import COPIES, LIMIT, SMALL, contents, setup_of, short_episodes, trained  # noqa: F401 - some are fixtures
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
+from tuning.plants.thruster import find_scenario
 from tuning.policies.algorithms import ALGORITHMS
 from tuning.policies.environments import make_environments
 from tuning.policies.saved import FINAL, load, play, read_configuration, score
 from tuning.problems.data import held_out_seeds
-from tuning.thruster.scenario import find_scenario
 
 
 @pytest.mark.parametrize(("suffix", "size"), [("mp4", None), ("gif", (96, 64))])

@@ -14,10 +14,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormal
 import thruster_env  # noqa: F401 - registers the envs
 from tests.slow import slow_but
 from thruster_env.thruster.env import BowThrusterTrackingVectorEnv
+from tuning.plants.thruster import find_scenario
 from tuning.policies.algorithms import OBSERVATION_SETS, STACKED
 from tuning.policies.environments import NativeVecEnv, make_environments, make_single
 from tuning.policies.setup import in_scenario, make_configuration
-from tuning.thruster.scenario import find_scenario
 
 COPIES, LIMIT, STEPS = 3, 12, 30
 SEEDS = [7, 107, 5]

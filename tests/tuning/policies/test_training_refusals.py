@@ -12,11 +12,11 @@ pytest.importorskip("sb3_contrib")
 
 from tests.learners import SMALL, contents, copied, learn, setup_of, short_episodes, trained  # noqa: F401 - some are fixtures
 from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
+from tuning.plants.thruster import find_scenario
 from tuning.policies.algorithms import check_installed
 from tuning.policies.environments import make_environments
 from tuning.policies.saved import FINAL, configuration_from_json, find_saved, load, play
 from tuning.policies.setup import make_configuration
-from tuning.thruster.scenario import find_scenario
 
 
 def damage(path, how):

@@ -34,7 +34,7 @@ from tuning.experiments.recordings.model import (
 from tuning.likelihood.identify import identify
 from tuning.likelihood.recorded import runs_of
 from tuning.likelihood.result import Identification, valued
-from tuning.problems.digest import digest_of
+from tuning.problems.check import digest_of
 from tuning.problems.problem import Parameter
 
 DEGREES = 20.0  # degrees of freedom of the load cell's errors: it rings after each start and reversal

@@ -1,6 +1,6 @@
 """The underwater vehicle's scenarios: `Scenario`, a named, seeded and immutable recipe, and the built-in ones.
 
-    python -m tuning.auv.scenario [NAME ...]
+    python -m tuning.plants.auv [NAME ...]
 
 recomputes their scales and prints them.
 """

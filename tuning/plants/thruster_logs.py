@@ -80,7 +80,7 @@ def of_preset(problem: Problem, preset: str | Path | None, sequences: int = FILE
     """
     if preset is None:
         return problem
-    from tuning.thruster.scenario import Scenario
+    from tuning.plants.thruster import Scenario
 
     preset = str(preset)
     if not isinstance(problem, Scenario) or problem.system is not None:
@@ -100,7 +100,7 @@ def family_of_preset(
     *,
     noise: bool,
 ):
-    """The thruster of a preset whose parameters are free, `tuning.thruster.logs.ThrusterFamily`.
+    """The thruster of a preset whose parameters are free, `tuning.plants.thruster_logs.ThrusterFamily`.
 
     Args:
         logs: training logs.

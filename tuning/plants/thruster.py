@@ -1,6 +1,6 @@
 """The thruster's scenarios: `Scenario`, a named, seeded and immutable recipe, and the built-in ones.
 
-    python -m tuning.thruster.scenario [NAME ...]
+    python -m tuning.plants.thruster [NAME ...]
 
 recomputes their scales and prints them.
 """

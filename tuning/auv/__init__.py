@@ -1,1 +1,0 @@
-"""The underwater vehicle's scenarios."""

@@ -1,1 +1,0 @@
-"""The thruster's scenarios, and its parameters for identification."""
