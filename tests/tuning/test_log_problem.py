@@ -16,7 +16,6 @@ from tuning.api.held_out import HeldOut
 from tuning.evaluation.baselines import rule_label
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.evaluation.sizes import close_size
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.experiments.benchmark import run_in_memory
 from tuning.likelihood.gradient import tune_by_gradient
@@ -25,6 +24,7 @@ from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem
 from tuning.problems.log_parts import LEAD, parts_of
 from tuning.problems.log_problem import LogProblem
+from tuning.search.among_types import close_size
 from tuning.search.parameters import size_ladder
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice

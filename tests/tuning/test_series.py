@@ -16,12 +16,11 @@ import tuning
 from filters.models import NAMED, Scales, named_model
 from filters.named import model_named
 from thruster_env.graphs.loops import machine_code_of
-from tuning.series.answer import _digits
+from tuning.series.answer import _digits, outstanding_period
 from tuning.series.column import column_of, seconds_text
 from tuning.series.fit import Number, choose
 from tuning.series.likelihood import ColumnLikelihood
 from tuning.series.paste import LANGUAGES, lines_of
-from tuning.series.periods import outstanding_period
 from tuning.series.recursion import _recursion
 
 NILE = """

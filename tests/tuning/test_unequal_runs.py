@@ -9,7 +9,6 @@ from filters.consistency.report import consistency_report
 from tests.linear_problem import LinearProblem
 from thruster_env.model.affine import affine_model
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain, score_ratio
-from tuning.evaluation.sizes import close_size
 from tuning.likelihood.gradient import goal_of
 from tuning.likelihood.identifiability import identify
 from tuning.problems.check import check_data, checked_problem
@@ -17,6 +16,7 @@ from tuning.problems.data import Data, mask_of, only, padded
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import RunsProblem, log_of
 from tuning.reporting.time_figures import one_run
+from tuning.search.among_types import close_size
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 

@@ -27,11 +27,12 @@ from tuning.evaluation.tuned import read_choice, read_tuned, write_tuned
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.plants.thruster import find_scenario
 from tuning.problems.check import checked_problem
-from tuning.problems.find import find_problem, find_same
+from tuning.problems.find import find_problem
 from tuning.search.among_types import noise_by_gradient
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters
 from tuning.search.study import open_study, run_study
+from tuning.search.workers import find_same
 
 
 @pytest.fixture(scope="module")

@@ -49,7 +49,7 @@ from tuning.search.plan import (
     range_words,
 )
 from tuning.search.space import untuned_choice
-from tuning.search.study import StudyResult, answered_by, open_study, run_study
+from tuning.search.study import StudyResult, answered_by, finalists_of, open_study, run_study
 from tuning.search.trials import near
 from tuning.search.validation import (
     Failure,
@@ -62,7 +62,6 @@ from tuning.search.validation import (
     _wins,
     as_data,
     choice_from,
-    finalists_of,
     validate,
 )
 

@@ -11,7 +11,7 @@ from filters.bounds import ALL_UP_TO
 from filters.consistency.nees import Interval
 from thruster_env.core.checks import with_progress
 from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, score_ratio, values_of
-from tuning.problems.data import Data, estimates_in_parts
+from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 from tuning.search.objectives import MOST_PRICE, nis_violation
 from tuning.search.parameters import size_ladder
@@ -176,41 +176,6 @@ def sufficient_size(sizes: Sequence[SizeRow], consistent: bool = False) -> int:
     least, limit = min(row.ratio.high for row in rows), 1.0 + SIZE_TOLERANCE
     limit = limit if least < limit else limit * least
     return next(row.size for row in rows if row.ratio.high < limit)
-
-
-def close_size(choice: Choice, plan: Plan, training: Sequence[Data]) -> int:
-    """The smallest ensemble whose estimates are so close to the largest one's that the error barely grows.
-
-        mean of (m_N - m_L)^2 / P_L over runs, scored steps and states < 1.01^2 - 1
-
-    This can be computed without truth: sampling adds this much to the mean square error, in units of the
-    variance that the largest ensemble assumes. The likelihood is insensitive to it if R is large. If the
-    plan has a budget, no size is above that of the choice.
-
-    Args:
-        choice: the choice of a study.
-        plan: the plan of the study.
-        training: the plan's training data.
-    """
-    size = choice.numbers["ensemble_size"]
-    sizes = [n for n in sorted({*size_ladder(choice.name), size}) if plan.budget is None or n <= size]
-    rest, limit = sizes[:-1], (1.0 + SIZE_TOLERANCE) ** 2 - 1.0
-    for scenario, data in zip(plan.scenarios, training, strict=True):
-        means, variances = _scored(choice.with_size(sizes[-1]), scenario, data)
-        likely = np.maximum(variances, np.finfo(float).tiny)
-        excess = [((_scored(choice.with_size(n), scenario, data)[0] - means) ** 2 / likely).mean() for n in rest]
-        rest = [n for n, error in zip(rest, excess, strict=True) if error < limit]
-    return min(rest, default=sizes[-1])
-
-
-def _scored(choice: Choice, scenario: Problem, data: Data) -> tuple[np.ndarray, np.ndarray]:
-    """Means and variances of all scored steps, (steps, n) each."""
-    parts = list(estimates_in_parts(choice.filter(scenario), data))
-    means, covs = (
-        np.concatenate([part.scored_rows(getattr(estimates, name)) for part, estimates in parts])
-        for name in ("means", "covs")
-    )
-    return means, np.einsum("kii->ki", covs)
 
 
 def _counting(outside: Sequence[float], consistent: bool, scores: Sequence[float]) -> list[int]:

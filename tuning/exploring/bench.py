@@ -7,7 +7,7 @@ that one then sees, which the tests check.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +21,7 @@ from filters.filter import Filter
 from filters.registry import FILTERS
 from thruster_env.core.checks import at_least, one_of, short_repr
 from thruster_env.model.quantities import Quantity
-from tuning.evaluation.baselines import rule_of_thumb
+from tuning.evaluation.baselines import TUNED, baseline_size, baselines, rule_of_thumb
 from tuning.evaluation.evaluate import values_of
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
@@ -31,10 +31,8 @@ from tuning.exploring.view import (
     Knob,
     PageData,
     View,
-    checked_values,
     disturbed,
     knobs_of,
-    marks_of,
     page_data,
     start_of,
     view_of,
@@ -46,7 +44,16 @@ from tuning.problems.problem import Parameter, Problem
 from tuning.problems.scenario import plain
 from tuning.search.objectives import LIKELIHOOD, SCORE, find_objective, nis_ratio
 from tuning.search.plan import Plan
-from tuning.search.space import Choice, everything_of, fits, has_search_space, neutral, parameters, untuned_choice
+from tuning.search.space import (
+    Choice,
+    everything_of,
+    fits,
+    has_search_space,
+    neutral,
+    parameters,
+    parameters_of,
+    untuned_choice,
+)
 from tuning.search.storage import quiet_optuna
 from tuning.search.study import FINISHED, StudyResult, finished_trials, open_study, run_trials
 
@@ -186,6 +193,29 @@ def trials_of(plan: Plan, start: Choice, trials: int) -> Iterator[Trial]:
         scores = list(last.intermediate_values.values())
         score = sum(scores) / len(scores) if pruned and scores else last.values[0]
         yield Trial(dict(last.params), score, pruned)
+
+
+KNOWN = ("given", "rule of thumb", "scaled default", "oracle")  # baselines that are marked
+
+
+def marks_of(name: str, problem: Problem, tuned: Choice | None = None, seed: int = 0) -> dict[str, dict]:
+    """The values of knobs, by name, of a filter's baselines and of a tuned filter."""
+    same = tuned if tuned is not None and tuned.name == name else None
+    known = baselines(name, problem, seed, ensemble_size=None if same is None else baseline_size(same))
+    choices = {label: choice for label, choice in known.items() if label in KNOWN}
+    if same is not None:
+        choices[TUNED] = same
+    return {label: parameters_of(choice) for label, choice in choices.items()}
+
+
+def checked_values(
+    knobs: Sequence[Knob], values: Mapping[str, float], start: Mapping[str, float]
+) -> dict[str, float]:
+    """A value of each knob, that at the start where none is given; ValueError for others than a knob can have."""
+    known = {knob.name: knob for knob in knobs}
+    for name in values:
+        one_of("a knob", name, known)
+    return {name: knob.checked(values.get(name, start[name])) for name, knob in known.items()}
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,9 @@ import numpy as np
 from filters.consistency.nees import LAGS, band_of_means, whiteness
 from filters.engine.batch import Estimates
 from filters.filter import Filter
-from thruster_env.core.checks import at_least, between, one_of
+from thruster_env.core.checks import at_least, between
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs.log import seen_by
-from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import Evaluation, compute_metrics
 from tuning.evaluation.runs import RunMetrics, metrics_by_run, metrics_of_all
 from tuning.problems.check import data_of
@@ -33,7 +32,6 @@ from tuning.search.space import Choice, everything_of, neutral, parameters, para
 LOWER, HIGHER, NEAR = "lower", "higher", "near"  # what is better in a figure
 SENSORS, AMPLIFIER = "sensors", "amplifier"  # fields of a scenario that hold effects
 SIGMA = "sigma"  # unit of what is said in standard deviations of the sensor's noise
-KNOWN = ("given", "rule of thumb", "scaled default", "oracle")  # baselines that are marked
 GROUPS = ("Q", "R", "model", "filter", "prior", "correlations", "disturbances")
 
 
@@ -369,16 +367,6 @@ class Knob(NamedTuple):
         return at_least(self.name, value, int(self.low)) if self.integer else number
 
 
-def marks_of(name: str, problem: Problem, tuned: Choice | None = None, seed: int = 0) -> dict[str, dict]:
-    """The values of knobs, by name, of a filter's baselines and of a tuned filter."""
-    same = tuned if tuned is not None and tuned.name == name else None
-    known = baselines(name, problem, seed, ensemble_size=None if same is None else baseline_size(same))
-    choices = {label: choice for label, choice in known.items() if label in KNOWN}
-    if same is not None:
-        choices[TUNED] = same
-    return {label: parameters_of(choice) for label, choice in choices.items()}
-
-
 def knobs_of(name: str, problem: Problem, marks: Mapping[str, Mapping[str, float]]) -> tuple[Knob, ...]:
     """All numbers of a filter that a study may choose, and the disturbances of the plant.
 
@@ -431,13 +419,3 @@ def start_of(knobs: Sequence[Knob], problem: Problem, choice: Choice) -> dict[st
         value = plant.get(knob.name, chosen.get(knob.name, neutral(knob.name)))
         values[knob.name] = knob.low if value is None else value
     return values
-
-
-def checked_values(
-    knobs: Sequence[Knob], values: Mapping[str, float], start: Mapping[str, float]
-) -> dict[str, float]:
-    """A value of each knob, that at the start where none is given; ValueError for others than a knob can have."""
-    known = {knob.name: knob for knob in knobs}
-    for name in values:
-        one_of("a knob", name, known)
-    return {name: knob.checked(values.get(name, start[name])) for name, knob in known.items()}

@@ -29,7 +29,7 @@ from thruster_env.logs.log import Log
 from thruster_env.model.simulate import inputs_until
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.likelihood.ascent import Ascent, climb
-from tuning.likelihood.identifiability import SIGNIFICANT
+from tuning.likelihood.identifiability import SIGNIFICANT, TWO_SIDED
 from tuning.likelihood.objective import Objective
 from tuning.likelihood.recorded import estimates_of, likelihood_of, of_changed, recorded, runs_of, starts_of
 from tuning.likelihood.result import (
@@ -37,7 +37,7 @@ from tuning.likelihood.result import (
     NullTest,
     Optimum,
     covariances_of,
-    identification_of,
+    is_narrow,
     null_of,
     null_tests,
 )
@@ -108,6 +108,49 @@ def from_nothing(objective: Objective, start: np.ndarray, stop, tell) -> Ascent 
     at = np.where(fixed, [null for null, _ in nulls], start)
     without = climb(objective, at, fixed=fixed, stop=stop)
     return climb(objective, without.at, stop=stop, progress=tell)
+
+
+def identification_of(
+    objective: Objective,
+    first: np.ndarray,
+    best: Ascent,
+    optima: tuple[Optimum, ...],
+    tests: Mapping[str, NullTest] | None = None,
+    *,
+    interrupted: bool,
+    seconds: float,
+) -> Identification:
+    """The result at the best maximum, with standard errors and which parameters are determined."""
+    coordinates, at = objective.coordinates, best.at
+    width = coordinates.high - coordinates.low
+    cov, _ = covariances_of(objective, best)
+    errors = np.sqrt(np.diag(cov))
+    ends = (at <= coordinates.low + 1e-6 * width) | (at >= coordinates.high - 1e-6 * width)
+    natural, values = errors * np.abs(coordinates.slopes(at)), coordinates.values(at)
+    narrow, not_zero = is_narrow(cov, coordinates), np.abs(values) > TWO_SIDED * natural
+    names = coordinates.names
+
+    def by_name(values) -> dict:
+        return dict(zip(names, np.asarray(values).tolist(), strict=True))
+
+    return Identification(
+        names=names,
+        values=coordinates.named(at),
+        start=coordinates.named(first),
+        standard_errors=by_name(natural),
+        cov=cov,
+        at=at,
+        at_end=by_name(ends),
+        determined=by_name(narrow & ~ends & not_zero),
+        narrow=by_name(narrow),
+        log_likelihood=best.found.value,
+        start_log_likelihood=objective.value(first),
+        optima=optima,
+        objective=objective,
+        interrupted=interrupted,
+        seconds=seconds,
+        null_tests=tests or {},
+    )
 
 
 def identify(

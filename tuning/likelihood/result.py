@@ -290,49 +290,6 @@ class Identification(NamedTuple):
         return sentences
 
 
-def identification_of(
-    objective: Objective,
-    first: np.ndarray,
-    best: Ascent,
-    optima: tuple[Optimum, ...],
-    tests: Mapping[str, NullTest] | None = None,
-    *,
-    interrupted: bool,
-    seconds: float,
-) -> Identification:
-    """The result at the best maximum, with standard errors and which parameters are determined."""
-    coordinates, at = objective.coordinates, best.at
-    width = coordinates.high - coordinates.low
-    cov, _ = covariances_of(objective, best)
-    errors = np.sqrt(np.diag(cov))
-    ends = (at <= coordinates.low + 1e-6 * width) | (at >= coordinates.high - 1e-6 * width)
-    natural, values = errors * np.abs(coordinates.slopes(at)), coordinates.values(at)
-    narrow, not_zero = is_narrow(cov, coordinates), np.abs(values) > TWO_SIDED * natural
-    names = coordinates.names
-
-    def by_name(values) -> dict:
-        return dict(zip(names, np.asarray(values).tolist(), strict=True))
-
-    return Identification(
-        names=names,
-        values=coordinates.named(at),
-        start=coordinates.named(first),
-        standard_errors=by_name(natural),
-        cov=cov,
-        at=at,
-        at_end=by_name(ends),
-        determined=by_name(narrow & ~ends & not_zero),
-        narrow=by_name(narrow),
-        log_likelihood=best.found.value,
-        start_log_likelihood=objective.value(first),
-        optima=optima,
-        objective=objective,
-        interrupted=interrupted,
-        seconds=seconds,
-        null_tests=tests or {},
-    )
-
-
 def covariances_of(objective: Objective, best: Ascent) -> tuple[np.ndarray, np.ndarray]:
     """Covariances (p, p) of the estimates at a maximum: as stated, and by Fisher's information alone.
 

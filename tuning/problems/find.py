@@ -206,17 +206,6 @@ def _module_meant(name: Any) -> str:
     return f"; did you mean '{plain}:problem'?" if exists else ""
 
 
-def find_same(name: str, digest: str) -> Problem:
-    """A problem by its name, which must be the same as in another process: ValueError for another digest."""
-    problem = find_problem(name)
-    if problem.digest != digest:
-        raise ValueError(
-            f"problem {name} must be the same in all processes, of digest {digest}, but here it has "
-            f"{problem.digest}"
-        )
-    return problem
-
-
 def find_given(name, problems: Sequence[Problem], where: str | Path) -> Problem:
     """A problem that a file or a storage names: one of the user's or, unless it is code, one found by its name.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -250,20 +250,6 @@ def _mask_of_held_out(
     if len(logs) >= EVERY_THIRD:
         return [block.run % EVERY_THIRD == EVERY_THIRD - 1 for block in blocks]
     return [i % EVERY_THIRD == EVERY_THIRD - 1 for i in range(len(blocks))]
-
-
-def checked_logs(user_logs: Any) -> tuple[Log, ...]:
-    """Logs of one problem as a tuple; ValueError unless they have one sample time and different names."""
-    logs = (
-        (user_logs,) if isinstance(user_logs, Log) else tuple(user_logs) if isinstance(user_logs, Sequence) else ()
-    )
-    if not logs or not all(isinstance(log, Log) for log in logs):
-        raise ValueError(f"logs must be some thruster_env.logs.log.Log, but got {short_repr(user_logs)}")
-    check_times(logs)
-    names = [log.name for log in logs]
-    if len(set(names)) < len(names):
-        raise ValueError(f"logs of one problem must have different names, but got {', '.join(names)}")
-    return logs
 
 
 def check_times(logs: Sequence[Log]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from filters.consistency.time_constants import Run
 from filters.starts import MEASUREMENT, STARTS, begun_at, cov_of_measured_starts, first_measured
-from thruster_env.core.checks import at_least, one_of
+from thruster_env.core.checks import at_least, one_of, short_repr
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.findings import OUTLIERS, Recording, has_outliers, remarks_on
@@ -22,7 +22,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
 from tuning.problems.data import Data, mask_of, only, padded
-from tuning.problems.log_parts import Parts, check_apart, checked_logs, parts_of
+from tuning.problems.log_parts import Parts, check_apart, check_times, parts_of
 from tuning.problems.problem import Parameter
 
 ROBUST = ("ekf-robust",)  # filters that take measurements far from the prior for outliers
@@ -63,6 +63,20 @@ def as_rows(log: Log) -> Log:
     fields: dict[str, Any] = {"inputs": inputs, "measurements": measurements, "input_quantities": quantities}
     fields |= {"references": {}, "referred": {}, "source": {}, "stamps": None, "recording": Recording()}
     return dataclasses.replace(log, **fields)
+
+
+def checked_logs(user_logs: Any) -> tuple[Log, ...]:
+    """Logs of one problem as a tuple; ValueError unless they have one sample time and different names."""
+    logs = (
+        (user_logs,) if isinstance(user_logs, Log) else tuple(user_logs) if isinstance(user_logs, Sequence) else ()
+    )
+    if not logs or not all(isinstance(log, Log) for log in logs):
+        raise ValueError(f"logs must be some thruster_env.logs.log.Log, but got {short_repr(user_logs)}")
+    check_times(logs)
+    names = [log.name for log in logs]
+    if len(set(names)) < len(names):
+        raise ValueError(f"logs of one problem must have different names, but got {', '.join(names)}")
+    return logs
 
 
 class LogProblem(AssumedProblem):

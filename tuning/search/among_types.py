@@ -10,24 +10,24 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import optuna
-from optuna.distributions import BaseDistribution
 from optuna.trial import FrozenTrial, TrialState
 
 from filters.filter import PageFilter
 from filters.registry import filter_type
 from tuning.evaluation.baselines import competing_baselines, noise_estimated
 from tuning.evaluation.held_out import sizes_as_data, stored_sizes
-from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
+from tuning.evaluation.sizes import SIZE_TOLERANCE, SizeRow, ensemble_sizes, sufficient_size
 from tuning.likelihood.gradient import goal_of, optimum, start_at, starts_of
 from tuning.likelihood.objective import OF_STATES, Objective
 from tuning.likelihood.parametric import has_gradient
-from tuning.problems.data import Data
+from tuning.problems.data import Data, estimates_in_parts
+from tuning.problems.problem import Problem
 from tuning.search.objectives import LIKELIHOOD, SCORE, reported
-from tuning.search.parameters import R, model_parameters
+from tuning.search.parameters import R, model_parameters, size_ladder
 from tuning.search.plan import Plan
 from tuning.search.space import FILTER_TYPE, Choice, ends_of, trial_parameters, untuned_choice, within_ranges
 from tuning.search.trials import COST, NIS, best_trial, enqueue_new, is_consistent, is_near, is_over_budget, near
@@ -177,25 +177,6 @@ def next_in_race(plan: Plan, trials: Sequence[FrozenTrial]) -> str:
     """The filter type of the next trial: of those in the race the one with the fewest, the best of these first."""
     begun = Counter(trial.params.get(FILTER_TYPE) for trial in trials if trial.state != TrialState.WAITING)
     return min(race_of(plan, trials).running or plan.filter_types, key=begun.__getitem__)
-
-
-def choose_type_by_race(sampler: optuna.samplers.BaseSampler, plan: Plan) -> optuna.samplers.BaseSampler:
-    """The sampler, whose trials have the filter type that is next in the race."""
-    of_all, of_one = sampler.infer_relative_search_space, sampler.sample_independent
-
-    def without_type(study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        return {name: distribution for name, distribution in of_all(study, trial).items() if name != FILTER_TYPE}
-
-    def sample(
-        study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
-    ) -> Any:
-        if param_name == FILTER_TYPE:
-            return next_in_race(plan, study.get_trials(deepcopy=False))
-        return of_one(study, trial, param_name, param_distribution)
-
-    sampler.infer_relative_search_space = without_type  # type: ignore[method-assign]  # of this sampler alone
-    sampler.sample_independent = sample  # type: ignore[method-assign]
-    return sampler
 
 
 def _first_trials(plan: Plan, trials: Sequence[FrozenTrial]) -> Iterator[tuple[str, str]]:
@@ -464,6 +445,41 @@ def sizes_of(
         rows = ensemble_sizes(choice, plan, data, consistent)
         study.set_user_attr(SIZES, sizes_as_data(rows, choice, plan))
     return rows
+
+
+def close_size(choice: Choice, plan: Plan, training: Sequence[Data]) -> int:
+    """The smallest ensemble whose estimates are so close to the largest one's that the error barely grows.
+
+        mean of (m_N - m_L)^2 / P_L over runs, scored steps and states < 1.01^2 - 1
+
+    This can be computed without truth: sampling adds this much to the mean square error, in units of the
+    variance that the largest ensemble assumes. The likelihood is insensitive to it if R is large. If the
+    plan has a budget, no size is above that of the choice.
+
+    Args:
+        choice: the choice of a study.
+        plan: the plan of the study.
+        training: the plan's training data.
+    """
+    size = choice.numbers["ensemble_size"]
+    sizes = [n for n in sorted({*size_ladder(choice.name), size}) if plan.budget is None or n <= size]
+    rest, limit = sizes[:-1], (1.0 + SIZE_TOLERANCE) ** 2 - 1.0
+    for scenario, data in zip(plan.scenarios, training, strict=True):
+        means, variances = _scored(choice.with_size(sizes[-1]), scenario, data)
+        likely = np.maximum(variances, np.finfo(float).tiny)
+        excess = [((_scored(choice.with_size(n), scenario, data)[0] - means) ** 2 / likely).mean() for n in rest]
+        rest = [n for n, error in zip(rest, excess, strict=True) if error < limit]
+    return min(rest, default=sizes[-1])
+
+
+def _scored(choice: Choice, scenario: Problem, data: Data) -> tuple[np.ndarray, np.ndarray]:
+    """Means and variances of all scored steps, (steps, n) each."""
+    parts = list(estimates_in_parts(choice.filter(scenario), data))
+    means, covs = (
+        np.concatenate([part.scored_rows(getattr(estimates, name)) for part, estimates in parts])
+        for name in ("means", "covs")
+    )
+    return means, np.einsum("kii->ki", covs)
 
 
 def sized(choice: Choice, plan: Plan, data: Sequence[Data], sizes: Sequence[SizeRow], consistent: bool) -> Choice:

@@ -14,31 +14,35 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import optuna
+from optuna.distributions import BaseDistribution
 from optuna.trial import FrozenTrial, TrialState
 
+from filters.registry import filter_type
 from thruster_env.core.checks import tell
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.check import is_older
 from tuning.problems.data import Data
 from tuning.search.among_types import (
-    choose_type_by_race,
+    MAXIMUM_LIKELIHOOD,
     enqueue_after,
     enqueue_what_is_left,
     is_race,
+    next_in_race,
     sized,
     sizes_of,
 )
 from tuning.search.measures import measured
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import Plan
-from tuning.search.space import Choice, trial_parameters
+from tuning.search.space import FILTER_TYPE, Choice, trial_parameters
 from tuning.search.storage import PROCESS, drop_waiting, retry_orphans, this_process
 from tuning.search.trials import BLOCK, COST, best_trial, cost_of, is_consistent, make_sampler, measure, run_trial
-from tuning.search.validation import Validation, as_data, finalists_of, validate
+from tuning.search.validation import BY_CONSISTENCY, Validation, as_data, validate
 
+BY_SCORE = 4  # of the best trials meet the baselines, and `BY_CONSISTENCY` of the best consistent ones
 STOPPING = "stopping after the running task; Ctrl-C again stops at once"
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 BEST = "best trial under the constraints"  # attribute of a study, for programs that ignore constraints
@@ -218,6 +222,25 @@ def give_sampler(study: optuna.Study, make: Callable[[int], optuna.samplers.Base
     study.sampler = first
 
 
+def choose_type_by_race(sampler: optuna.samplers.BaseSampler, plan: Plan) -> optuna.samplers.BaseSampler:
+    """The sampler, whose trials have the filter type that is next in the race."""
+    of_all, of_one = sampler.infer_relative_search_space, sampler.sample_independent
+
+    def without_type(study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        return {name: distribution for name, distribution in of_all(study, trial).items() if name != FILTER_TYPE}
+
+    def sample(
+        study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
+    ) -> Any:
+        if param_name == FILTER_TYPE:
+            return next_in_race(plan, study.get_trials(deepcopy=False))
+        return of_one(study, trial, param_name, param_distribution)
+
+    sampler.infer_relative_search_space = without_type  # type: ignore[method-assign]  # of this sampler alone
+    sampler.sample_independent = sample  # type: ignore[method-assign]
+    return sampler
+
+
 def open_study(
     name: str,
     plan: Plan,
@@ -298,6 +321,36 @@ def _check_identity(name: str, wanted: dict, stored: dict) -> None:
 def finished_trials(study: optuna.Study) -> int:
     """Number of finished trials: complete and pruned ones."""
     return len(study.get_trials(deepcopy=False, states=FINISHED))
+
+
+def finalists_of(
+    plan: Plan, trials: Sequence[FrozenTrial], resize: Callable[[Choice, bool], Choice]
+) -> dict[str, Choice]:
+    """The trials that meet the baselines, by name: the best, the best consistent, the maximum-likelihood ones.
+
+    Args:
+        plan: of the study.
+        trials: its trials.
+        resize: gives the best trial of each filter type the ensemble size with which it ends; the others of that
+            type have the same. Called with whether its size must be consistent.
+    """
+    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    complete.sort(key=lambda trial: trial.values[0])
+    best = best_trial(complete)
+    first = [] if best is None else [best]
+    consistent = [trial for trial in complete if is_consistent(trial)][:BY_CONSISTENCY]
+    likely = [trial for trial in complete if MAXIMUM_LIKELIHOOD in trial.user_attrs]
+    finalists: dict[str, Choice] = {}
+    sizes: dict[str, int] = {}
+    for trial in (*first, *complete[:BY_SCORE], *consistent, *likely):
+        choice = plan.choice_of(trial.params)
+        if filter_type(choice.name).has_ensemble:
+            if choice.name not in sizes:
+                sized = resize(choice, plan.is_constrained and is_consistent(trial))
+                sizes[choice.name] = sized.numbers["ensemble_size"]
+            choice = choice.with_size(sizes[choice.name])
+        finalists[f"trial {trial.number + 1}"] = choice
+    return finalists
 
 
 def run_study(

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite, isnan, nan
 from statistics import geometric_mean
 from typing import NamedTuple
 
 import numpy as np
-from optuna.trial import FrozenTrial, TrialState
 
 from filters.consistency.nees import Interval, slightly
 from filters.registry import filter_type
@@ -26,7 +25,6 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.evaluate import is_beyond
 from tuning.problems.data import Data
-from tuning.search.among_types import MAXIMUM_LIKELIHOOD
 from tuning.search.measures import (
     LEVEL,
     Measured,
@@ -41,10 +39,10 @@ from tuning.search.objectives import LARGEST, MOST_PRICE, MSE, NIS_BAND, OUTPUT,
 from tuning.search.parameters import ensemble_sizes_of, model_parameters, obeying
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
-from tuning.search.trials import best_trial, cost_of, is_consistent
+from tuning.search.trials import cost_of
 
+BY_CONSISTENCY = 2  # consistent trials that meet the baselines, the best ones
 VALIDATED = (SCORE, "thrust", MSE, *PROPER)  # objectives, beside those of outputs, that each run has
-BY_SCORE, BY_CONSISTENCY = 4, 2  # trials that meet the baselines: the best ones, and the best consistent ones
 NEES = ("nees", "state_nees")  # fields of `Met` that need truth
 EQUAL = 1e-4  # of the score, within which two filters are surely one in error, and consistency decides
 FAILS = 2.0  # mean NIS of a run over the number of channels, beyond which a filter fails there ...
@@ -355,36 +353,6 @@ def _with_failures(
             ]
     worst = sorted(failures, key=lambda failure: -failure.nis)[:WORST]
     return validation._replace(tested=tested.name, failures=tuple(worst), failed=len(failures), runs=count)
-
-
-def finalists_of(
-    plan: Plan, trials: Sequence[FrozenTrial], resize: Callable[[Choice, bool], Choice]
-) -> dict[str, Choice]:
-    """The trials that meet the baselines, by name: the best, the best consistent, the maximum-likelihood ones.
-
-    Args:
-        plan: of the study.
-        trials: its trials.
-        resize: gives the best trial of each filter type the ensemble size with which it ends; the others of that
-            type have the same. Called with whether its size must be consistent.
-    """
-    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    complete.sort(key=lambda trial: trial.values[0])
-    best = best_trial(complete)
-    first = [] if best is None else [best]
-    consistent = [trial for trial in complete if is_consistent(trial)][:BY_CONSISTENCY]
-    likely = [trial for trial in complete if MAXIMUM_LIKELIHOOD in trial.user_attrs]
-    finalists: dict[str, Choice] = {}
-    sizes: dict[str, int] = {}
-    for trial in (*first, *complete[:BY_SCORE], *consistent, *likely):
-        choice = plan.choice_of(trial.params)
-        if filter_type(choice.name).has_ensemble:
-            if choice.name not in sizes:
-                sized = resize(choice, plan.is_constrained and is_consistent(trial))
-                sizes[choice.name] = sized.numbers["ensemble_size"]
-            choice = choice.with_size(sizes[choice.name])
-        finalists[f"trial {trial.number + 1}"] = choice
-    return finalists
 
 
 def _rescaled(finalists: Mapping[str, Choice], plan: Plan, training: Sequence[Data]) -> dict[str, Choice]:

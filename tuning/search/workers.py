@@ -27,7 +27,7 @@ from thruster_env.core.modules import working_folder_last
 from thruster_env.core.parallel import take_share, without_interrupts
 from tuning.problems.assumed import within
 from tuning.problems.data import Data
-from tuning.problems.find import find_same
+from tuning.problems.find import find_problem
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
 from tuning.search.plan import Plan
@@ -59,6 +59,17 @@ def orders_of(plan: Plan) -> dict[str, Any]:
             problem.name: _packed(problem) for problem in plan.scenarios if isinstance(within(problem), LogProblem)
         },
     }
+
+
+def find_same(name: str, digest: str) -> Problem:
+    """A problem by its name, which must be the same as in another process: ValueError for another digest."""
+    problem = find_problem(name)
+    if problem.digest != digest:
+        raise ValueError(
+            f"problem {name} must be the same in all processes, of digest {digest}, but here it has "
+            f"{problem.digest}"
+        )
+    return problem
 
 
 def plan_of(orders: dict[str, Any]) -> Plan:

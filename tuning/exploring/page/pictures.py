@@ -139,13 +139,7 @@ class Colours(NamedTuple):
     band: str
 
 
-LIGHT = Colours(ink="#1b1f24", axis="#4d5661", grid="#e3e6ea", estimate="#0b6bb8", band="#0b6bb8")
 DARK = Colours(ink="#f2f4f6", axis="#aab3bd", grid="#333a43", estimate="#62b5f0", band="#62b5f0")
-
-
-def ground(dark: bool) -> Colours:
-    """Those of the ground that the page has."""
-    return DARK if dark else LIGHT
 
 
 def paint(picture: figure, colours: Colours) -> None:

@@ -41,7 +41,7 @@ from tornado.web import ErrorHandler, OutputTransform
 from thruster_env.model.quantities import Quantity
 from tuning.exploring.bench import SCENES, Bench, Scene
 from tuning.exploring.page.export import KINDS, exported
-from tuning.exploring.page.pictures import HELD, Look, MapPicture, Pictures, Sent, ground
+from tuning.exploring.page.pictures import DARK, HELD, Colours, Look, MapPicture, Pictures, Sent
 from tuning.exploring.view import View
 
 WIDTHS = (200, 4000)  # of a picture, in points
@@ -69,6 +69,14 @@ class Wire(DataModel):
 
     asked = String(default="")
     told = String(default="")
+
+
+LIGHT = Colours(ink="#1b1f24", axis="#4d5661", grid="#e3e6ea", estimate="#0b6bb8", band="#0b6bb8")
+
+
+def ground(dark: bool) -> Colours:
+    """Those of the ground that the page has."""
+    return DARK if dark else LIGHT
 
 
 class Session:
