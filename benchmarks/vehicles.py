@@ -17,8 +17,11 @@ from filters.filter import Filter
 from thruster_env.auv.dynamics import motion_substep
 from thruster_env.auv.parameters import Constants
 from thruster_env.auv.plant import make_plant
-from thruster_env.core.sources import tuple_of, written_out
+from thruster_env.env.copies import LANES
+from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.loops import Loops
+from thruster_env.graphs.programs import OF_COPIES, Place, callable_of, program_of
+from thruster_env.model.traced import traced_function
 from tuning.plants.auv import Scenario, find_scenario
 from tuning.problems.data import training_seeds
 
@@ -28,15 +31,6 @@ PAPER_SIZE, PAPER_SECONDS = 300, 25.0
 CRUISE = (2.845, -0.01707, 0.0, 0.0)  # propeller's force [N] and torque [N m], both rudders [rad]
 N = 8  # states of the model "motion"
 PAIRS = 8  # of a sine and a cosine in a Runge-Kutta step: four rates of roll and pitch
-
-_constants = written_out(
-    "constants",
-    "numbers",
-    f"Constants({', '.join(f'numbers[{i}]' for i in range(len(Constants._fields)))})",
-    Constants=Constants,
-)
-_column = written_out("column", "table, j", tuple_of(f"table[{i}, j]" for i in range(N)))
-_store = written_out("store", "table, j, x", *(f"table[{i}, j] = x[{i}]" for i in range(N)), "None")
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -63,7 +57,7 @@ def member_steps() -> Measure:
     plant = make_plant()
     table = np.zeros((N, MEMBERS))
     table[0], numbers = 1.0, np.array(plant.constants)
-    propagate = _propagate()
+    propagate = _propagator(plant.constants)
     return shared(lambda: propagate(table, STEPS, numbers), STEPS * MEMBERS)
 
 
@@ -95,14 +89,20 @@ def papers_ensemble(seed: int) -> Measure:
     return measure
 
 
-@cache
-def _propagate() -> Callable:
+def _propagator(constants: Constants) -> Callable:
+    """`propagate(table, steps, numbers)` of members (N, columns), with the motion traced as envs trace it."""
+    graph, sizes = Graph(), (N, len(CRUISE), len(constants))
+    x = [graph.given(Place("memory", k)) for k in range(N)]
+    c = [graph.given(Place("numbers", k)) for k in range(len(constants))]
+    motion = traced_function(motion_substep, sizes, type(constants), (N,))
+    after = motion(*(np.array(part, dtype=object) for part in (x, CRUISE, c)))
+    stores = [(Place("memory", k), graph.number(entry)) for k, entry in enumerate(after)]
+    step = callable_of(program_of(stores, {}), LANES, OF_COPIES)
 
     def propagate(table, steps, numbers):
-        c = _constants(numbers)
         for _ in range(steps):
-            for j in range(table.shape[1]):
-                _store(table, j, motion_substep(_column(table, j), CRUISE, c))
+            for j in range(0, table.shape[1], LANES):
+                step(table[:, j : j + LANES], numbers)
 
     return Loops(propagate)
 

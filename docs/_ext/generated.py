@@ -111,8 +111,7 @@ def _operations_of(name: str, title: str) -> Iterator[str]:
 
 def methods() -> str:
     """All methods of tuning, what they need, when to use which, and whose they are, in Markdown."""
-    from tuning.methods.registry import METHODS
-    from tuning.methods.task import GRADIENT, TRUTH
+    from tuning.methods.task import GRADIENT, METHODS, TRUTH
 
     needs = {TRUTH: "true states", GRADIENT: "a gradient"}
     lines = ["## Every method", "", "| method | what it does | needs | use it | source |", "|---|---|---|---|---|"]

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import optuna
-from scipy.linalg import expm
 
 from docs.scripts import about, by_name, log_ticks, subplots
 from filters.augmented import Unknown, augmented_model
@@ -20,19 +19,16 @@ from filters.registry import make_filter
 from thruster_env.core.files import BLUE, DARK, RUST, save_figure
 from thruster_env.core.sources import written_out
 from thruster_env.core.text_tables import markdown_table
-from thruster_env.model.affine import affine_model
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.thruster.dynamics import Constants
-from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, scaled_default
+from tuning.evaluation.baselines import ORACLE, RULE, SCALED, scaled_default
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.experiments.benchmark import run_in_memory
-from tuning.likelihood.gradient import BAD_START, tune_by_gradient
+from tuning.likelihood.gradient import BAD_START
 from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.plants.thruster import Scenario, find_scenario
-from tuning.problems.model_problem import ModelProblem
-from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, NIS_BAND, SCORE, nis_violation, penalised
-from tuning.search.plan import HELD_OUT_SEEDS, Plan
+from tuning.search.plan import HELD_OUT_SEEDS, NIS_BAND, Plan, nis_violation, penalised
 from tuning.search.space import Choice, distributions, oracle_choice, parameters_of, suggest, trial_parameters
 from tuning.search.trials import make_sampler
 
@@ -95,51 +91,6 @@ def earned(scenarios: Sequence[str] = EARNING, trials: int = TRIALS) -> str:
 def _consistency(evaluation: Evaluation) -> list[str]:
     nees = evaluation.nees.value
     return [f"{nees:.3g}" if nees < 1000 else "> 1000", f"{evaluation.nis.value:.2f}"]
-
-
-def recovered() -> str:
-    """Studies of a perfect linear model, from a bad start."""
-    rows = []
-    for name in ("published_tunnel", "published_open_bladed"):
-        scenario = find_scenario(name)
-        bad = bad_start("kf", scenario)
-        comparison = evaluate_held_out(
-            run_in_memory(Plan("kf", (scenario,), SEED), TRIALS, bad).choice, scenario, SEED
-        )
-        started = evaluate(bad.filter(scenario), scenario.data(comparison.seeds), scenario.scale)
-        ratios = (score_ratio(evaluation, comparison.true) for evaluation in (started, comparison.tuned))
-        rows.append([f"`{name}`", *(about(ratio, 4) for ratio in ratios)])
-    return markdown_table(["scenario", "start over oracle", "tuned over oracle"], rows)
-
-
-def maximum_likelihood() -> str:
-    """The maximum of the likelihood beside the true numbers."""
-    scenario = find_scenario("nominal")
-    result = tune_by_gradient("ekf", scenario, Plan("ekf", (scenario,), SEED).training_data()[0])
-    true = (*scenario.process_noise_cov, scenario.measurement_noise_cov)
-    columns = zip(result.names, true, result.best.parameters, result.standard_errors, strict=True)
-    rows = [[name, f"{value:.4g}", f"{best:.4g}", f"{100 * error:.0f} %"] for name, value, best, error in columns]
-    return markdown_table(["", "true", "most likely", "standard error"], rows)
-
-
-def aims() -> str:
-    """Where the gradients of three objectives lead where the model is wrong, beside a study of the score."""
-    scenario = find_scenario("mismatch")
-    data = Plan("ekf", (scenario,), SEED).training_data()[0]
-    rows = []
-    for aim in (LIKELIHOOD, SCORE, MSE, LOG_SCORE):
-        result = tune_by_gradient("ekf", scenario, data, objective=aim)
-        rows.append(_proved(f"gradient of `{aim}`", result.choice, scenario, result.names, result.identified))
-    choice = run_in_memory(Plan("ekf", (scenario,), SEED), TRIALS).choice
-    rows.append(_proved(f"study of `score`, {TRIALS} trials", choice, scenario))
-    return markdown_table(["", "score over the scaled default", "NEES", "NIS", "not determined"], rows)
-
-
-def _proved(what: str, choice: Choice, scenario: Scenario, names=(), identified=()) -> list[str]:
-    comparison = evaluate_held_out(choice, scenario, SEED)
-    loose = ", ".join(name for name, known in zip(names, identified, strict=True) if not known)
-    ratio, tuned = comparison.ratios[SCALED], comparison.tuned
-    return [what, about(ratio), f"{tuned.nees.value:.3g}", f"{tuned.nis.value:.3g}", loose]
 
 
 STUDIES = ("ekf", "nominal", 100), ("kf", "published_tunnel", 100), ("kf", "published_open_bladed", 100)
@@ -206,54 +157,6 @@ def scores_reached() -> str:
         title = f"`{name}`, `{kind}`, {trials} trials"
         rows.append([title, excess[0], f"{excess[1]} ({worst})", f"{count} of {len(scores)}"])
     return markdown_table(["study", "median excess of the score", "largest (95 %)", "surely below 0.5 %"], rows)
-
-
-MASSES, MEASURED, DT, STEPS = 5, (0, 2, 4), 0.1, 300
-STIFFNESS, DAMPING = 4.0, 0.2  # over the mass
-WRONG = 0.5  # relative errors of the springs, at most
-
-
-def masses() -> ModelProblem:
-    """Positions and speeds of masses between springs, of which the filter has the stiffness wrong."""
-    random, n = np.random.default_rng(1), MASSES
-    springs = STIFFNESS * (2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
-    motion = np.block([[np.zeros((n, n)), np.eye(n)], [-springs, -DAMPING * np.eye(n) - 0.02 * springs]])
-    q = np.concatenate([1e-5 * np.exp(random.normal(0, 1, n)), 1e-2 * np.exp(random.normal(0, 1.5, n))])
-    r = 1e-2 * np.exp(random.normal(0, 1, len(MEASURED)))
-    wrong = motion.copy()
-    wrong[n:, :n] *= 1.0 + WRONG * random.uniform(-1, 1, (n, n))
-
-    def model(of: np.ndarray, q: np.ndarray, r: np.ndarray):
-        return affine_model(
-            a=expm(of * DT),
-            b=np.zeros((2 * n, 1)),
-            c=np.eye(2 * n)[list(MEASURED)],
-            process_noise_cov=q,
-            measurement_noise_cov=r,
-            prior_mean=np.zeros(2 * n),
-            prior_cov=0.1 * np.eye(2 * n),
-        )
-
-    assumed = model(wrong, np.full(2 * n, 1e-3), np.full(len(MEASURED), 0.1))
-    return ModelProblem(model(motion, q, r), assumed, np.zeros((STEPS, 1)), name="masses")
-
-
-def many() -> str:
-    """The score of searches among many numbers, over that of the given Q and R."""
-    problem = masses()
-    plan = Plan("kf", (problem,))
-    data, study = plan.training_data(), run_in_memory(plan, TRIALS)
-    rows, choices = [], {f"study of diagonal Q and R, {TRIALS} trials": study.choice}
-    for name, options in (("diagonal", {}), ("full", {"full_q": True, "full_r": True})):
-        ended = tune_by_gradient("kf", problem, data, [1.0], "score", options)
-        choices[f"gradient of the score, {name} Q and R, {len(ended.free)} numbers"] = ended.choice
-    for name, choice in choices.items():
-        comparison = evaluate_held_out(choice, problem, plan.seed)
-        if not rows:
-            ratio = score_ratio(comparison.evaluations[NOISE], comparison.evaluations[GIVEN])
-            rows.append(["noise estimation", f"{ratio.value:.2f}"])
-        rows.append([name, f"{comparison.ratios[GIVEN].value:.2f}"])
-    return markdown_table(["", "score over the given one"], rows)
 
 
 SCENARIO = "mismatch"
@@ -383,4 +286,4 @@ def _line(name: str, evaluation: Evaluation, base: Evaluation) -> list[str]:
 
 
 FIGURES = {"tuning_ridge.png": ridge}
-TABLES = by_name(earned, recovered, maximum_likelihood, aims, numbers_found, scores_reached, many, bought)
+TABLES = by_name(earned, numbers_found, scores_reached, bought)

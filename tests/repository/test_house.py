@@ -36,7 +36,7 @@ OF_TENSORS = (  # networks in models and estimators
     "filters/tensors/",
     "filters/learned/",
     "tuning/learning.py",
-    "thruster_env/core/threads.py",
+    "thruster_env/core/parallel.py",
 )
 
 

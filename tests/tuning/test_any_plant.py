@@ -28,8 +28,7 @@ from tuning.reporting.search_figures import draw_consistency
 from tuning.reporting.sections import advice, held_out_section
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import choice_table
-from tuning.search.objectives import find_objective, nis_ratio
-from tuning.search.plan import Plan, check_objectives
+from tuning.search.plan import Plan, check_objectives, find_objective, nis_ratio
 from tuning.search.space import oracle_choice, untuned_choice
 
 SEEDS = range(8)

@@ -16,12 +16,10 @@ from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.methods.innovations import steady_gain
-from tuning.methods.registry import ALONE, METHODS, find_method
-from tuning.methods.task import Budget, Task, stationary
+from tuning.methods.task import ALONE, METHODS, Budget, Task, find_method, stationary
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import RunsProblem
-from tuning.search.objectives import reported, reported_name
-from tuning.search.plan import TRAINING_SEEDS, Plan
+from tuning.search.plan import TRAINING_SEEDS, Plan, reported, reported_name
 from tuning.search.space import given_choice, untuned_choice
 
 SHORT = find_problem("nominal").replace(steps=70, name="short")

@@ -15,8 +15,7 @@ from tuning.plants.thruster import find_scenario
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Parameter
 from tuning.search.among_types import BY_GRADIENT, MAXIMUM_LIKELIHOOD_AFTER
-from tuning.search.objectives import LIKELIHOOD, OBJECTIVES
-from tuning.search.plan import Plan
+from tuning.search.plan import LIKELIHOOD, OBJECTIVES, Plan
 from tuning.search.space import choice_of, parameters_of
 from tuning.search.study import open_study, run_study
 

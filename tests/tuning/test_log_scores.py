@@ -10,7 +10,7 @@ from filters import make_filter, run
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from tuning.evaluation.runs import log_scores_of
-from tuning.search.objectives import LARGEST
+from tuning.search.plan import LARGEST
 
 PROBLEM = LinearProblem()
 DATA = PROBLEM.data(range(3))

@@ -17,8 +17,7 @@ from tuning.reporting.sections import of_front, reported_about
 from tuning.reporting.tuning_report import _band_sentence
 from tuning.search.among_types import TypeResult
 from tuning.search.measures import measured
-from tuning.search.objectives import find_objective, nees_ratio, reported, reported_name
-from tuning.search.plan import HELD_OUT_SEEDS, Plan
+from tuning.search.plan import HELD_OUT_SEEDS, Plan, find_objective, nees_ratio, reported, reported_name
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
 from tuning.search.trials import measure

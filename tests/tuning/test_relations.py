@@ -5,11 +5,10 @@ import pytest
 
 from tests.tuning.methods.problems import linear, task_of
 from tuning.likelihood.gradient import goal_of, tune_by_gradient
-from tuning.methods.registry import find_method
+from tuning.methods.task import find_method
 from tuning.plants.thruster import find_scenario
-from tuning.search.objectives import LIKELIHOOD, LOG_SCORE
 from tuning.search.parameters import model_parameters, relation_of
-from tuning.search.plan import Plan
+from tuning.search.plan import LIKELIHOOD, LOG_SCORE, Plan
 from tuning.search.space import parameters_of
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_study

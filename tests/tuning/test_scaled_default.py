@@ -23,8 +23,7 @@ from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds, training_seeds
 from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem
-from tuning.search.objectives import nis_ratio
-from tuning.search.plan import TRAINING_SEEDS
+from tuning.search.plan import TRAINING_SEEDS, nis_ratio
 from tuning.search.space import oracle_choice, untuned_choice
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")

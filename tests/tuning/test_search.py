@@ -15,8 +15,7 @@ from tuning.likelihood.gradient import BAD_START, tune_by_gradient
 from tuning.plants.thruster import find_scenario
 from tuning.search import trials
 from tuning.search.among_types import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED
-from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
-from tuning.search.plan import Plan
+from tuning.search.plan import LARGEST, NIS_BAND, Plan, nis_violation
 from tuning.search.space import choice_of, distributions, oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
 from tuning.search.trials import BLOCK, SAMPLERS, best_trial, box, enqueue_new, make_sampler, measure, violation

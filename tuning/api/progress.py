@@ -157,7 +157,7 @@ def trial_bar(
 
 def _best(trials: Sequence[FrozenTrial], plan: Plan) -> str:
     """The first objective of the best trial, of a likelihood log L itself; a dash before there is one."""
-    from tuning.search.objectives import PROPER, reported, reported_name
+    from tuning.search.plan import PROPER, reported, reported_name
     from tuning.search.trials import best_trial
 
     best = best_trial(trials)

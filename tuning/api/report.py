@@ -57,8 +57,7 @@ from tuning.reporting.sections import (
     search_section,
 )
 from tuning.reporting.subject import Subject, find_subject, is_file, kept_nis
-from tuning.search.objectives import nis_ratio
-from tuning.search.plan import SIZE_SEEDS, at_ends
+from tuning.search.plan import SIZE_SEEDS, at_ends, nis_ratio
 from tuning.search.storage import quiet_optuna, storage_text
 from tuning.search.trials import measure
 

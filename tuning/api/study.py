@@ -22,14 +22,12 @@ from tuning.evaluation.tuned import check_keepable, write_tuned
 from tuning.evaluation.worth import all_warnings, tuning_effect
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import Identifiability
-from tuning.methods.registry import GRADIENT_METHOD, METHODS
-from tuning.methods.task import Refused
+from tuning.methods.task import GRADIENT_METHOD, METHODS, Refused
 from tuning.problems.assumed import as_argument, rows_argument
 from tuning.problems.problem import Problem, score_label
 from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.tuning_report import as_json, report
-from tuning.search.objectives import reported, reported_name
-from tuning.search.plan import Plan, range_warning
+from tuning.search.plan import Plan, range_warning, reported, reported_name
 from tuning.search.space import Choice, untuned_choice
 from tuning.search.study import (
     StudyResult,

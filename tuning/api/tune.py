@@ -48,16 +48,14 @@ from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import identify
 from tuning.likelihood.objective import OF_STATES
 from tuning.likelihood.parametric import check_gradient
-from tuning.methods.registry import DEFAULT, GRADIENT_METHOD, METHODS, ONLY, find_method
-from tuning.methods.task import Budget, Refused, Task
+from tuning.methods.task import DEFAULT, GRADIENT_METHOD, METHODS, ONLY, Budget, Refused, Task, find_method
 from tuning.problems.assumed import AssumedProblem, within
 from tuning.problems.data import Data
 from tuning.problems.find import built_in
 from tuning.problems.problem import Problem
 from tuning.search.measures import measured
-from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.parameters import R
-from tuning.search.plan import HELD_OUT_SEEDS, Plan
+from tuning.search.plan import HELD_OUT_SEEDS, LIKELIHOOD, SCORE, Plan
 from tuning.search.space import (
     AUTO,
     Choice,
@@ -419,7 +417,7 @@ def run_tuning(
         storage: journal file or URL; None for a study that ends with the process.
         name: of the study; from the plan if None.
         out: the tuned file; none is written if None.
-        method: determines the choice, one of `tuning.methods.registry.METHODS`; None for a study by the plan's
+        method: determines the choice, one of `tuning.methods.task.METHODS`; None for a study by the plan's
             sampler.
         aim: the objective of the method "gradient", as of `aim_of`.
         workers: processes that share the study.

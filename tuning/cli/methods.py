@@ -8,8 +8,7 @@ from typing import Annotated, Any
 from thruster_env.core.text_tables import Table
 from tuning.api.markers import INPUT, Argument
 from tuning.api.result import Printed
-from tuning.methods.registry import METHODS, find_method
-from tuning.methods.task import GRADIENT, TRUTH
+from tuning.methods.task import GRADIENT, METHODS, TRUTH, find_method
 
 NEEDS = "needs"
 HEADS = ("method", "what it does", "use it", NEEDS)

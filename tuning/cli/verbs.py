@@ -68,7 +68,7 @@ def names_in(choices: str) -> tuple[Sequence[str], str]:
 
         return [*CHANNELS], f"{', '.join(CHANNELS)}."
     if choices == "objectives":
-        from tuning.search.objectives import OBJECTIVES  # which imports optuna
+        from tuning.search.plan import OBJECTIVES  # which imports optuna
 
         return [*OBJECTIVES], f"{', '.join(OBJECTIVES)}, output:SYMBOL."
     from tuning.problems.find import built_in

@@ -20,9 +20,8 @@ from tuning.problems.assumed import as_argument, rows_argument
 from tuning.problems.check import data_of
 from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates, Problem
-from tuning.search.objectives import LARGEST, nis_ratio
 from tuning.search.parameters import ensemble_sizes_of
-from tuning.search.plan import TRAINING_SEEDS
+from tuning.search.plan import LARGEST, TRAINING_SEEDS, nis_ratio
 from tuning.search.space import Choice, given_choice, oracle_choice, untuned_choice
 
 # Their names in tables, sentences and pictures.

@@ -48,9 +48,8 @@ from tuning.problems.check import data_of
 from tuning.problems.data import Data, estimates_in_parts
 from tuning.problems.problem import Problem
 from tuning.search.measures import measured
-from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.parameters import ensemble_sizes_of
-from tuning.search.plan import Plan
+from tuning.search.plan import LIKELIHOOD, SCORE, Plan
 from tuning.search.space import Choice, has_search_space, time_constants_on
 from tuning.search.storage import quiet_optuna
 from tuning.search.study import open_study, run_trials, stop_on_interrupt

@@ -13,9 +13,8 @@ from thruster_env.core.checks import with_progress
 from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, score_ratio, values_of
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
-from tuning.search.objectives import MOST_PRICE, nis_violation
 from tuning.search.parameters import size_ladder
-from tuning.search.plan import SIZE_SEEDS, Plan
+from tuning.search.plan import MOST_PRICE, SIZE_SEEDS, Plan, nis_violation
 from tuning.search.space import Choice
 
 FEW = 8  # of the fresh seeds, on which all sizes of a large model are compared first

@@ -40,8 +40,7 @@ from tuning.problems.assumed import augmented, name_and_unknown, suited
 from tuning.problems.check import is_older
 from tuning.problems.find import built_in, find_given, find_problem, scenario_of
 from tuning.problems.problem import Problem
-from tuning.search.objectives import NIS_BAND
-from tuning.search.plan import Plan
+from tuning.search.plan import NIS_BAND, Plan
 from tuning.search.space import Choice
 from tuning.search.study import StudyResult
 from tuning.search.validation import as_data

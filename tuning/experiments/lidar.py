@@ -26,8 +26,7 @@ from filters.consistency.nees import Interval
 from thruster_env.core.text_tables import markdown_table
 from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.evaluate import Evaluation, evaluate, mse
-from tuning.methods.registry import find_method
-from tuning.methods.task import Task
+from tuning.methods.task import Task, find_method
 from tuning.problems.model_problem import RunsProblem
 from tuning.search.space import Choice, untuned_choice
 

@@ -42,8 +42,7 @@ from tuning.problems.find import built_in, find_problem
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Parameter, Problem
 from tuning.problems.scenario import plain
-from tuning.search.objectives import LIKELIHOOD, SCORE, find_objective, nis_ratio
-from tuning.search.plan import Plan
+from tuning.search.plan import LIKELIHOOD, SCORE, Plan, find_objective, nis_ratio
 from tuning.search.space import (
     Choice,
     everything_of,

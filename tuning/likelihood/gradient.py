@@ -14,8 +14,8 @@ from tuning.likelihood.objective import Objective
 from tuning.likelihood.parametric import Family, check_gradient
 from tuning.problems.data import Data
 from tuning.problems.problem import Parameter, Problem
-from tuning.search.objectives import LIKELIHOOD
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
+from tuning.search.plan import LIKELIHOOD
 from tuning.search.space import Choice, untuned_choice
 
 BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from the optimum

@@ -26,7 +26,7 @@ from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.ascent import Evaluation
 from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates
-from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
+from tuning.search.plan import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 from tuning.search.space import Choice
 
 OF_STATES = {  # objectives on the true states: what of them is summed over steps

@@ -1,1 +1,3 @@
-"""Methods of tuning: published methods that find Q, R and other numbers, each behind the same interface."""
+"""Methods that find Q, R and other numbers of a filter; an import of the package registers them all."""
+
+from tuning.methods import gradients, innovations, searches  # noqa: F401 - their methods register themselves

@@ -20,8 +20,8 @@ from tuning.likelihood.gradient import objective_of, optimum, start_at, starts_o
 from tuning.likelihood.objective import Objective
 from tuning.methods.task import COVARIANCE, DIAGONAL, FEW, GRADIENT, MATRICES, NOISE, TRUTH, Task, method, way_out
 from tuning.problems.data import Data
-from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 from tuning.search.parameters import MeasurementVariance, ProcessVariance
+from tuning.search.plan import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 from tuning.search.space import Choice
 
 ABBEEL = "Abbeel, Coates, Montemerlo, Ng, Thrun (2005)"

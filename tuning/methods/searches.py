@@ -16,18 +16,27 @@ from optuna.distributions import BaseDistribution
 from thruster_env.core.angles import difference
 from tuning.evaluation.residuals import predicted
 from tuning.likelihood.ascent import DIVERGED
-from tuning.methods.task import COVARIANCE, GRADIENT, MODEL, NUTPIE, TRUTH, Spent, Task, method
+from tuning.methods.task import (
+    COVARIANCE,
+    GAUSSIAN,
+    GRADIENT,
+    HANSEN,
+    MODEL,
+    NUTPIE,
+    TPE,
+    TRUTH,
+    UNIFORM,
+    Spent,
+    Task,
+    method,
+)
 from tuning.problems.data import estimates_in_parts
 from tuning.problems.problem import Coordinates
-from tuning.search.objectives import LIKELIHOOD
+from tuning.search.plan import LIKELIHOOD
 from tuning.search.space import Choice
 from tuning.search.storage import quiet_optuna
 from tuning.search.trials import make_sampler
 
-TPE = "Bergstra, Bardenet, Bengio, Kegl (2011)"
-HANSEN = "Hansen (2016), arXiv 1604.00772"
-GAUSSIAN = "Optuna's GPSampler"
-UNIFORM = "Bergstra, Bengio (2012)"
 CHEN = "Chen, Heckman, Julier, Ahmed (2018), arXiv 1807.08855"
 
 # Of draws from the posterior.

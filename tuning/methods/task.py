@@ -1,4 +1,4 @@
-"""`Task`: what a method of tuning works on, and `Method`: what one needs, with the decorator that registers it.
+"""`Task`: what a method of tuning works on, and the methods by name, which `method` registers where they stand.
 
 A task runs the filter, counts passes and keeps the best choice so far.
 """
@@ -12,11 +12,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from filters.registry import filter_type
+from thruster_env.core.checks import one_of
 from thruster_env.core.modules import to_install
 from thruster_env.core.streams import METHOD_OF_TUNING, derived_generator
 from thruster_env.model.affine import linearize
@@ -30,15 +31,24 @@ from tuning.likelihood.objective import Objective
 from tuning.likelihood.parametric import check_gradient
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.problem import Parameter, Problem
-from tuning.search.objectives import LIKELIHOOD, LOG_SCORES, NEES, SCORE, VARIANCES, find_objective, penalised
 from tuning.search.parameters import Q, R, model_parameters
+from tuning.search.plan import LIKELIHOOD, LOG_SCORES, NEES, SCORE, VARIANCES, find_objective, penalised
 from tuning.search.space import Choice, has_search_space, neutral, parameters, untuned_choice
 
 FEW = 32  # runs, by which passes are priced
 TIMED = 3  # calls, of which the shortest counts, of what is priced
 ALIKE = 1e-9  # relative difference, up to which two linearisations are the same
 ROUNDING = 1e-6  # part of an objective: an answer that is worse by less is as good
+F = TypeVar("F", bound=Callable[..., None])
 
+GRADIENT_METHOD = "gradient"
+DEFAULT = "tpe"
+ONLY = "-only"  # behind a sampler: without what a study does besides
+
+TPE = "Bergstra, Bardenet, Bengio, Kegl (2011)"
+HANSEN = "Hansen (2016), arXiv 1604.00772"
+GAUSSIAN = "Optuna's GPSampler"
+UNIFORM = "Bergstra, Bengio (2012)"
 
 # What a method may need.
 TRUTH = "truth"  # true states
@@ -425,7 +435,79 @@ class Method(NamedTuple):
             task.refuse_worse()
 
 
-ALONE: dict[str, Method] = {}  # methods that run alone, by name: `method` registers them
+def study(task: Task) -> None:
+    """Trials of the objective, of the ensemble size, too, with the mean NIS in a band.
+
+    The first trials are the baselines and the maximum-likelihood values. The best trials then meet the baselines
+    on validation seeds, and the best baseline is chosen unless one of them is significantly better
+    (docs/appendix/tuning.md).
+    """
+    raise ValueError("a study must be run by tuning.tune or thruster tune, but got a task")
+
+
+def gradient(task: Task) -> None:
+    """The maximum of log L, or the least score, mse or log-score if that is the objective, with standard errors.
+
+    A study by `tpe` runs beside it. The optimum meets the baselines on validation seeds, as trials do.
+    """
+    study(task)
+
+
+METHODS: dict[str, Method] = {  # studies; `method` adds those that run alone
+    DEFAULT: Method(
+        "the default: a study by Optuna's tree-structured Parzen estimator, its best trials validated",
+        "for any filter and objective, also for an ensemble's size and among filters",
+        study,
+        TPE,
+        sampler="tpe",
+    ),
+    "gp": Method(
+        "the same study by Optuna's Gaussian process",
+        "for any filter, if a trial takes seconds",
+        study,
+        GAUSSIAN,
+        sampler="gp",
+    ),
+    "cma-es": Method(
+        "the same study by covariance matrix adaptation",
+        "for any filter, with hundreds of trials",
+        study,
+        HANSEN,
+        sampler="cma-es",
+    ),
+    "nsga-ii": Method(
+        "the same study by a genetic algorithm",
+        "with two objectives, for a Pareto front",
+        study,
+        "Deb, Pratap, Agarwal, Meyarivan (2002)",
+        sampler="nsga-ii",
+    ),
+    "random": Method(
+        "the same study by independent draws",
+        "to compare: every sampler has to beat it",
+        study,
+        UNIFORM,
+        sampler="random",
+    ),
+    "grid": Method(
+        "the same study over five values of each parameter, in random order",
+        "with up to three parameters, to see the whole range",
+        study,
+        UNIFORM,
+        sampler="grid",
+    ),
+    GRADIENT_METHOD: Method(
+        "`likelihood` with standard errors, or `score`, `mse` or `log-score` if that is the objective, validated; "
+        "a study by `tpe` runs beside it",
+        "for Kalman filters, if the accuracy of Q and R counts, too",
+        gradient,
+        "Gupta, Mehra (1974)",
+        (GRADIENT,),
+        sampler="tpe",
+    ),
+}
+
+ALONE: dict[str, Method] = {}  # those that run alone
 
 
 def method(
@@ -436,11 +518,16 @@ def method(
     needs: tuple[str, ...] = (),
     options: tuple[str, ...] = OPTIONS,
     by_trials: bool = False,
-) -> Callable[[Callable[[Task], None]], Callable[[Task], None]]:
+) -> Callable[[F], F]:
     """The decorator that registers a function as the method of a name; for the other arguments see `Method`."""
 
-    def register(function: Callable[[Task], None]) -> Callable[[Task], None]:
-        ALONE[name] = Method(about, when, function, source, needs, options, by_trials)
+    def register(function: F) -> F:
+        METHODS[name] = ALONE[name] = Method(about, when, function, source, needs, options, by_trials)
         return function
 
     return register
+
+
+def find_method(name: str) -> Method:
+    """A method by its name; ValueError for an unknown one."""
+    return METHODS[one_of("method", name, tuple(METHODS))]

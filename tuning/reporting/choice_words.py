@@ -27,8 +27,8 @@ from tuning.problems.assumed import may_estimate_constants, within
 from tuning.problems.find import logs_package
 from tuning.problems.problem import Problem
 from tuning.search.measures import LEVEL
-from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MOST_PRICE, MSE, NIS_BAND, PROPER, nis_ratio
 from tuning.search.parameters import index_pairs
+from tuning.search.plan import LIKELIHOOD, LOG_SCORE, MOST_PRICE, MSE, NIS_BAND, PROPER, nis_ratio
 from tuning.search.space import Choice, everything_of, neutral, parameters, parameters_of
 from tuning.search.validation import choice_from
 

@@ -28,7 +28,7 @@ from tuning.evaluation.sizes import SizeRow
 from tuning.problems.data import Data
 from tuning.reporting.style import SCRIPT, STYLE
 from tuning.reporting.time_figures import one_run
-from tuning.search.objectives import reported, reported_name
+from tuning.search.plan import reported, reported_name
 from tuning.search.trials import best_trial
 
 if TYPE_CHECKING:

@@ -37,7 +37,7 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
 from tuning.reporting.page import Picture, figure_svg
 from tuning.reporting.time_figures import COLUMNS, plotted_states
-from tuning.search.objectives import SCORE, reported
+from tuning.search.plan import SCORE, reported
 from tuning.search.space import FILTER_TYPE
 from tuning.search.trials import best_trial, is_consistent
 

@@ -57,9 +57,17 @@ from tuning.reporting.subject import Subject
 from tuning.reporting.tables import kinds_table
 from tuning.reporting.time_figures import draw_estimates, draw_gains, draw_innovations, draw_signal, gains
 from tuning.search.among_types import filter_types_tried
-from tuning.search.objectives import NIS_BAND, find_objective, reported, reported_name
 from tuning.search.parameters import index_pairs
-from tuning.search.plan import TRAINING_SEEDS, Plan, range_warning, range_words
+from tuning.search.plan import (
+    NIS_BAND,
+    TRAINING_SEEDS,
+    Plan,
+    find_objective,
+    range_warning,
+    range_words,
+    reported,
+    reported_name,
+)
 from tuning.search.space import AUTO, FILTER_TYPE, Choice
 
 MANY_TRIALS = 50

@@ -11,9 +11,8 @@ from tuning.likelihood.gradient import GradientResult
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import number_rows
 from tuning.search.among_types import TypeResult
-from tuning.search.objectives import LIKELIHOOD, PROPER, reported, reported_name
 from tuning.search.parameters import index_pairs
-from tuning.search.plan import Plan
+from tuning.search.plan import LIKELIHOOD, PROPER, Plan, reported, reported_name
 from tuning.search.space import Choice
 
 

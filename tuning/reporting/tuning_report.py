@@ -45,9 +45,8 @@ from tuning.reporting.choice_words import (
 )
 from tuning.reporting.tables import front_table, gradient_table, kinds_table
 from tuning.search.among_types import filter_types_tried
-from tuning.search.objectives import LIKELIHOOD, NIS_BAND, PROPER, reported, reported_name
 from tuning.search.parameters import index_pairs, size_ladder
-from tuning.search.plan import Plan, at_ends, range_words
+from tuning.search.plan import LIKELIHOOD, NIS_BAND, PROPER, Plan, at_ends, range_words, reported, reported_name
 from tuning.search.space import parameters_of
 from tuning.search.study import StudyResult
 from tuning.search.trials import is_over_budget

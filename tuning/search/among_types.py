@@ -26,9 +26,8 @@ from tuning.likelihood.objective import OF_STATES, Objective
 from tuning.likelihood.parametric import has_gradient
 from tuning.problems.data import Data, estimates_in_parts
 from tuning.problems.problem import Problem
-from tuning.search.objectives import LIKELIHOOD, SCORE, reported
 from tuning.search.parameters import R, model_parameters, size_ladder
-from tuning.search.plan import Plan
+from tuning.search.plan import LIKELIHOOD, SCORE, Plan, reported
 from tuning.search.space import FILTER_TYPE, Choice, ends_of, trial_parameters, untuned_choice, within_ranges
 from tuning.search.trials import COST, NIS, best_trial, enqueue_new, is_consistent, is_near, is_over_budget, near
 

@@ -12,17 +12,17 @@ from filters.consistency.nees import Interval
 from tuning.evaluation.evaluate import Evaluation, compute_metrics, farthest, mse, score
 from tuning.evaluation.runs import RunMetrics, metrics_of_all
 from tuning.problems.data import Data
-from tuning.search.objectives import (
+from tuning.search.plan import (
     DIVERGENCE_PENALTY,
     LARGEST,
     LOG_SCORE,
     MSE,
     OUTPUT,
     PROPER,
+    Plan,
     nees_ratio,
     nis_ratio,
 )
-from tuning.search.plan import Plan
 from tuning.search.space import Choice
 
 LEVEL = 0.05  # of a two-sided interval

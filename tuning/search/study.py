@@ -35,8 +35,7 @@ from tuning.search.among_types import (
     sizes_of,
 )
 from tuning.search.measures import measured
-from tuning.search.objectives import nis_ratio
-from tuning.search.plan import Plan
+from tuning.search.plan import Plan, nis_ratio
 from tuning.search.space import FILTER_TYPE, Choice, trial_parameters
 from tuning.search.storage import PROCESS, drop_waiting, retry_orphans, this_process
 from tuning.search.trials import BLOCK, COST, best_trial, cost_of, is_consistent, make_sampler, measure, run_trial

@@ -31,17 +31,17 @@ from thruster_env.core.streams import LOCAL_TRIALS, derived_generator
 from tuning.evaluation.evaluate import Evaluation, compute_metrics, run_scores
 from tuning.evaluation.runs import RunMetrics, joined, metrics_of_all
 from tuning.problems.data import Data
-from tuning.search.objectives import (
+from tuning.search.plan import (
     LARGEST,
     LOG_SCORES,
     NEES,
     SCORE,
     VARIANCES,
+    Plan,
     nis_ratio,
     nis_violation,
     penalised,
 )
-from tuning.search.plan import Plan
 from tuning.search.space import FILTER_TYPE, Choice, suggest
 
 BLOCK = 8  # seeds between two decisions whether to prune

@@ -35,9 +35,8 @@ from tuning.search.measures import (
     over,
     signed_rank,
 )
-from tuning.search.objectives import LARGEST, MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER, SCORE
 from tuning.search.parameters import ensemble_sizes_of, model_parameters, obeying
-from tuning.search.plan import Plan
+from tuning.search.plan import LARGEST, MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER, SCORE, Plan
 from tuning.search.space import Choice
 from tuning.search.trials import cost_of
 

@@ -19,11 +19,10 @@ from tuning.methods.innovations import (
     steady_gain,
     updated,
 )
-from tuning.methods.registry import find_method
-from tuning.methods.task import Budget, Task, stationary
+from tuning.methods.task import Budget, Task, find_method, stationary
 from tuning.problems.model_problem import ModelProblem, RunsProblem
 from tuning.problems.problem import Parameter
-from tuning.search.objectives import LIKELIHOOD
+from tuning.search.plan import LIKELIHOOD
 
 # Flow of the Nile at Aswan, 1871 to 1970 [1e8 m^3]: Durbin, Koopman (2012), "Time series analysis by state space
 # methods", 2nd ed., where Q is 1469.1 and R 15099 (section 2.10).

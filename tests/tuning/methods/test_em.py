@@ -6,9 +6,8 @@ import pytest
 from tests.tuning.methods.problems import P0, A, C, at, linear, task_of
 from tuning.evaluation.evaluate import values_of
 from tuning.methods.gradients import counts_of
-from tuning.methods.registry import find_method
-from tuning.methods.task import Budget
-from tuning.search.objectives import LIKELIHOOD
+from tuning.methods.task import Budget, find_method
+from tuning.search.plan import LIKELIHOOD
 
 FIRST_Q, FIRST_R = np.array([0.5, 0.02]), np.array([0.1, 0.6])
 

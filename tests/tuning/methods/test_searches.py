@@ -9,11 +9,10 @@ from tests.tuning.methods.problems import P0, A, C, Q, R, at, linear, task_of
 from tuning.evaluation.evaluate import values_of
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.methods.gradients import Factors
-from tuning.methods.registry import METHODS, find_method
 from tuning.methods.searches import BACKWARD, FORWARD, _squares
-from tuning.methods.task import Budget, Task
+from tuning.methods.task import METHODS, Budget, Task, find_method
 from tuning.plants.thruster import find_scenario
-from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
+from tuning.search.plan import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 
 FULL = {"full_q": True, "full_r": True}
 

@@ -13,7 +13,7 @@ from tuning.experiments import lorenz96
 from tuning.experiments.benchmark import noise_free_problem
 from tuning.experiments.lidar import drawn, lidar_problem
 from tuning.experiments.pendulum import model as pendulum
-from tuning.methods.registry import ALONE
+from tuning.methods.task import ALONE
 from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem

@@ -46,13 +46,11 @@ from tuning.experiments.methods.problems import (
 from tuning.experiments.users import holm
 from tuning.likelihood.gradient import optimum
 from tuning.likelihood.parametric import DIFFERENTIABLE
-from tuning.methods.registry import ALONE, ONLY, find_method
-from tuning.methods.task import Answer, Budget, Task
+from tuning.methods.task import ALONE, ONLY, Answer, Budget, Task, find_method
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
-from tuning.search.objectives import LOG_SCORE, SCORE
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
-from tuning.search.plan import Plan
+from tuning.search.plan import LOG_SCORE, SCORE, Plan
 from tuning.search.space import Choice, oracle_choice, untuned_choice
 from tuning.search.storage import quiet_optuna
 from tuning.search.study import open_study, run_study

@@ -30,9 +30,8 @@ from tuning.experiments.methods.problems import (
     Protocol,
 )
 from tuning.experiments.methods.runs import Regret, Result, regrets, run_protocol, within
-from tuning.methods.registry import ALONE
-from tuning.methods.task import TRUTH
-from tuning.search.objectives import LIKELIHOOD
+from tuning.methods.task import ALONE, TRUTH
+from tuning.search.plan import LIKELIHOOD
 
 # Methods that look at no true state; but searches minimise an error where there are true states.
 BLIND = (
