@@ -15,9 +15,8 @@ from thruster_env.logs.log import Log
 from thruster_env.logs.read import INPUTS_ACT
 from thruster_env.logs.recorders.bags import STAMPS
 from tuning.api.markers import LOGS, READ, Augment, ModelOption, Option, PresetOption
-from tuning.logs.read import model_of_logs, name_of, read_named
+from tuning.logs.read import check_on_grid, model_of_logs, name_of, read_named, with_numbers
 from tuning.series.column import as_columns, is_numbers
-from tuning.series.named import check_on_grid, with_numbers
 
 if TYPE_CHECKING:
     from tuning.problems.problem import Problem

@@ -29,13 +29,22 @@ from tuning.likelihood.identify import identify
 from tuning.likelihood.parametric import ModelFamily
 from tuning.likelihood.recorded import CLOCK, clock_offsets, shifted
 from tuning.likelihood.result import Identification, write_values
-from tuning.logs.read import check_model, name_of, offer_of, read_named, texts
+from tuning.logs.read import (
+    check_model,
+    check_on_grid,
+    is_auto,
+    maker_of,
+    name_of,
+    offer_of,
+    read_named,
+    texts,
+    with_numbers,
+)
 from tuning.problems.assumed import name_and_unknown
 from tuning.problems.find import logs_package, named
 from tuning.problems.log_parts import check_apart, check_times, parts_of
 from tuning.problems.log_problem import MISSING, LogProblem, without_outliers
 from tuning.problems.problem import Parameter, Problem
-from tuning.series.named import check_on_grid, is_auto, maker_of, with_numbers
 
 # Of `read_named`.
 OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt", "grid", "inputs_act", "stamps")
