@@ -1,15 +1,15 @@
 """`View`: a filter's estimates with their bands, innovations, consistency over time, and figures.
 
 In order: the data of a bench, which are runs of a plant or whole logs; the view; the disturbances of a plant as
-numbers; and the numbers that one may change, with their ranges and known values.
+numbers; the numbers that one may change, with their ranges and known values; and one figure of a view.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from functools import lru_cache
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from filters.filter import Filter
 from thruster_env.core.checks import at_least, between
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs.log import seen_by
+from thruster_env.model.quantities import Quantity
 from tuning.evaluation.evaluate import Evaluation, compute_metrics
 from tuning.evaluation.runs import RunMetrics, metrics_by_run, metrics_of_all
 from tuning.problems.check import data_of
@@ -29,6 +30,15 @@ from tuning.problems.scenario import PlantScenario, plain
 from tuning.search.parameters import PRIOR, Correlation, FilterParameter, MeasurementVariance, ProcessVariance, Q
 from tuning.search.space import Choice, everything_of, neutral, parameters, parameters_of
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from tuning.exploring.bench import Bench
+
+WITHIN_95 = 1.959963984540054  # standard normal deviates
+MOST_STATES, MOST_INNOVATIONS = 4, 2
+INK, ESTIMATE = "#1b1f24", "#0b6bb8"
 LOWER, HIGHER, NEAR = "lower", "higher", "near"  # what is better in a figure
 SENSORS, AMPLIFIER = "sensors", "amplifier"  # fields of a scenario that hold effects
 SIGMA = "sigma"  # unit of what is said in standard deviations of the sensor's noise
@@ -419,3 +429,87 @@ def start_of(knobs: Sequence[Knob], problem: Problem, choice: Choice) -> dict[st
         value = plant.get(knob.name, chosen.get(knob.name, neutral(knob.name)))
         values[knob.name] = knob.low if value is None else value
     return values
+
+
+def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) -> Figure:
+    """One run's states in their bands and its innovations; NIS, NEES and autocorrelation of all runs."""
+    from matplotlib.figure import Figure
+
+    run = min(run, len(view.estimate) - 1)
+    panels: list[Callable[[Axes], None]] = []
+    for i, named in enumerate(bench.states[:MOST_STATES]):
+        panels.append(partial(_state, view=view, run=run, i=i, named=named))
+    for i, named in enumerate(bench.measurements[:MOST_INNOVATIONS]):
+        panels.append(partial(_innovation, view=view, run=run, i=i, named=named))
+    panels.append(lambda ax: _level(ax, view.time[run], view.nis, view.nis_band, "NIS"))
+    if view.nees is not None and view.nees_band is not None:
+        nees, band = view.nees, view.nees_band
+        panels.append(lambda ax: _level(ax, view.time[run], nees, band, "NEES"))
+    panels.append(lambda ax: _lags(ax, view))
+    rows = -(-len(panels) // 2)
+    figure = Figure(figsize=(9.0, 1.5 * rows + 0.6), layout="constrained")
+    numbers = ",  ".join(
+        f"{name} {figure_.value:.3g} {figure_.unit}".rstrip() for name, figure_ in view.figures.items()
+    )
+    figure.suptitle(f"{title or bench.title}\n{numbers}", fontsize=8)
+    axes = figure.subplots(rows, 2, squeeze=False).ravel()
+    for ax, draw in zip(axes, panels, strict=False):
+        draw(ax)
+        ax.tick_params(labelsize=7)
+        ax.xaxis.label.set_size(7)
+        ax.yaxis.label.set_size(7)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.margins(x=0.01)
+    for ax in axes[len(panels) :]:
+        ax.set_visible(False)
+    return figure
+
+
+def _state(ax: Axes, view: View, run: int, i: int, named: Quantity) -> None:
+    mean, half = view.estimate[run, :, i], WITHIN_95 * view.deviation[run, :, i]
+    ax.fill_between(view.time[run], mean - half, mean + half, color=ESTIMATE, alpha=0.2, linewidth=0)
+    if view.truth is not None:
+        ax.plot(view.time[run], view.truth[run, :, i], color=INK, linewidth=0.8)
+    ax.plot(view.time[run], mean, color=ESTIMATE, linewidth=1.0)
+    ax.set_ylabel(_labelled(named))
+
+
+def _innovation(ax: Axes, view: View, run: int, i: int, named: Quantity) -> None:
+    half = WITHIN_95 * view.innovation_deviation[run, :, i]
+    ax.fill_between(view.time[run], -half, half, color=ESTIMATE, alpha=0.2, linewidth=0)
+    ax.plot(*present(view.time[run], view.innovation[run, :, i]), color=ESTIMATE, linewidth=0.7)
+    ax.set_ylabel(f"innovation {_labelled(named)}")
+
+
+def _level(
+    ax: Axes, time: np.ndarray, values: np.ndarray, band: tuple[np.ndarray, np.ndarray], label: str
+) -> None:
+    ax.fill_between(time, *band, color=ESTIMATE, alpha=0.2, linewidth=0)
+    ax.semilogy(*present(time, mean_of_runs(values)), color=ESTIMATE, linewidth=0.7)
+    ax.set_ylabel(label)
+
+
+def _lags(ax: Axes, view: View) -> None:
+    ax.axhspan(-view.autocorrelation_band, view.autocorrelation_band, color=ESTIMATE, alpha=0.2, linewidth=0)
+    for channel in np.asarray(view.autocorrelation):
+        ax.vlines(np.arange(1, len(channel) + 1), 0.0, channel, color=ESTIMATE)
+    ax.set_ylim(-1.0, 1.0)
+    ax.set_xlabel("lag [steps]")
+    ax.set_ylabel("autocorrelation")
+
+
+def _labelled(named: Quantity) -> str:
+    return f"{named.name} [{named.unit}]" if named.unit else named.name
+
+
+def present(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times and values where there is one: between two others that are missing, a line would show none."""
+    known = ~np.isnan(values)
+    return time[known], values[known]
+
+
+def mean_of_runs(values: np.ndarray) -> np.ndarray:
+    """The mean over runs (S, K) -> (K,) of what is finite; NaN where nothing is."""
+    known = np.isfinite(values)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)

@@ -25,8 +25,7 @@ from bokeh.palettes import Cividis256, RdBu11
 from bokeh.plotting import figure
 
 from tuning.exploring.bench import Bench, Map, Trial
-from tuning.exploring.page.export import WITHIN_95, mean_of_runs, present
-from tuning.exploring.view import Knob, View
+from tuning.exploring.view import WITHIN_95, Knob, View, mean_of_runs, present
 
 Column = np.ndarray | Sequence[np.ndarray]
 HELD = ("#d55e00", "#009e73", "#cc79a7", "#e69f00")  # Okabe, Ito (2008), "Color universal design"

@@ -12,6 +12,8 @@ Anything else gets one empty answer, 404, whether the token is nearly right or n
 from __future__ import annotations
 
 import asyncio
+import base64
+import io
 import json
 import logging
 import math
@@ -22,7 +24,7 @@ from contextlib import suppress
 from functools import cache, partial
 from hmac import compare_digest
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bokeh.core.properties import String
 from bokeh.document import Document
@@ -40,10 +42,16 @@ from tornado.web import ErrorHandler, OutputTransform
 
 from thruster_env.model.quantities import Quantity
 from tuning.exploring.bench import SCENES, Bench, Scene
-from tuning.exploring.page.export import KINDS, exported
 from tuning.exploring.page.pictures import DARK, HELD, Colours, Look, MapPicture, Pictures, Sent
-from tuning.exploring.view import View
+from tuning.exploring.view import View, figure_of
 
+KINDS = {
+    "tuned": "tuned file",
+    "python": "Python lines",
+    "command": "command",
+    "png": "PNG picture",
+    "svg": "SVG picture",
+}
 WIDTHS = (200, 4000)  # of a picture, in points
 MOST_TRIALS = 10_000
 log = logging.getLogger(__name__)
@@ -77,6 +85,36 @@ LIGHT = Colours(ink="#1b1f24", axis="#4d5661", grid="#e3e6ea", estimate="#0b6bb8
 def ground(dark: bool) -> Colours:
     """Those of the ground that the page has."""
     return DARK if dark else LIGHT
+
+
+class File(NamedTuple):
+    """A file for the browser to keep: text, or if it is none, bytes in base 64."""
+
+    name: str
+    type: str
+    text: str | None
+    base64: str | None = None
+
+
+def exported(bench: Bench, values: Mapping[str, float], view: View, run: int, kind: str) -> File:
+    """A file of what is seen.
+
+    Raises:
+        ValueError: for another kind than those of `KINDS`.
+    """
+    if kind == "tuned":
+        return File("tuned.json", "application/json", bench.tuned_file(values))
+    if kind == "python":
+        return File("explored.py", "text/x-python", bench.python_lines(values))
+    if kind == "command":
+        return File("command.txt", "text/plain", bench.command(values))
+    if kind not in KINDS:
+        raise ValueError(f"kind must be one of {', '.join(KINDS)}, but got {kind}")
+    drawn = io.BytesIO()
+    figure_of(bench, view, run).savefig(drawn, format=kind, dpi=150)
+    if kind == "svg":
+        return File("explored.svg", "image/svg+xml", drawn.getvalue().decode())
+    return File("explored.png", "image/png", None, base64.b64encode(drawn.getvalue()).decode())
 
 
 class Session:

@@ -17,9 +17,9 @@ from bokeh.document import Document
 
 from tests.linear_problem import LinearProblem
 from tuning.exploring.bench import Bench
-from tuning.exploring.page.export import present
 from tuning.exploring.page.pictures import DARK, HELD, as_sent
 from tuning.exploring.page.session import Server, Session, _plain, page_of
+from tuning.exploring.view import present
 
 SEEDS = 3
 WITHIN = 1.959963984540054
