@@ -12,8 +12,9 @@ from thruster_env.logs.write import check_picture
 from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, Argument, Option, Progress, PythonOnly
 from tuning.api.progress import console_for
 from tuning.series.answer import SeriesFit, choose_among_all
-from tuning.series.column import column_of
+from tuning.series.column import Column, column_of
 from tuning.series.fit import choose
+from tuning.series.outliers import without_outliers
 from tuning.series.paste import LANGUAGES
 
 
@@ -80,8 +81,12 @@ def fit(
             status.update(f"fitting {name} ...")
 
         is_auto = model.strip().lower() == AUTO
-        choice = choose_among_all(data, fitting) if is_auto else choose(data, (model,), fitting)
-    fitted = SeriesFit(data, *choice)
+
+        def answer(column: Column) -> SeriesFit:
+            choice = choose_among_all(column, fitting) if is_auto else choose(column, (model,), fitting)
+            return SeriesFit(column, *choice)
+
+        fitted = without_outliers(data, answer)
     if plot is not None:
         save_figure(fitted.plot(), plot)
     if code is not None:

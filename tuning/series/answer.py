@@ -42,6 +42,7 @@ SLOW = 1e-3  # Hz, below which a frequency is also given as a period
 PERIODIC = {"harmonic", "seasonal"}  # models of a period
 OF_PERIOD = "A period of "
 NEVER = "the filter never forgets its start"
+WIDE = 4  # states, beyond which matrices are not printed
 LARGE = 0.05  # correlation of innovations that matters
 
 # Of a period that stands out.
@@ -130,6 +131,10 @@ class SeriesFit(Result):
         candidates: all that were tried, best first.
         numbers: the model's free numbers and R, with 95 % intervals.
         level: the mean about which the signal of each axis varies, (axes,), if it does.
+        left_out: outliers, which are not in `column`, (K, axes), NaN elsewhere; None if there are none.
+        gate: number of standard deviations of S beyond which numbers are outliers, if some were left out.
+        jumps: rows at which an axis jumps, and its innovations there [standard deviations].
+        peaks: why numbers far from their prediction were not left out; empty if there are none.
     """
 
     column: Column
@@ -137,6 +142,10 @@ class SeriesFit(Result):
     candidates: tuple[Candidate, ...]
     numbers: tuple[Number, ...]
     level: np.ndarray | None = None
+    left_out: np.ndarray | None = None
+    gate: float | None = None
+    jumps: tuple[tuple[int, float], ...] = ()
+    peaks: str = ""
 
     @property
     def name(self) -> str:
@@ -296,12 +305,37 @@ class SeriesFit(Result):
             for number in self.numbers
             if not number.determined
         ]
+        sentences += self._far_sentences()
         apart = self.axes_differ()
         if apart < WHITE:
             sentences.append(f"The axes differ (p = {apart:.2g}): fit each of them alone.")
         if not self.is_wrong:
             sentences.append(f"The innovations are white (p = {white.p_value:.2g}).")
         return [*sentences, *self.column.remarks]
+
+    def _far_sentences(self) -> list[str]:
+        """Outliers, what a filter has to do with them, and jumps."""
+        sentences, times = [self.peaks] if self.peaks else [], self.column.times
+        if self.left_out is not None and self.gate is not None:
+            rows = np.flatnonzero((~np.isnan(self.left_out)).any(axis=1))
+            where, who = f"row {rows[0]}, {times[rows[0]]:.4g} s", "1 number is an outlier and is left out"
+            if len(rows) > 1:
+                where = f"rows {rows[0]} to {rows[-1]}, {times[rows[0]]:.4g} to {times[rows[-1]]:.4g} s"
+                who = f"{len(rows)} numbers are outliers and are left out"
+            sentences += [
+                f"{who} ({where}), beyond {self.gate:g} standard deviations of the prediction: Q and R are those "
+                "of the others.",
+                f"So a filter has to leave out outliers, too, as the lines of --code do, fit.filter.session("
+                f"gate={self.gate:g}), and the filter ekf-robust.",
+            ]
+        if self.jumps:
+            row, height = max(self.jumps, key=lambda jump: abs(jump[1]))
+            count = f" {len(self.jumps)} times, the highest" if len(self.jumps) > 1 else ""
+            sentences.append(
+                f"The record jumps{count} at row {row} ({times[row]:.4g} s), by {abs(height):.0f} standard "
+                "deviations of the prediction, and Q makes up for it: fit the rows before and after it alone."
+            )
+        return sentences
 
     def to_frame(self) -> pandas.DataFrame:
         """A row per number: meaning, unit, value, and the ends of its 95 % interval."""
@@ -316,6 +350,9 @@ class SeriesFit(Result):
             "model": self.name,
             "rows": len(self.column.values),
             "measured": int(self.column.measured.any(axis=1).sum()),
+            "outliers": 0 if self.left_out is None else int((~np.isnan(self.left_out)).sum()),
+            "gate": self.gate,
+            "jumps": [row for row, _ in self.jumps],
             "dt": self.column.dt,
             "numbers": {number.name: number._asdict() for number in self.numbers},
             "F": f,
@@ -336,7 +373,10 @@ class SeriesFit(Result):
         """Half a page for the terminal: the model, its numbers with intervals, and what they mean."""
         column, first = self.column, []
         count = int(column.measured.any(axis=1).sum())
-        missing = len(column.values) - count
+        outliers = 0
+        if self.left_out is not None:
+            outliers = int((~np.isnan(self.left_out) & ~column.measured).any(axis=1).sum())
+        missing = len(column.values) - count - outliers
         names = ", ".join(quantity.short_label for quantity in column.quantities)
         apart, step = f"one each {_step_text(column.dt)}", "per step"
         if column.stamps is not None:
@@ -362,9 +402,11 @@ class SeriesFit(Result):
         )
         forgets = f"the filter forgets in {seconds_text(self.memory)}" if math.isfinite(self.memory) else NEVER
         lines = [
-            f"Q {step} = {_matrix(self.q, f'Q {step} = ')}",
+            f"Q {step} = {_matrix(self.q, f'Q {step} = ')}" if len(self.q) <= WIDE else f"Q {step}: fit.q, --json",
             f"R = {self.r:.6g}" + " of each axis" * (self.model.m > 1),
-            f"Steady-state gain = {_matrix(self.gain, 'Q per step = ')}: {forgets}",
+            f"Steady-state gain = {_matrix(self.gain, 'Q per step = ')}: {forgets}"
+            if len(self.q) <= WIDE
+            else f"Steady-state gain: fit.gain; {forgets}",
         ]
         rivals = [
             f"{name} {-loss:.1f} +- {error:.1f}" for name, loss, error in self._standings() if name != self.name
@@ -372,6 +414,7 @@ class SeriesFit(Result):
         if rivals:
             sentences.append(f"Log-likelihood of unseen blocks less the best model's: {', '.join(rivals)}.")
         heading = f"{heading}, {missing} missing" if missing else heading
+        heading = f"{heading}, {outliers} outliers left out" if outliers else heading
         return [
             heading,
             *first,
@@ -427,6 +470,8 @@ class SeriesFit(Result):
         top.fill_between(
             times, means - 1.96 * deviations, means + 1.96 * deviations, color="C0", alpha=0.25, label="95 % band"
         )
+        if self.left_out is not None:
+            top.plot(times, self.left_out[:, axis], "x", markersize=4, color="C1", label="outliers, left out")
         inside = values[measured[:, axis]]
         margin = 0.1 * np.ptp(inside)
         top.set_ylim(inside.min() - margin, inside.max() + margin)
@@ -452,7 +497,7 @@ class SeriesFit(Result):
                 f'but {self.name} {forgets}: take code("python") or code("filterpy"), whose gain varies, or '
                 "thruster tune and export, which write such a one in C"
             )
-        return lines_of(language, self.model, self._gains(), self.column.dt)
+        return lines_of(language, self.model, self._gains(), self.column.dt, self.gate)
 
 
 def _step_text(dt: float) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from filters.models import Scales, named_model
 from thruster_env.core.checks import as_floats, listed, one_of, short_repr
 from thruster_env.logs.columns import COUNTERS, DATE_NAMES, TIME, TIME_NAMES, parted
-from thruster_env.logs.findings import CLOCK, GAP, MISSING, Remark, sentences
+from thruster_env.logs.findings import CLOCK, GAP, MISSING, OUTLIER, Remark, sentences
 from thruster_env.logs.grid import resolution_of_digits
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
@@ -112,6 +112,16 @@ class Column:
             rule = f"{name} must have noise, from which Q and R follow"
             raise ValueError(f"{rule}, but its numbers lie on a smooth curve to {DIGITS:g} of the largest")
 
+    def without(self, rows: np.ndarray) -> Column:
+        """The column without the numbers of which a mask (K, axes) is true."""
+        return replace(self, values=np.where(rows, np.nan, self.table).reshape(self.values.shape))
+
+    @property
+    def backwards(self) -> Column:
+        """The column with its last number first."""
+        stamps = None if self.stamps is None else (self.stamps[-1] - self.stamps)[::-1]
+        return replace(self, values=self.values[::-1], stamps=stamps)
+
     def axis(self, index: int) -> Column:
         """One axis alone."""
         return replace(self, values=self.table[:, index], quantities=self.quantities[index : index + 1])
@@ -121,9 +131,12 @@ class Column:
         excess = len(self.values) - most
         if excess <= 0:
             return self
-        rows = slice(excess // 2, excess // 2 + most)
-        stamps = None if self.stamps is None else self.stamps[rows] - self.stamps[rows.start]
-        return replace(self, values=self.values[rows], stamps=stamps)
+        return self.rows(excess // 2, excess // 2 + most)
+
+    def rows(self, begin: int, end: int) -> Column:
+        """Some rows of the column."""
+        stamps = None if self.stamps is None else self.stamps[begin:end] - self.stamps[begin]
+        return replace(self, values=self.values[begin:end], stamps=stamps)
 
 
 def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequence[str] | None = None) -> Column:
@@ -166,7 +179,7 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
         _check_numbers(quantity.symbol, values)
     values = log.measurements[:, 0] if len(log.measured) == 1 else log.measurements
     lost = (GAP, MISSING) if stamps is None else ()  # of which one sentence tells all
-    remarks = sentences([finding for finding in log.findings if finding.kind not in lost])
+    remarks = sentences([finding for finding in log.findings if finding.kind not in (*lost, OUTLIER)])
     missing = [] if stamps is not None else _missing(log.measurements, log.dt)
     return Column(values, log.dt, log.measured, (*remarks, *missing), stamps)
 

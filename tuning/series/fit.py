@@ -166,7 +166,7 @@ def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
 
     The first block counts for no candidate: there each filter still learns its state, one with few states sooner.
     """
-    fitted = _maximum(candidate, column)
+    fitted = most_likely(candidate, column)
     if not prove:
         return fitted
     counts = np.cumsum(column.measured.any(axis=1))  # so that each block has as many rows with numbers
@@ -175,13 +175,13 @@ def _fit(candidate: Sum, column: Column, *, prove: bool) -> Fitted:
     in_sample = float(everything.by_rows(fitted.ascent.at)[blocks > 0].sum())
     for fold in range(2):
         visible = replace(column, values=np.where((blocks % 2 == fold)[:, None], np.nan, column.table))
-        values = _maximum(candidate, visible, column.scales).candidate.values
+        values = most_likely(candidate, visible, column.scales).candidate.values
         densities = everything.by_rows(everything.coordinates.of(list(values.values())))
         held_out[fold::2] = np.bincount(blocks, weights=densities.sum(axis=1), minlength=BLOCKS)[fold::2]
     return fitted._replace(held_out=held_out[1:], in_sample=in_sample)
 
 
-def _maximum(candidate: Sum, column: Column, scales: Scales | None = None) -> Fitted:
+def most_likely(candidate: Sum, column: Column, scales: Scales | None = None) -> Fitted:
     """The candidate with the likeliest numbers for a column; of a part of one with the scales of that."""
     scales = scales or column.scales
     objective = ColumnLikelihood(candidate, column, scales=scales)
@@ -322,7 +322,9 @@ def _chance_peaks(fitted: Fitted, column: Column) -> list[tuple[slice, list[bool
         if not any(number.is_searched for number in part.free):
             continue
         rest = tuple(other for other in fitted.model.parts if other is not part)
-        without = _maximum(Sum(" + ".join(other.name for other in rest), rest), column) if rest else _white(column)
+        without = (
+            most_likely(Sum(" + ".join(other.name for other in rest), rest), column) if rest else _white(column)
+        )
         densities = [
             ColumnLikelihood(model, column, rows=len(column.values)).by_rows(at)
             for model, at in ((fitted.model, fitted.ascent.at), (without.model, without.ascent.at))

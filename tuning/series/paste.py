@@ -10,9 +10,10 @@ from thruster_env.core.checks import one_of
 from thruster_env.model.affine import AffineModel
 
 ARDUINO = "arduino"  # the only one of constant gain
+BURST = 10  # far numbers in a row that are outliers; more are a jump
 
 
-def lines_of(language: str, model: AffineModel, gain: np.ndarray, dt: float) -> str:
+def lines_of(language: str, model: AffineModel, gain: np.ndarray, dt: float, gate: float | None = None) -> str:
     """The filter of a model without inputs as lines of a language, below a comment with sample time and units.
 
     Args:
@@ -20,11 +21,12 @@ def lines_of(language: str, model: AffineModel, gain: np.ndarray, dt: float) -> 
         model: F, H, Q, R, the first state and its covariance; the measurement's offset is subtracted from z.
         gain: K (n, m), the steady-state gain.
         dt: sample time [s].
+        gate: standard deviations of S beyond which measurements are left out; all are taken if None.
 
     Raises:
         ValueError: for another language.
     """
-    lines = LANGUAGES[one_of("a language", language, tuple(LANGUAGES))](model, gain)
+    lines = LANGUAGES[one_of("a language", language, tuple(LANGUAGES))](model, gain, gate)
     comment = COMMENTS.get(language, "#")
     units = [
         f"{word}: {', '.join(f'{quantity.symbol} [{quantity.unit or 1}]' for quantity in quantities)}"
@@ -33,8 +35,12 @@ def lines_of(language: str, model: AffineModel, gain: np.ndarray, dt: float) -> 
     return "\n".join([f"{comment} a step is {dt:.12g} s", *(f"{comment} {line}" for line in units), lines])
 
 
-def _python(model: AffineModel, gain: np.ndarray) -> str:
+def _python(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
     a, _, _, c, d = model.matrices()
+    session = f"""
+session = filter_.session(gate={gate})  # it leaves outliers out
+session.start()
+# session.update(z[0]), then session.step([], z) for each further one: session.mean, session.cov"""
     return f"""import numpy as np
 import filters
 
@@ -47,11 +53,16 @@ filter_ = filters.make_filter("kf", filters.affine_model(
     prior_mean={_numbers(model.prior_mean)},
     prior_cov={_rows(model.prior_cov)},
     measurement_offset={_numbers(d)},
-))"""
+))""" + ("" if gate is None else session)
 
 
-def _filterpy(model: AffineModel, gain: np.ndarray) -> str:
+def _filterpy(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
     a, _, _, c, d = model.matrices()
+    far, or_far = "", ""
+    if gate is not None:
+        deviations = "np.sqrt(np.diag(kf.H @ kf.P @ kf.H.T + kf.R))"
+        far = f"far = abs(np.reshape(z{_less(d)}, (-1, 1)) - kf.H @ kf.x)[:, 0] > {gate} * {deviations}\n"
+        or_far = " or far.any()"
     return f"""import numpy as np
 from filterpy.kalman import KalmanFilter
 
@@ -64,15 +75,16 @@ kf.x = np.array([{_numbers(model.prior_mean)}]).T
 kf.P = np.array({_rows(model.prior_cov)})
 # the first measurement updates the state at once: kf.update(z[0]{_less(d)}), then for each further one
 kf.predict()
-kf.update(None if np.isnan(z).any() else z{_less(d)})"""
+{far}kf.update(None if np.isnan(z).any(){or_far} else z{_less(d)})"""
 
 
-def _pykalman(model: AffineModel, gain: np.ndarray) -> str:
+def _pykalman(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
     a, _, _, c, d = model.matrices()
+    advice = "" if gate is None else "# pykalman has no gate: set outliers of z to NaN first\n"
     return f"""import numpy as np
 from pykalman import KalmanFilter
 
-kf = KalmanFilter(
+{advice}kf = KalmanFilter(
     transition_matrices={_rows(a)},
     observation_matrices={_rows(c)},
     transition_covariance={_rows(model.process_noise_cov)},
@@ -84,10 +96,11 @@ kf = KalmanFilter(
 means, covs = kf.filter(np.ma.masked_invalid(z))"""
 
 
-def _matlab(model: AffineModel, gain: np.ndarray) -> str:
+def _matlab(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
     a, _, _, c, d = model.matrices()
     z, offset = "z(:, k)" if model.m > 1 else "z(k)", _matlab_rows(d[:, None]) if model.m > 1 else _number(d[0])
     less = f" - {offset}" if d.any() else ""
+    near = "" if gate is None else f" && all(abs(v) <= {gate}*sqrt(diag(S)))"
     return f"""F = {_matlab_rows(a)};
 H = {_matlab_rows(c)};
 Q = {_matlab_rows(model.process_noise_cov)};
@@ -99,16 +112,17 @@ for k = 1:{"size(z, 2)" if model.m > 1 else "numel(z)"}
         x = F*x;
         P = F*P*F' + Q;
     end
-    if ~any(isnan({z}))
-        S = H*P*H' + R;
+    v = {z} - H*x{less};
+    S = H*P*H' + R;
+    if ~any(isnan(v)){near}
         K = P*H'/S;
-        x = x + K*({z} - H*x{less});
+        x = x + K*v;
         P = (eye({model.n}) - K*H)*P*(eye({model.n}) - K*H)' + K*R*K';
     end
 end"""
 
 
-def _arduino(model: AffineModel, gain: np.ndarray) -> str:
+def _arduino(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
     a, _, _, c, d = model.matrices()
     names = [f"x{i + 1}" for i in range(model.n)]
     inputs = [f"z{j + 1}" for j in range(model.m)] if model.m > 1 else ["z"]
@@ -125,6 +139,7 @@ def _arduino(model: AffineModel, gain: np.ndarray) -> str:
         "// it needs double of 64 bits: on boards with an AVR (Uno, Mega) double is float, of seven digits",
         f"double {', '.join(names)};",
         "int begun = 0;",
+        *([f"int {', '.join(f'far{j + 1} = 0' for j in range(model.m))};"] if gate is not None else []),
         f"void filter({arguments}) {{",
         "  if (!begun) {",
         *(f"    {name} = {value};" for name, value in first.items()),
@@ -137,6 +152,12 @@ def _arduino(model: AffineModel, gain: np.ndarray) -> str:
         f"  double {difference} = {z} - ({_products(row, p, offset)});"
         for difference, z, row, offset in zip(v, inputs, c, offsets, strict=True)
     ]
+    if gate is not None:  # v = 0 for outliers, but after some in a row the level is another one
+        s = np.diag(model.measurement_noise_cov) / (1.0 - np.einsum("ji,ij->j", c, gain))
+        for j, (difference, limit) in enumerate(zip(v, gate * np.sqrt(s), strict=True)):
+            is_near = f"{difference} < {_c(limit)} && {difference} > -{_c(limit)}"
+            skip = f"{{ far{j + 1}++; {difference} = 0.0; }}"
+            lines.append(f"  if ({is_near}) far{j + 1} = 0; else if (far{j + 1} < {BURST}) {skip}")
     lines += [
         f"  {x} = {_products(np.array([1.0, *row]), [before, *v])};"
         for x, before, row in zip(names, p, gain, strict=True)
@@ -144,7 +165,7 @@ def _arduino(model: AffineModel, gain: np.ndarray) -> str:
     return "\n".join([*lines, "}"])
 
 
-LANGUAGES: dict[str, Callable[[AffineModel, np.ndarray], str]] = {
+LANGUAGES: dict[str, Callable[[AffineModel, np.ndarray, float | None], str]] = {
     "python": _python,
     "filterpy": _filterpy,
     "pykalman": _pykalman,

@@ -1,0 +1,132 @@
+"""Outliers of a column are left out of its fit and of the lines to paste; jumps, peaks and pulses are named."""
+
+import ctypes
+import math
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+import tuning
+
+ROWS = 600
+
+
+def walk(seed=3):
+    rng = np.random.default_rng(seed)
+    return np.cumsum(0.1 * rng.normal(size=ROWS)) + 0.3 * rng.normal(size=ROWS)
+
+
+def with_outliers(z, share=0.03, size=50.0):
+    rng = np.random.default_rng(0)
+    off = np.where(rng.random(len(z)) < share, size * rng.normal(size=len(z)), 0.0)
+    return z + off, np.abs(off) > 2.0
+
+
+def rows_left_out(fit):
+    return [] if fit.left_out is None else np.flatnonzero((~np.isnan(fit.left_out)).any(axis=1)).tolist()
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return tuning.fit(with_outliers(walk())[0], dt=0.1, model="constant")
+
+
+def test_q_and_r_are_those_of_the_record_with_its_outliers_missing(fit):
+    z, outliers = with_outliers(walk())
+    assert rows_left_out(fit) == np.flatnonzero(outliers).tolist() and fit.gate == 4.4
+    missing = tuning.fit(np.where(outliers, np.nan, z), dt=0.1, model="constant")
+    assert [fit.q, fit.r] == [missing.q, missing.r]
+    assert 0.075 < fit.r < 0.1 and not missing.left_out  # 0.09 is true, 80 with the outliers
+    text = str(fit)
+    assert f"{ROWS - outliers.sum()} numbers, one each 0.1 s, {outliers.sum()} outliers left out" in text
+    assert "gate=4.4" in text and "missing" not in text
+
+
+@pytest.mark.parametrize("model", ["constant", "constant-velocity"])
+def test_a_record_of_normal_noise_has_no_outliers(model):
+    """One record in a hundred has a number beyond the gate: of 20, more than 2 have a probability of 1e-3."""
+    fits = [tuning.fit(walk(seed)[:200], dt=0.1, model=model) for seed in range(20 if model == "constant" else 5)]
+    assert sum(fit.left_out is not None for fit in fits) <= 2
+    assert not any(fit.jumps or fit.peaks for fit in fits)
+
+
+def test_bursts_and_outliers_among_the_first_numbers_are_left_out():
+    z = walk()
+    z[0] += 30.0
+    z[2] -= 9.0
+    z[100:106] += 20.0
+    z[300:304] -= 5.0
+    fit = tuning.fit(z, dt=0.1, model="constant")
+    assert rows_left_out(fit) == [0, 2, *range(100, 106), *range(300, 304)] and not fit.jumps
+
+
+def test_an_axis_and_unequal_steps_have_outliers_of_their_own():
+    rng = np.random.default_rng(1)
+    times = np.cumsum(rng.uniform(0.05, 0.15, size=ROWS))
+    z = np.column_stack([walk(4), walk(5)])
+    z[50, 0], z[400:402, 1] = 40.0, -40.0
+    fit = tuning.fit(z, times=times, model="constant")
+    assert np.argwhere(~np.isnan(fit.left_out)).tolist() == [[50, 0], [400, 1], [401, 1]]
+    assert 0.07 < fit.r < 0.11
+
+
+def test_a_record_that_does_not_return_jumps():
+    z = walk()
+    z[250:] += 8.0
+    fit = tuning.fit(z, dt=0.1, model="constant")
+    assert [row for row, _ in fit.jumps] == [250] and fit.left_out is None
+    assert "The record jumps at row 250 (25 s), by " in " ".join(str(fit).split())
+
+
+@pytest.mark.parametrize(
+    ("z", "reason"),
+    [
+        (walk() + np.where(np.arange(ROWS) % 25 == 0, 8.0, 0.0), "they come each 2.5 s, so they are signal"),
+        (np.where(np.random.default_rng(2).random(ROWS) < 0.03, 1.0, 0.0), "without them the others do not vary"),
+        (with_outliers(walk(), share=0.35)[0], "there are more than 25 % of them"),
+    ],
+)
+def test_peaks_that_are_no_outliers_count(z, reason):
+    fit = tuning.fit(z, dt=0.1, model="constant")
+    assert fit.left_out is None and fit.gate is None
+    assert f"part of the fit: {reason}." in fit.peaks
+    assert "session" not in fit.code("python")
+
+
+def test_lines_for_filterpy_leave_out_what_a_session_with_a_gate_does(fit):
+    pytest.importorskip("filterpy.kalman")
+    z, _ = with_outliers(walk())
+    names = {}
+    exec(fit.code("python"), names)
+    session = names["session"]
+    session.update(z[:1])
+    setup, step = fit.code("filterpy").split("# the first")
+    exec(setup, names)
+    kf = names["kf"]
+    kf.update(z[0])
+    for number in z[1:]:
+        session.step([], [number])
+        exec(step.split("\n", 1)[1], {**names, "z": number})
+        np.testing.assert_allclose(kf.x[:, 0], session.mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(session.mean, fit.estimates.means[0, -1], rtol=1e-9)
+    assert session.rejected == [len(rows_left_out(fit))]
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="the lines of C need a compiler")
+def test_lines_for_a_controller_leave_outliers_out_and_follow_a_jump(fit, tmp_path):
+    source = tmp_path / "filter.c"
+    source.write_text(fit.code("arduino") + "\ndouble state(void) { return x1; }\n")
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", str(tmp_path / "filter.so"), str(source)], check=True)
+    library = ctypes.CDLL(str(tmp_path / "filter.so"))
+    library.filter.argtypes, library.state.restype = [ctypes.c_double], ctypes.c_double
+    states = []
+    for number in with_outliers(walk())[0]:
+        library.filter(number)
+        states.append(library.state())
+    off = np.array(states[50:]) - fit.estimates.means[0, 50:, 0]
+    assert math.sqrt(float(np.mean(off**2))) < 0.02  # the gain is constant; the deviation of an estimate is 0.16
+    for _ in range(40):
+        library.filter(100.0)
+    assert library.state() == pytest.approx(100.0, rel=1e-3)

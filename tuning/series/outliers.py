@@ -1,0 +1,193 @@
+"""Numbers of a column that no normal noise explains, left out of its fit, and jumps, which are named.
+
+A number is far if its innovation is beyond the gate. All innovations of a record of normal noise are within it
+with a probability of 99 %. Up to `BURST` far numbers in a row, after which the record returns, are outliers: the
+model is fitted without them, and they are found anew with that model until they stay the same. If the record does
+not return, it jumps there.
+
+Source: Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation, section 3.6,
+for gates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.special import ndtri
+
+from filters.models import named_model
+from tuning.series.column import Column, seconds_text
+from tuning.series.fit import Candidate, filtered, most_likely
+from tuning.series.likelihood import R, model_of
+from tuning.series.paste import BURST
+
+if TYPE_CHECKING:
+    from tuning.series.answer import SeriesFit
+
+LEVEL = 0.01  # probability that a record of normal noise has a number beyond the gate
+MOST = 0.25  # share of the numbers that may be outliers
+RETURNED = 0.7  # of an outlier's height, above which the number after it has not returned
+ROUNDS = 8  # of leaving out and fitting one model again
+OF_MEDIANS = 8.0  # medians of the distance from neighbours, beyond which a number is far from them
+SETTLING = 500  # rows after which a filter has settled
+CHOICES = 2  # of the model again, without outliers
+REGULAR = 0.1  # deviation of the times between peaks, in their mean, below which they are signal
+
+
+class Far(NamedTuple):
+    """Numbers far from their prediction.
+
+    Attributes:
+        outliers: whether each number is one, (K, axes).
+        jumps: rows at which an axis begins to have another course, and innovations there [standard deviations].
+        gate: number of standard deviations beyond which a number is far.
+    """
+
+    outliers: np.ndarray
+    jumps: tuple[tuple[int, float], ...]
+    gate: float
+
+
+def without_outliers(column: Column, fit: Callable[[Column], SeriesFit]) -> SeriesFit:
+    """The fit without the outliers, which it names.
+
+    All numbers count if more than `MOST` of them are outliers, if outliers come at regular times, if the others
+    do not vary, or if the model does not fit these: then it predicts too poorly to tell outliers from a course
+    that it misses.
+
+    Args:
+        column: the numbers.
+        fit: chooses and fits a model.
+    """
+    of_all = fit(column)
+    far = far_of_all = far_from(of_all.chosen, of_all.level, column)
+    if not far.outliers.any():
+        return replace(of_all, jumps=far.jumps)
+    answer, first = of_all, far.outliers | far_from_medians(column)
+    try:
+        for _ in range(CHOICES):
+            outliers = _settled(answer.chosen, column, first)
+            _check_irregular(column.times[outliers.any(axis=1)])
+            answer = fit(column.without(outliers))
+            far = far_from(answer.chosen, answer.level, column)
+            first = far.outliers
+            if (first == outliers).all():
+                break
+        if not answer.is_wrong:
+            values = np.where(outliers, column.table, np.nan) if outliers.any() else None
+            return replace(answer, left_out=values, gate=far.gate, jumps=far.jumps)
+        reason = "without them no model that was tried fits"
+    except NoOutliersError as error:
+        reason = str(error)
+    except ValueError:  # of the fit
+        reason = "without them the others do not vary"
+    count = int(far_of_all.outliers.sum())
+    numbers = "1 number is" if count == 1 else f"{count} numbers are"
+    peaks = f"{numbers} far from the prediction, but part of the fit: {reason}."
+    return replace(of_all, jumps=far_of_all.jumps, peaks=peaks)
+
+
+class NoOutliersError(ValueError):
+    """Numbers far from their prediction are no outliers, for a reason."""
+
+
+def _check_irregular(times: np.ndarray) -> None:
+    """Raise NoOutliersError for peaks at regular times [s]."""
+    apart = np.diff(times)
+    apart = apart[apart > 0.5 * apart.mean()] if len(apart) else apart  # of bursts, one for each
+    if len(apart) >= 6 and apart.std() < REGULAR * apart.mean():
+        raise NoOutliersError(f"they come each {seconds_text(float(apart.mean()))}, so they are signal")
+
+
+def far_from_medians(column: Column) -> np.ndarray:
+    """Numbers far from the median of their neighbours, (K, axes): outliers to begin with, as many hide many."""
+    far = np.zeros(column.table.shape, dtype=bool)
+    for axis, measured in enumerate(column.measured.T):
+        z = column.table[measured, axis]
+        windows = sliding_window_view(np.pad(z, BURST // 2, mode="edge"), 2 * (BURST // 2) + 1)
+        off = np.abs(z - np.median(windows, axis=1))
+        far[measured, axis] = off > OF_MEDIANS * np.median(off)
+    return far
+
+
+def _settled(candidate: Candidate, column: Column, outliers: np.ndarray) -> np.ndarray:
+    """The outliers of one model, fitted without them again and again until they stay the same, (K, axes).
+
+    It begins without `outliers`, (K, axes).
+
+    Raises:
+        NoOutliersError: if more than `MOST` of the numbers are outliers.
+    """
+    model = named_model(candidate.name)
+    for _ in range(ROUNDS):
+        if outliers.sum() > MOST * column.measured.sum():
+            raise NoOutliersError(f"there are more than {100.0 * MOST:.0f} % of them")
+        fitted = most_likely(model, column.without(outliers))
+        before, outliers = outliers, far_from(fitted.candidate, fitted.mean, column).outliers
+        if (before == outliers).all():
+            break
+    return outliers
+
+
+def far_from(candidate: Candidate, level: np.ndarray | None, column: Column) -> Far:
+    """Outliers and jumps of a column under a fitted model; `level` is the mean about which it varies, if any.
+
+    Outliers among the first numbers, from which the filter learns its state, are those of the record backwards:
+    all named models are the same in both directions.
+    """
+    first = len(named_model(candidate.name).signal(_signal_values(candidate)).output) + BURST
+    begin, outliers = column.rows(0, SETTLING).backwards, np.zeros(column.table.shape, dtype=bool)
+    backwards = _far(candidate, level, begin, outliers[:SETTLING]).outliers[::-1]
+    outliers[:first] = backwards[:first]
+    return _far(candidate, level, column, outliers)
+
+
+def _far(candidate: Candidate, level: np.ndarray | None, column: Column, outliers: np.ndarray) -> Far:
+    named, values = named_model(candidate.name), candidate.values
+    model = model_of(named, column, values, level)
+    signal = named.signal(_signal_values(candidate))
+    counted = column.counted(model)
+    gate = math.ceil(-10.0 * float(ndtri(0.5 * LEVEL / max(counted.sum(), 1)))) / 10.0
+    settled, heights = outliers.copy(), np.zeros(counted.shape)
+    outliers = outliers.copy()
+    jumps = list[tuple[int, float]]()
+    for _ in range(4 * BURST):
+        estimates = filtered(signal, model, column.without(outliers))
+        innovations = estimates.innovations[0]
+        deviations = np.sqrt(np.diagonal(estimates.innovation_covs[0], axis1=1, axis2=2))
+        far = (np.abs(innovations) > gate * deviations) & counted & ~outliers & ~settled
+        for axis in range(far.shape[1]):
+            for begin, end in _bursts(outliers[:, axis], column.measured[:, axis]):
+                if settled[begin, axis]:
+                    continue
+                height, next_far = heights[begin, axis], end < len(far) and far[end, axis]
+                stays = end < len(far) and not next_far and innovations[end, axis] / height > RETURNED
+                if stays or end - begin > BURST:
+                    outliers[begin:end, axis], settled[begin : end + BURST, axis] = False, True
+                    far[begin : end + BURST, axis] = False
+                    jumps.append((begin, float(height / deviations[begin, axis])))
+            rows = np.flatnonzero(far[:, axis])
+            rows = rows[np.diff(rows, prepend=-2 * BURST) > BURST]  # those after it may be far because of it
+            outliers[rows, axis], heights[rows, axis] = True, innovations[rows, axis]
+            far[:, axis] = False
+            far[rows, axis] = True
+        if not far.any():
+            break
+    return Far(outliers, tuple(sorted(jumps)), gate)
+
+
+def _signal_values(candidate: Candidate) -> dict[str, float]:
+    return {name: value for name, value in candidate.values.items() if name != R}
+
+
+def _bursts(outliers: np.ndarray, measured: np.ndarray) -> list[tuple[int, int]]:
+    """The first row of each run of outliers, and the first measured row after it, or the number of rows."""
+    rows = np.flatnonzero(measured)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], outliers[rows], [False]])))
+    after = np.append(rows, len(measured))
+    return [(int(rows[begin]), int(after[end])) for begin, end in zip(edges[::2], edges[1::2], strict=True)]
