@@ -31,8 +31,8 @@ from tuning.search.parameters import PRIOR, Correlation, FilterParameter, Measur
 from tuning.search.space import Choice, everything_of, neutral, parameters, parameters_of
 
 if TYPE_CHECKING:
+    import matplotlib.figure
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from tuning.exploring.bench import Bench
 
@@ -431,9 +431,9 @@ def start_of(knobs: Sequence[Knob], problem: Problem, choice: Choice) -> dict[st
     return values
 
 
-def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) -> Figure:
+def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) -> matplotlib.figure.Figure:
     """One run's states in their bands and its innovations; NIS, NEES and autocorrelation of all runs."""
-    from matplotlib.figure import Figure
+    import matplotlib.figure
 
     run = min(run, len(view.estimate) - 1)
     panels: list[Callable[[Axes], None]] = []
@@ -447,7 +447,7 @@ def figure_of(bench: Bench, view: View, run: int = 0, title: str | None = None) 
         panels.append(lambda ax: _level(ax, view.time[run], nees, band, "NEES"))
     panels.append(lambda ax: _lags(ax, view))
     rows = -(-len(panels) // 2)
-    figure = Figure(figsize=(9.0, 1.5 * rows + 0.6), layout="constrained")
+    figure = matplotlib.figure.Figure(figsize=(9.0, 1.5 * rows + 0.6), layout="constrained")
     numbers = ",  ".join(
         f"{name} {figure_.value:.3g} {figure_.unit}".rstrip() for name, figure_ in view.figures.items()
     )
