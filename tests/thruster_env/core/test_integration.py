@@ -6,7 +6,7 @@ import pytest
 from thruster_env.core.derivatives import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
 from thruster_env.core.streams import nearest_whole
 from thruster_env.graphs.loops import Loops
-from thruster_env.model.traced import array_valued
+from thruster_env.model.traced import _array_valued
 
 
 class Step:
@@ -58,7 +58,7 @@ def rows_of_six(x):
 
 
 def test_rows_of_a_large_matrix_are_compiled_and_not_run_as_python():
-    rows = array_valued(rows_of_six, "x", 6, 6)
+    rows = _array_valued(rows_of_six, "x", 6, 6)
 
     def evaluate(x, out):
         out[:] = rows(x)
