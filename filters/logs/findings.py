@@ -40,7 +40,7 @@ from thruster_env.core.files import (
 from thruster_env.core.sources import as_value, is_array
 from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.logs.columns import OUTPUT, STATE, plain, suffix
-from thruster_env.logs.findings import GAP, SPOILING, sentences
+from thruster_env.logs.findings import GAP, OUTLIER, SPOILING, sentences
 from thruster_env.logs.grid import date_text, time_text
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.simulate import inputs_until
@@ -207,6 +207,8 @@ def verdict(estimate: LogEstimate, log_findings: LogFindings) -> list[str]:
     if spoilt:
         kinds = list(dict.fromkeys(finding.kind for finding in spoilt))
         conclusion += f" First mend what was found in the log ({', '.join(kinds)}): it spoils these numbers."
+        if OUTLIER in kinds and "robust" not in estimate.filter.name:
+            conclusion += " The filter ekf-robust gives outliers less weight."
     return [*messages, conclusion]
 
 

@@ -470,11 +470,13 @@ class SeriesFit(Result):
         top.fill_between(
             times, means - 1.96 * deviations, means + 1.96 * deviations, color="C0", alpha=0.25, label="95 % band"
         )
-        if self.left_out is not None:
-            top.plot(times, self.left_out[:, axis], "x", markersize=4, color="C1", label="outliers, left out")
         inside = values[measured[:, axis]]
         margin = 0.1 * np.ptp(inside)
-        top.set_ylim(inside.min() - margin, inside.max() + margin)
+        ends = inside.min() - margin, inside.max() + margin
+        if self.left_out is not None:
+            outliers = np.clip(self.left_out[:, axis], *ends)  # at an edge if beyond
+            top.plot(times, outliers, "x", markersize=5, color="C1", clip_on=False, label="outliers, left out")
+        top.set_ylim(*ends)
         top.set_ylabel(quantity.short_label)
         top.legend(loc="best", frameon=False, fontsize="small")
         bottom.plot(times, normalised, ".", markersize=2.5, color="0.4")
