@@ -271,11 +271,7 @@ def _with_size(choice: Choice, ensemble_size: int | None) -> Choice:
 
 
 def baselines(
-    name: str,
-    scenario: Problem,
-    seed: int = 0,
-    default: Scaled | None = None,
-    ensemble_size: int | None = None,
+    name: str, scenario: Problem, seed: int = 0, default: Scaled | None = None, ensemble_size: int | None = None
 ) -> dict[str, Choice]:
     """All existing baselines of a filter by name, the most important one first.
 

@@ -42,13 +42,7 @@ from tuning.evaluation.baselines import (
     scaled_default,
     scaled_rule,
 )
-from tuning.evaluation.evaluate import (
-    NOTHING,
-    Evaluation,
-    evaluate,
-    likelihood_gain,
-    score_ratio,
-)
+from tuning.evaluation.evaluate import NOTHING, Evaluation, evaluate, likelihood_gain, score_ratio
 from tuning.evaluation.residuals import UnevenNis, uneven_nis
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.check import data_of

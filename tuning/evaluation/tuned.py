@@ -81,11 +81,7 @@ def _plain_numbers(value: float) -> float | None:
 
 
 def tuned_content(
-    plan: Plan,
-    result: StudyResult,
-    comparisons: Sequence[Comparison],
-    study_name: str,
-    method: str | None = None,
+    plan: Plan, result: StudyResult, comparisons: Sequence[Comparison], study_name: str, method: str | None = None
 ) -> dict[str, Any]:
     """The content of a tuned file.
 

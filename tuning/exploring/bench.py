@@ -494,10 +494,7 @@ SCENES = {
             "Raise R until the jumps are gone: a hundred times the data sheet's leaves less than a quarter of "
             "the error.",
             "outliers",
-            (
-                Step("R from the data sheet", "ekf", {}),
-                Step("a hundred times that R", "ekf", {"R": 25.0}),
-            ),
+            (Step("R from the data sheet", "ekf", {}), Step("a hundred times that R", "ekf", {"R": 25.0})),
             ("R",),
             "omega_m",
             (Seen("RMSE omega_m", 0.05, 0.25), Seen("RMSE U_a", 0.2, 0.4)),
@@ -512,10 +509,7 @@ SCENES = {
             "does. The unscented filter tries several points on both sides and knows that it does not know.",
             "Change the filter from ekf to ukf: the same Q and R, and the errors fit the band again.",
             "speed_magnitude",
-            (
-                Step("ekf: one tangent", "ekf", OWN),
-                Step("ukf: points on both sides", "ukf", OWN),
-            ),
+            (Step("ekf: one tangent", "ekf", OWN), Step("ukf: points on both sides", "ukf", OWN)),
             (),
             "omega_m",
             (Seen("NEES", 0.2, 0.5), Seen("RMSE omega_m", 0.6, 0.9), Seen("NIS", 0.7, 1.1)),
@@ -529,10 +523,7 @@ SCENES = {
             "at the right Q and R. Inflation hides it; more members cure it.",
             "Raise the number of members from 5 to 100 and see NEES fall to the number of states, 2.",
             "nominal",
-            (
-                Step("5 members", "enkf", {**OWN, "N": 5}),
-                Step("100 members", "enkf", {**OWN, "N": 100}),
-            ),
+            (Step("5 members", "enkf", {**OWN, "N": 5}), Step("100 members", "enkf", {**OWN, "N": 100})),
             ("N", "inflation"),
             "U_a",
             (Seen("NEES", 0.1, 0.3), Seen("RMSE U_a", 0.7, 0.95)),

@@ -32,13 +32,7 @@ from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.linear import make_linear_plant, operating_points
 from thruster_env.thruster.model import model_of_plant
 from thruster_env.thruster.parameters import CHANNELS, is_file, read_preset
-from thruster_env.thruster.plant import (
-    DEFAULT_DT,
-    DEFAULT_MAX_VOLTAGE,
-    DEFAULT_PROCESS_NOISE,
-    Plant,
-    Task,
-)
+from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_NOISE, Plant, Task
 from tuning.problems.data import Data
 from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, Excitation, MultiSine
 from tuning.problems.find import find_in

@@ -93,12 +93,7 @@ def of_preset(problem: Problem, preset: str | Path | None, sequences: int = FILE
 
 
 def family_of_preset(
-    logs: Sequence[Log],
-    preset: str | None,
-    sensors: Sequence[str] | None,
-    free: Sequence[str],
-    *,
-    noise: bool,
+    logs: Sequence[Log], preset: str | None, sensors: Sequence[str] | None, free: Sequence[str], *, noise: bool
 ):
     """The thruster of a preset whose parameters are free, `tuning.plants.thruster_logs.ThrusterFamily`.
 

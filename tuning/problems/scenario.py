@@ -89,9 +89,7 @@ class PlantScenario(Problem):
         for name, kind, called in (("about", str, "text"), ("parameter_factors", Mapping, "a mapping")):
             if not isinstance(getattr(self, name), kind):
                 raise ValueError(f"{name} must be {called}, but got {short_repr(getattr(self, name))}")
-        checked = self.own_checks() | {
-            "steps": at_least("steps", self.steps, FIRST_SCORED_STEP + 1, MOST_STEPS),
-        }
+        checked = self.own_checks() | {"steps": at_least("steps", self.steps, FIRST_SCORED_STEP + 1, MOST_STEPS)}
         checked["first_scored_step"] = checked_first_scored_step(self.first_scored_step, checked["steps"])
         for entry in fields(self):
             object.__setattr__(self, entry.name, frozen(checked.get(entry.name, getattr(self, entry.name))))
@@ -196,10 +194,7 @@ class PlantScenario(Problem):
     @property
     def true(self) -> dict:
         """Model arguments of the filter that knows the plant's Q and R."""
-        return {
-            "process_noise_cov": self.process_noise_cov,
-            "measurement_noise_cov": self.measurement_noise_cov,
-        }
+        return {"process_noise_cov": self.process_noise_cov, "measurement_noise_cov": self.measurement_noise_cov}
 
     @property
     def held(self) -> dict:

@@ -128,9 +128,7 @@ OBJECTIVES = {
         (TRUTH, COVARIANCE, NEES, VARIANCES),
     ),
     "consistency": Objective(
-        "|log(mean NEES / n)| + |log(mean NIS / m)|",
-        _from_one(nees_ratio, nis_ratio),
-        (TRUTH, COVARIANCE, NEES),
+        "|log(mean NEES / n)| + |log(mean NIS / m)|", _from_one(nees_ratio, nis_ratio), (TRUTH, COVARIANCE, NEES)
     ),
     "cost": Objective("microseconds a step of one run, of one core", lambda _, microseconds: microseconds),
 }

@@ -22,9 +22,7 @@ from filters.consistency.time_constants import (
     slopes_along,
     time_constants,
 )
-from filters.consistency.time_constants import (
-    Path as GainPath,
-)
+from filters.consistency.time_constants import Path as GainPath
 from filters.estimators.foreign import ForeignFilter, estimator_named, is_trained
 from filters.filter import Filter
 from filters.registry import FILTERS, FilterType, filter_type, make_filter

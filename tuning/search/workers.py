@@ -32,13 +32,7 @@ from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
 from tuning.search.plan import Plan
 from tuning.search.storage import drop_waiting, open_storage, quiet_optuna, retry_orphans, this_process
-from tuning.search.study import (
-    OnTrial,
-    finished_trials,
-    open_study,
-    run_trials,
-    stop_on_interrupt,
-)
+from tuning.search.study import OnTrial, finished_trials, open_study, run_trials, stop_on_interrupt
 
 MODULE = "tuning.search.workers"
 POLL_SECONDS = 0.2

@@ -387,15 +387,7 @@ class SeriesFit(Result):
         if self.is_wrong:
             count = 1 + "".join(sentences[1:2]).startswith(OF_PERIOD)
             first, sentences = [sentences[0], *map(Unfolded, sentences[1:count])], sentences[count:]
-        rows = [
-            (
-                number.name,
-                *_digits(number),
-                number.unit,
-                _meaning(number),
-            )
-            for number in self.numbers
-        ]
+        rows = [(number.name, *_digits(number), number.unit, _meaning(number)) for number in self.numbers]
         about = " plus ".join(part.about for part in named_model(self.name).parts)
         numbers = Table(
             f"Model: {self.name}, {about}", ["", "value", "95 % from", "to", "unit", ""], rows, words=True
