@@ -237,7 +237,7 @@ def squarem(task: Task) -> None:
 
 def _start(task: Task, goal: Objective) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates of the start, and of how many terms each variance is the mean, (p,)."""
-    transitions, measured = counts_of(task)
+    transitions, measured, _ = counts_of(task)
     counts: list[float] = []
     for parameter in goal.coordinates.free:
         if isinstance(parameter.place, ProcessVariance):
@@ -251,14 +251,15 @@ def _start(task: Task, goal: Objective) -> tuple[np.ndarray, np.ndarray]:
     return goal.start, np.array(counts, dtype=np.float64)
 
 
-def counts_of(task: Task) -> tuple[int, np.ndarray]:
-    """Numbers of transitions, and of values measured in each channel, (m,), that a likelihood has."""
-    transitions, measured = 0, np.zeros(task.data[0].measurements.shape[-1])
+def counts_of(task: Task) -> tuple[int, np.ndarray, int]:
+    """Numbers of transitions, of measured values of each channel, (m,), and of times with a measurement."""
+    transitions, measured, times = 0, np.zeros(task.data[0].measurements.shape[-1]), 0
     for problem, data in zip(task.problems, task.data, strict=True):
         first = data.first_scored if problem.leads_in else 0
         transitions += int(np.maximum(data.rows - max(first, 1), 0).sum())
-        measured = measured + (~np.isnan(data.seen.measurements[:, first:])).sum(axis=(0, 1))
-    return transitions, measured
+        known = ~np.isnan(data.seen.measurements[:, first:])
+        measured, times = measured + known.sum(axis=(0, 1)), times + int(known.any(axis=-1).sum())
+    return transitions, measured, times
 
 
 def _step(goal: Objective, point: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, float]:
@@ -273,8 +274,7 @@ def _full(task: Task, goal: Objective) -> None:
     """Steps of matrices: of Q, R or both in full, else of their diagonals."""
     few = goal.of_few(FEW)
     price = task.price("slopes by Q and R", lambda: few.by_noise(task.start))
-    transitions, _ = counts_of(task)
-    measured = _times_measured(task)
+    transitions, _, measured = counts_of(task)
     choice, best = task.start, -np.inf
     for _ in range(EM_STEPS):
         model = task.model(choice)
@@ -303,14 +303,6 @@ def _moved(cov: np.ndarray, slope: np.ndarray, count: int, full: bool) -> np.nda
 def _change(before: np.ndarray, after: np.ndarray) -> float:
     scale = np.sqrt(np.outer(np.diag(before), np.diag(before)))
     return float((abs(after - before) / np.where(scale > 0, scale, 1.0)).max())
-
-
-def _times_measured(task: Task) -> int:
-    count = 0
-    for problem, data in zip(task.problems, task.data, strict=True):
-        first = data.first_scored if problem.leads_in else 0
-        count += int((~np.isnan(data.seen.measurements[:, first:])).any(axis=-1).sum())
-    return count
 
 
 @method(
@@ -363,7 +355,7 @@ def okf(task: Task) -> None:
     order = [task.generator.permutation(len(runs.seeds)) for runs in task.data]
     held_out = [max(1, round(VALIDATION * len(indices))) if len(indices) > 1 else 0 for indices in order]
     validation = [
-        _picked(data, indices[:count]) for data, indices, count in zip(task.data, order, held_out, strict=True)
+        data.select(indices[:count]) for data, indices, count in zip(task.data, order, held_out, strict=True)
     ]
     validation = [picked if picked.seeds else data for picked, data in zip(validation, task.data, strict=True)]
     learn = [indices[count:] for indices, count in zip(order, held_out, strict=True)]
@@ -393,8 +385,9 @@ def _adam(task: Task, learn: Sequence[np.ndarray], held_r: bool, price: float):
         q, r = factors.matrices(point)
         choice = with_covariances(task.best if step else task.start, q, None if held_r else r)
         yield choice, step == OKF_STEPS
-        queue = [_filled(left, all_, task.generator) for left, all_ in zip(queue, learn, strict=True)]
-        batch = [_picked(data, indices[:BATCH]) for data, indices in zip(task.data, queue, strict=True)]
+        pairs = zip(queue, learn, strict=True)
+        queue = [left if len(left) else task.generator.permutation(runs) for left, runs in pairs]
+        batch = [data.select(indices[:BATCH]) for data, indices in zip(task.data, queue, strict=True)]
         queue = [indices[BATCH:] for indices in queue]
         goal = _goal(task, choice, batch)
         _, by_q, by_r = goal.by_noise(choice)
@@ -453,25 +446,3 @@ def _entries(factor: np.ndarray) -> np.ndarray:
 
 def _goal(task: Task, choice: Choice, data: Sequence[Data]) -> Objective:
     return objective_of(choice, task.problems, data, task.free, MSE)
-
-
-def _filled(indices: np.ndarray, all_: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    return indices if len(indices) else generator.permutation(all_)
-
-
-def _picked(data: Data, indices: np.ndarray) -> Data:
-    """Some runs of data."""
-
-    def of(array: np.ndarray | None) -> np.ndarray | None:
-        return None if array is None else array[indices]
-
-    pick: Callable = of
-    return data._replace(
-        seeds=tuple(data.seeds[i] for i in indices.tolist()),
-        inputs=pick(data.inputs),
-        measurements=pick(data.measurements),
-        filter_keys=pick(data.filter_keys),
-        states=pick(data.states),
-        outputs=None,
-        counted=pick(data.counted),
-    )

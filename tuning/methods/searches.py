@@ -50,7 +50,7 @@ LEAST_SHARE = 1e-300  # below which s (1 - s) has no logarithm
 # Of the simplex and of coordinate steps.
 HIDDEN_PART = 0.5  # of the times, at which `masked` hides all channels
 FORWARD, BACKWARD = math.log(1.1), math.log(0.5)  # steps in coordinates
-ITERATIONS, LIMIT = 20, 0.1  # MATLAB's defaults: passes over all numbers, and the RMS error that is small enough
+ITERATIONS = 20  # MATLAB's default of passes over all numbers
 SIDE = math.log(10.0)  # of the first simplex, in coordinates
 FEW = 4  # numbers, up to which the simplex has its first coefficients
 CLOSE = 1e-3  # size of a simplex, in coordinates, and relative spread of its values, at which it ends

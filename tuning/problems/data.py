@@ -130,9 +130,12 @@ class Data(NamedTuple):
 
     def slice(self, first: int, last: int) -> Data:
         """The runs from `first` up to, but without, `last`."""
-        part = slice(first, last)
+        return self.select(slice(first, last))
+
+    def select(self, part: slice | np.ndarray) -> Data:
+        """The runs of a slice, or of indices in any order."""
         return self._replace(
-            seeds=self.seeds[part],
+            seeds=tuple(self.seeds[i] for i in np.arange(len(self.seeds))[part].tolist()),
             inputs=self.inputs[part],
             measurements=self.measurements[part],
             filter_keys=self.filter_keys[part],

@@ -59,7 +59,7 @@ def test_a_step_of_diagonals_is_a_smoothers(missing):
     task.start = at(task, FIRST_Q, FIRST_R)
     goal = task.goal(LIKELIHOOD, keeps=False)
     found = goal(goal.coordinates.of(goal.untuned))
-    transitions, measured = counts_of(task)
+    transitions, measured, _ = counts_of(task)
     slopes = found.gradient
     q = FIRST_Q * (1 + 2 / transitions * slopes[:2])
     r = FIRST_R * (1 + 2 / measured * slopes[2:])
