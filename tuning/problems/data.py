@@ -132,8 +132,8 @@ class Data(NamedTuple):
         """The runs from `first` up to, but without, `last`."""
         return self.select(slice(first, last))
 
-    def select(self, part: slice | np.ndarray) -> Data:
-        """The runs of a slice, or of indices in any order."""
+    def select(self, part: Any) -> Data:
+        """The runs of a slice, or of indices (count,) in any order."""
         return self._replace(
             seeds=tuple(self.seeds[i] for i in np.arange(len(self.seeds))[part].tolist()),
             inputs=self.inputs[part],
