@@ -67,6 +67,11 @@ def move(model, x, d):
     return wrap(moved(x, d, model.turns) if model.turns else x + d, model.state_angles)
 
 
+def added(model, x, d):
+    """`move` of a member without wrapped angles: x + d, q exp(d) or exp(d) q of a rotation."""
+    return moved(x, d, model.turns) if model.turns else x + d
+
+
 def points_around(model, x, D):
     """The points move(model, x, d) of each column d of D, (n, points), angles not wrapped."""
     return moved(x, D, model.turns) if model.turns else outer(x, ones(D)) + D
@@ -114,6 +119,12 @@ def unit(x, turns):
 def local_at(model, z, x):
     """The model and the measurement z in the tangent at h(x), of `about`; without rotations there as they are."""
     return about(model, z, model.h(x)) if model.measured_turns else (model, z)
+
+
+def local_at_measurement(model, z, x):
+    """The same in the tangent at z, or at h(x) in parts of z that miss a number."""
+    turns = model.measured_turns
+    return about(model, z, completed(z, unit(model.h(x), turns), turns)) if turns else (model, z)
 
 
 def about(model, z, y):

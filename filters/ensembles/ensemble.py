@@ -29,6 +29,7 @@ from filters.algebra.operations import (
     wrap,
 )
 from filters.algebra.points import dot, log_density, outer
+from filters.algebra.tangents import added
 from filters.engine.belief import Belief, Kernels
 from filters.filter import FilterWithPage
 from filters.pages.kernels import members_kernels
@@ -105,7 +106,7 @@ def propagate(model, x, u):
 
 def add_process_noise(model, x, w):
     """Add noise of covariance Q to a member, at the end of a step."""
-    return on_branch(x + model.Q_root @ w, model.state_angles)
+    return on_branch(added(model, x, model.Q_root @ w), model.state_angles)
 
 
 def expect(model, x, z):

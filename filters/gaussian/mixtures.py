@@ -1,17 +1,10 @@
-"""Mixtures of Gaussians: the Gaussian sum filter and the Takagi-Sugeno fuzzy filter.
-
-A mixture has the moments and, after a measurement, the weights
-
-    mean = sum of w_k x_k,  P = sum of w_k (P_k + (x_k - mean)(x_k - mean)')
-    w_k becomes w_k N(v_k; 0, S_k)/L,  L = sum of w_k N(v_k; 0, S_k)
-"""
+"""Mixtures of Gaussians: the Gaussian sum filter and the Takagi-Sugeno fuzzy filter."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from math import prod
 from typing import Any, ClassVar, NamedTuple
 
@@ -19,10 +12,12 @@ import numpy as np
 
 from filters.algebra.operations import choose, exceeds, present
 from filters.algebra.points import dot, log_density, outer
+from filters.algebra.tangents import added, innovation, local_at, reset
 from filters.baselines import index_of
 from filters.engine.belief import Belief, Kernels, filter_offset, memory_offsets
 from filters.filter import Filter
 from filters.gaussian import extended
+from filters.gaussian.blending import Parts, blender, parts_of, weigher
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.sigma_points import checked_corners, memberships, rules_at_corners
 from filters.pages.kernels import (
@@ -37,161 +32,16 @@ from filters.pages.kernels import (
     works_of,
 )
 from filters.pages.page import ACTING, Equations, PagedModel, RowMemory
-from thruster_env.core.angles import angle_indices, whole_turns, wrapped
 from thruster_env.core.checks import at_least, one_of, short_repr
-from thruster_env.core.sources import Source, lower_pairs
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.shape import Functions, Shape
+from thruster_env.model.turns import tangent_flags
 
 Shapes = tuple[tuple[str, tuple[int, ...]], ...]  # of parameters, by name
 FEWEST_PARTS, MOST_PARTS = 7, 1000
 REACH = 4.5  # of the outermost parts, in standard deviations of the split component
 OVERLAP = 0.6  # standard deviation of a part, over the distance from one to the next
 BLENDINGS = ("weights", "moments", "output")
-
-
-class Parts(NamedTuple):
-    """The layout of the parts of a mixture of Gaussians in a row."""
-
-    first: int
-    stride: int  # from one part to the next
-    number: int
-
-
-@cache
-def blender(
-    parts: Parts, size: int, x: int, p: int, angles: tuple[bool, ...], *, between: bool = True, wraps: bool = True
-) -> Callable:
-    """Return `blend(row, weights, target)`: write a mixture's mean and covariance from the offset `target` on.
-
-    `x` and `p` are the offsets of mean and covariance within each part, `weights` that of the weights in the row.
-    Angles of parts are put on one branch (`thruster_env.core.angles`); if it `wraps`, those of the mean lie in
-    (-pi, pi]. Without the covariance `between` the parts the result is the sum of w_k P_k.
-    """
-    source = Source("blend", "row, weights, target", result=(size, size))
-    mean, cov, d = source.local("m", size), source.local("c", size, size), source.local("d", size)
-    each = f"for k in range({parts.number}):", f"part = {parts.first} + {parts.stride} * k"
-    if not source.loops:
-        source.line(
-            " = ".join([*(mean[i] for i in range(size)), *(cov[i, j] for i, j in lower_pairs(size)), "0.0"])
-        )
-    has_weight = "if row[weights + k] != 0.0:"  # 0 times the square of a distant part may be NaN
-    for _ in source.inside(each[0]):
-        source.line(each[1])
-        for _ in source.inside(has_weight):
-            for i in source.range(size):
-                source.line(f"{mean[i]} += row[weights + k] * row[part + {x + i}]")
-    for _ in source.inside(each[0]):
-        source.line(each[1])
-        source.line("w = row[weights + k]")
-        for _ in source.inside(has_weight):
-            for i in source.range(size if between else 0):
-                source.line(f"{d[i]} = row[part + {x + i}] - {mean[i]}")
-            for i in source.range(size):
-                for j in source.range(i + 1):
-                    apart = f" + {d[i]} * {d[j]}" * between
-                    source.line(f"{cov[i, j]} += w * (row[part + {p + i * size + j}]{apart})")
-    for i in source.range(size):
-        source.line(f"row[target + {i}] = {mean[i]}")
-        for j in source.range(i + 1):
-            source.line(f"row[target + {i * size + j + size}] = row[target + {j * size + i + size}] = {cov[i, j]}")
-    blend = source.function()
-    if not any(angles):
-        return blend
-    align, angle_places = part_aligner(parts, x, angles), angle_indices(angles)
-
-    def blend_aligned(row, weights, target):
-        align(row, weights)
-        blend(row, weights, target)
-        if wraps:
-            for i in angle_places:
-                row[target + i] = wrapped(row[target + i])
-
-    return blend_aligned
-
-
-@cache
-def part_aligner(parts: Parts, x_offset: int, angles: tuple[bool, ...]) -> Callable:
-    """Return `align(row, weights)`: put angles of the vector x of all parts on one branch, around their mean."""
-    (_, stride, count), angle_offsets = parts, angle_indices(angles, parts.first + x_offset)
-
-    def align(row, weights):
-        for i in angle_offsets:
-            s = c = 0.0
-            for k in range(count):
-                s += row[weights + k] * np.sin(row[i + k * stride])
-                c += row[weights + k] * np.cos(row[i + k * stride])
-            middle = np.arctan2(s, c)
-            for k in range(count):
-                row[i + k * stride] -= whole_turns(row[i + k * stride] - middle)
-
-    return align
-
-
-@cache
-def weigher(parts: Parts, level: int) -> Callable:
-    """Return `weigh(row, weights)`: multiply weights by the parts' likelihoods; it returns the log of their sum.
-
-    The weights before must not be zero.
-    """
-    (_, stride, count), first = parts, parts.first + level
-
-    def weigh(row, weights):
-        top = -math.inf
-        for k in range(count):
-            top = max(top, row[first + k * stride])
-        total = 0.0
-        for k in range(count):
-            row[weights + k] *= math.exp(row[first + k * stride] - top)
-            total += row[weights + k]
-        for k in range(count):
-            row[weights + k] /= total
-        return top + math.log(total) if total > 0.0 else -math.inf
-
-    return weigh
-
-
-@cache
-def log_weigher(parts: Parts, level: int) -> Callable:
-    """Return `weigh(row, logs, weights)`: `weigher` for weights that are carried from step to step as logarithms.
-
-    The logarithms begin at `logs`; a weight of zero, with the logarithm -inf, stays zero. A weight that is too
-    small for a float64 keeps its logarithm, so that its part regains weight as soon as measurements support it.
-    """
-    (_, stride, count), first = parts, parts.first + level
-
-    def weigh(row, logs, weights):
-        top = -math.inf
-        for k in range(count):
-            row[logs + k] += row[first + k * stride]
-            top = max(top, row[logs + k])
-        total = 0.0
-        for k in range(count):
-            row[weights + k] = math.exp(row[logs + k] - top)
-            total += row[weights + k]
-        log_total = top + math.log(total) if total > 0.0 else -math.inf
-        for k in range(count):
-            row[weights + k] /= total
-            row[logs + k] -= log_total
-        return log_total
-
-    return weigh
-
-
-def logarithm(weight):
-    """The logarithm of a weight, -inf of zero."""
-    return math.log(weight) if weight > 0.0 else -math.inf
-
-
-def parts_of(extras: np.ndarray, number: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means (number, n), covariances (number, n, n) and weights, or their logarithms, of a belief's parts."""
-    parts, weights = np.split(extras, [-number])
-    means, covs, _ = np.split(parts.reshape(number, -1), [n, n + n * n], axis=1)
-    return means.copy(), covs.reshape(number, n, n).copy(), weights.copy()
-
-
-def nothing(memory, inputs, numbers):
-    """Do nothing: the function before the first of several."""
 
 
 class MixturePage(NamedTuple):
@@ -222,8 +72,13 @@ def mixture_kernels(
 
     Extras: mean, covariance, innovation, its covariance and log-likelihood of each part; then the weights.
     """
-    n, m, layout, prior = shape.n, shape.m, memory_offsets(shape.n, shape.m), prior_start(shape)
-    belief, length, wide = n + n * n, prod(own_shape), max(shape.inputs, m)
+    n, m, t, prior = shape.n, shape.m, shape.t, prior_start(shape)
+    layout, belief, length, wide = (
+        memory_offsets(n, m, t),
+        n + t * t,
+        prod(own_shape),
+        max(shape.inputs, shape.channels),
+    )
     level = belief + m + m * m
     acting, feed = layout.extras, shape.feed  # the input of the last step, if h takes it
     parts = Parts(acting + feed, level + 1, count)
@@ -238,13 +93,15 @@ def mixture_kernels(
     acting_now = memory.another(memory.read("rows", acting, feed)) if feed else None
     outputs = (layout.innovation, m), (layout.innovation_cov, m, m)
     v, S = (memory.read("rows", *output) for output in outputs)
+    z, measured_turns = memory.z, shape.measured_turns
+    z = innovation(z, z, measured_turns) if measured_turns else z  # of which only NaN matter
     begin, density = works_of(
         stored(begun, (weights, *shared)),
-        stored((log_density(v, S, present(memory.z)),), (layout.log_likelihood,)),
+        stored((log_density(v, S, present(z)),), (layout.log_likelihood,)),
     )
 
     def stages(memory: RowMemory, model: Equations) -> list[Stage]:
-        x, P = memory.read("rows", 0, n), memory.read("rows", n, n, n, symmetric=True)
+        x, P = memory.read("rows", 0, n), memory.read("rows", n, t, t, symmetric=True)
         u, z, of_part = memory.u, memory.z, [memory.read("given", wide, *own_shape)]
         of_part += [memory.read("given", matrix.operation.at - inputs_offset, *matrix.shape) for matrix in shared]
         if acting_now is not None:
@@ -254,10 +111,9 @@ def mixture_kernels(
         return [stored(predicted, (x, P)[: len(predicted)]), stored(updated, offsets[: len(updated)])]
 
     predict_part, update_part = programs_of(plain, functions, shape, stages).works
-    of_states = blender(parts, n, 0, n, shape.state_angles, between=page.between)
-    of_innovations = blender(
-        *(parts, m, belief, belief + m, shape.measurement_angles), between=page.between, wraps=False
-    )
+    of_states = blender(parts, n, 0, n, shape.state_angles, between=page.between, turns=shape.turns)
+    angles = tangent_flags(shape.measurement_angles, shape.measured_turns)
+    of_innovations = blender(parts, m, belief, belief + m, angles, between=page.between, wraps=False)
     weigh, of_belief = weigher(parts, level), page_kernels(ExtendedKalmanFilter.page, functions, shape)
     step_offset, innovation_offset, likelihood_offset = layout.step, layout.innovation, layout.log_likelihood
     own_first, end, afresh = filter_offset(shape) + plain.own_size, memory.end, page.afresh
@@ -329,6 +185,8 @@ def mixture_kernels(
         extras=inputs_offset - acting,
         scratch=end - inputs_offset,
         acting=tuple(range(acting, first)),
+        turns=len(shape.turns),
+        measured_turns=len(shape.measured_turns),
     )
 
 
@@ -338,9 +196,11 @@ class MixtureFilter(Filter):
 
     Attributes:
         page: the functions.
+        takes_rotations: whether it is written with the steps of a state that has rotations.
     """
 
     page: ClassVar[MixturePage]
+    takes_rotations: ClassVar[bool] = False
 
     @cached_property
     def parameters(self) -> Mapping[str, Any]:
@@ -368,11 +228,13 @@ class MixtureFilter(Filter):
         model = self.kernel_model
         shapes = tuple((name, np.shape(array)) for name, array in self.parameters.items())
         count, *own_shape = np.shape(self.of_parts)
-        return mixture_kernels(self.written_page, model.functions, model.shape, shapes, count, tuple(own_shape))
+        shape = model.any_shape if self.takes_rotations else model.shape
+        return mixture_kernels(self.written_page, model.functions, shape, shapes, count, tuple(own_shape))
 
     def part_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means (parts, n), covariances (parts, n, n) and weights (parts,) of the parts of a belief."""
-        return parts_of(belief.extras[self.kernel_model.shape.feed :], len(self.of_parts), self.model.n)
+        """Means (parts, n), covariances (parts, t, t) and weights (parts,) of the parts of a belief."""
+        feed, model = self.kernel_model.any_shape.feed, self.model
+        return parts_of(belief.extras[feed:], len(self.of_parts), model.n, model.t)
 
 
 def split(model, x, P):
@@ -384,7 +246,10 @@ def split(model, x, P):
 
 def update_gaussian_sum(model, t, g, x, P, z):
     """The part at the node t, after the measurement z."""
-    return extended.update(model, x + g * t, P - outer(g, g) * model.own.narrower, z)
+    P = reset(model, P - outer(g, g) * model.own.narrower, x, g * t)
+    x = added(model, x, g * t)
+    local, z = local_at(model, z, x)
+    return extended.update(local, x, P, z)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -420,13 +285,14 @@ class GaussianSumFilter(MixtureFilter):
 
     name: ClassVar[str] = "gsf"
     page: ClassVar[MixturePage] = MixturePage(split, update_gaussian_sum)
+    takes_rotations: ClassVar[bool] = True
     gaussian_likelihood: ClassVar[bool] = False
     parts: int = 15
     component: int = -1
 
     def __post_init__(self):
         object.__setattr__(self, "parts", at_least("parts", self.parts, FEWEST_PARTS, MOST_PARTS))
-        object.__setattr__(self, "component", index_of("component", self.component, self.model.n))
+        object.__setattr__(self, "component", index_of("component", self.component, self.model.t))
 
     @cached_property
     def standard_split(self) -> tuple[np.ndarray, np.ndarray, float]:
@@ -441,7 +307,7 @@ class GaussianSumFilter(MixtureFilter):
     def parameters(self) -> dict[str, Any]:
         """The unit vector of the component, 1 - s^2, and the weights."""
         _, weights, variance = self.standard_split
-        return {"unit": np.eye(self.model.n)[self.component], "narrower": 1.0 - variance, "weights": weights}
+        return {"unit": np.eye(self.model.t)[self.component], "narrower": 1.0 - variance, "weights": weights}
 
     @cached_property
     def of_parts(self) -> np.ndarray:

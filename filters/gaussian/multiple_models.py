@@ -19,15 +19,25 @@ from filters.algebra.points import dot
 from filters.augmented import embedded_model, places_within
 from filters.engine.belief import Belief, Kernels, filter_offset, memory_offsets, restart_if_lost
 from filters.filter import Filter
-from filters.gaussian.mixtures import Parts, blender, log_weigher, logarithm, nothing, parts_of
-from filters.gaussian.unequal_modes import Absent, absent_states, completer
+from filters.gaussian.blending import (
+    Absent,
+    Parts,
+    absent_states,
+    blender,
+    completer,
+    log_weigher,
+    logarithm,
+    nothing,
+    parts_of,
+)
 from filters.pages.kernels import anything_measured, nothing_to_summarise, stored, works_of
 from thruster_env.core.checks import as_floats, between, one_of, positive, short_repr, vector
 from thruster_env.graphs.programs import Place
 from thruster_env.logs.log import in_steps_of, sample_time_of
 from thruster_env.model.continuous import same_dt
-from thruster_env.model.shape import Shape, number_offsets, starts_of
+from thruster_env.model.shape import Shape, starts_of
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import refuse_rotations, tangent_flags
 
 LOST = 700.0  # log-likelihood of a mode whose filter restarts: this much below the least of the other modes
 MOST_MODES = 32
@@ -54,21 +64,22 @@ def mode_kernels(
     weights of all modes in the mixture with which one mode begins a step, and its probability; without `mixing`
     the filters do not mix.
     """
-    n, m, count, belief = shape.n, shape.m, len(modes), shape.n + shape.n**2
-    at, first_parameter = memory_offsets(n, m), filter_offset(shape)
+    n, m, count, belief = shape.n, shape.m, len(modes), shape.n + shape.t**2
+    at, first_parameter = memory_offsets(n, m, shape.t), filter_offset(shape)
     first, stride = at.extras, at.extras + max(mode.kernels.extras + mode.kernels.scratch for mode in modes)
     parts, logs = Parts(first, stride, count), first + count * stride
     probabilities = logs + count  # scratch from here on
     completing = probabilities + count * (3 + belief)  # after the scratch of `_mixer`
     end = completing + (count + belief) * bool(absent)
-    of_states = blender(parts, n, at.mean, at.cov, shape.state_angles)
-    of_innovations = blender(parts, m, at.innovation, at.innovation_cov, shape.measurement_angles, wraps=False)
+    of_states = blender(parts, n, at.mean, at.cov, shape.state_angles, turns=shape.turns)
+    angles = tangent_flags(shape.measurement_angles, shape.measured_turns)
+    of_innovations = blender(parts, m, at.innovation, at.innovation_cov, angles, wraps=False)
     innovation, level, step, lost = at.innovation, at.log_likelihood, at.step, at.divergences
     of_modes = [
         first_parameter + count + count * count + start for start in starts_of(*(mode.length for mode in modes))
     ]
     start_all, predict_all, update_all = _of_all(modes, parts, of_modes)
-    model = number_offsets(n, m)
+    model = shape.offsets
     priors = [(offset + model.prior_mean, offset + model.prior_cov) for offset in of_modes[:-1]]
     complete = completer(absent, parts, n, of_states, priors, completing)
     weigh = log_weigher(parts, level)
@@ -130,7 +141,14 @@ def mode_kernels(
     extras = probabilities - first
     acting = (first + j * stride + at for j, mode in enumerate(modes) for at in mode.kernels.acting)
     works = start, predict, update, nothing_to_summarise
-    return Kernels(n, m, n, 0, *works, extras=extras, scratch=end - first - extras, acting=tuple(acting))
+    return Kernels(
+        *(n, m, n, 0, *works),
+        extras=extras,
+        scratch=end - first - extras,
+        acting=tuple(acting),
+        turns=len(shape.turns),
+        measured_turns=len(shape.measured_turns),
+    )
 
 
 def _mixer(mixing: Callable, parts: Parts, belief: int, logs: int, transitions: int, blend: Callable) -> Callable:
@@ -217,7 +235,7 @@ class MultipleModelFilter(Filter):
         mode_filter: name of a Gaussian filter for all modes, such as "kf", "ekf" or "ukf", or one for each.
         probabilities: initial probabilities p (K,) of the modes; `usual_probabilities` if None.
         absent: mean and variance of a state, by symbol, in modes that lack it; by default modes that lack a state
-            get the moments of the modes that have it (`filters.gaussian.unequal_modes`).
+            get the moments of the modes that have it (`filters.gaussian.blending`).
     """
 
     one_model: ClassVar[bool] = False
@@ -299,6 +317,8 @@ class MultipleModelFilter(Filter):
     @cached_property
     def _models(self) -> list[StateSpaceModel]:
         every, moments = tuple(range(self.model.n)), self._moments
+        if any(indices != every for indices in self._places):
+            refuse_rotations(self.model)
         return [
             mode if indices == every else embedded_model(mode, self.model, moments)
             for mode, indices in zip(self._mode_models, self._places, strict=True)
@@ -373,24 +393,29 @@ class MultipleModelFilter(Filter):
     def kernels(self) -> Kernels:
         """Kernels for the modes; see `Filter.kernels`."""
         modes = tuple(Mode(filter_.kernels(), len(filter_.numbers)) for filter_ in self.mode_filters)
-        return mode_kernels(modes, self.model.shape, self.absent_states, self.mixing)
+        return mode_kernels(modes, self.model.any_shape, self.absent_states, self.mixing)
+
+    @property
+    def takes_rotations(self) -> bool:
+        """Whether the filters of all modes take models with rotations."""
+        return all(getattr(filter_, "takes_rotations", False) for filter_ in self.mode_filters)
 
     def mode_probabilities(self, belief: Belief) -> np.ndarray:
         """Probabilities mu (K,) of the modes of a belief."""
         return self.mode_estimates(belief)[2]
 
     def mode_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means (K, n), covariances (K, n, n) and probabilities (K,) of the modes of a belief."""
+        """Means (K, n), covariances (K, t, t) and probabilities (K,) of the modes of a belief."""
         means, covs, logs = self.mode_moments(belief)
         return means, covs, np.exp(logs)
 
     def mode_moments(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`mode_estimates` with the logarithms of the probabilities, -inf of zero."""
-        return parts_of(belief.extras, len(self.mode_filters), self.model.n)
+        return parts_of(belief.extras, len(self.mode_filters), self.model.n, self.model.t)
 
 
 def _sizes(model: StateSpaceModel) -> tuple:
-    return model.m, model.inputs, model.shape.measurement_angles
+    return model.m, model.inputs, model.any_shape.measurement_angles, model.turns, model.measured_turns
 
 
 def probabilities_of(name: str, user_value: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -23,7 +23,7 @@ from thruster_env.env.record import ReplayEnv
 from thruster_env.logs.log import Log, seen_by
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import stored_covs
+from thruster_env.model.turns import refuse_measured, stored_covs
 
 SKIPPED = 50  # first rows that do not count, in which a filter settles
 STEP = 1e-4  # of the slopes of outputs, in standard deviations
@@ -176,6 +176,7 @@ def estimate_with(
         seed: likewise.
         noise: of a log on its own stamps, Q by the length of a step [s]; None for one in proportion to it.
     """
+    refuse_measured(filter_.model, "a log")
     smoother = smoother or lag is not None
     measurements = seen_by(filter_.model, log.measurements)
     data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], measurements[None]

@@ -18,9 +18,11 @@ from copy import copy
 from functools import cache
 from typing import Any
 
-from filters.algebra.members import covariance, mean
+from filters.algebra.members import covariance, mean, on_branch
 from filters.algebra.operations import wrap
-from filters.algebra.tangents import differences, inverse_reset_slopes, local_at, moved, unit
+from filters.algebra.points import weighted_covariance, weighted_mean
+from filters.algebra.roots import zeros
+from filters.algebra.tangents import differences, inverse_reset_slopes, local_at, moved, reset_back, unit
 from filters.pages.page import Page
 from thruster_env.model.turns import tangent_flags
 
@@ -36,12 +38,39 @@ def moments(model: Any, x: Any) -> tuple[Any, Any]:
     return wrap(m, model.state_angles), covariance(D, D)
 
 
-def mean_of(model: Any, x: Any) -> Any:
+def weighted_moments(model: Any, x: Any, w: Any, P: Any | None) -> tuple[Any, Any, Any]:
+    """Members near their weighted mean, that mean (n,) and the covariance (t, t); P is that of each member."""
+    if not model.turns:
+        x = on_branch(x, model.state_angles, w)
+        cov = weighted_covariance(x, w)
+        return x, wrap(weighted_mean(x, w), model.state_angles), cov if P is None else cov + weighted_mean(P, w)
+    m = mean_of(model, x, lambda d: weighted_mean(d, w))
+    D = differences(model, x, m)
+    cov = weighted_covariance(D, w)
+    if P is not None:  # each about its own member
+        cov = cov + weighted_mean(reset_back(model, P, m, D), w)
+    return moved(m, D, model.turns), wrap(m, model.state_angles), cov
+
+
+def mean_of(model: Any, x: Any, average: Callable = mean) -> Any:
     """The intrinsic mean (n,) of the members."""
-    m = unit(mean(x), model.turns)
+    m = unit(average(x), model.turns)
     for _ in range(ROUNDS):
-        m = moved(m, mean(differences(model, x, m)), model.turns)
+        m = moved(m, average(differences(model, x, m)), model.turns)
     return m
+
+
+@cache
+def renewed(rejuvenate: Callable) -> Callable:
+    """A particle filter's `rejuvenate` of a state with rotations, from one for numbers: at the particles' mean."""
+
+    def rejuvenate_there(model: Any, x: Any, mean: Any, P: Any, e: Any) -> Any:
+        D = differences(model, x, mean)
+        after = rejuvenate(_chart(model), D, zeros(P, len(P)), P, e)
+        after, *extras = after if isinstance(after, tuple) else (after,)
+        return moved(mean, after, model.turns), *extras
+
+    return rejuvenate_there
 
 
 @cache
@@ -70,8 +99,7 @@ def _charted(function: Callable, *, with_noise: bool) -> Callable:
     def charted(model: Any, x: Any, *signals: Any) -> Any:
         m = mean_of(model, x)
         D = differences(model, x, m)
-        chart = copy(model)
-        chart.turns, chart.state_angles = (), tangent_flags(model.state_angles, model.turns)
+        chart = _chart(model)
         chart.h = lambda d: model.h(moved(m, d, model.turns))
         if with_noise:
             chart.Q_root = inverse_reset_slopes(m, D, model.turns) @ model.Q_root
@@ -80,3 +108,10 @@ def _charted(function: Callable, *, with_noise: bool) -> Callable:
         return moved(m, after, model.turns), *rest
 
     return charted
+
+
+def _chart(model: Any) -> Any:
+    """The model of a state that is an error, without its equations."""
+    chart = copy(model)
+    chart.turns, chart.state_angles = (), tangent_flags(model.state_angles, model.turns)
+    return chart

@@ -42,9 +42,11 @@ from filters.algebra.points import (
     weighted_mean,
     weights,
 )
+from filters.algebra.tangents import added, local_at_measurement
 from filters.engine.belief import Belief, Kernels, filter_offset, memory_offsets
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.filter import FilterWithPage
+from filters.pages.charts import renewed, weighted_moments
 from filters.pages.kernels import MembersMemory, Stage, anything_measured, predictor, stored, with_extras
 from filters.pages.kernels import member_works_of as works_of
 from filters.pages.page import Page, PagedModel, acting_places
@@ -59,7 +61,7 @@ from thruster_env.core.streams import (
     uniform_block,
 )
 from thruster_env.graphs.programs import Place
-from thruster_env.model.shape import Functions, Shape, number_offsets
+from thruster_env.model.shape import Functions, Shape
 
 LOWEST = -1e300  # of logarithms of weights
 SCRATCH_ROWS = 3
@@ -76,7 +78,7 @@ class Layout:
     """
 
     def __init__(self, page: Page, memory: MembersMemory, model: PagedModel):
-        n, first = memory.shape.n, memory_offsets(memory.shape.n, memory.shape.m).extras
+        n, first = memory.shape.n, memory_offsets(memory.shape.n, memory.shape.m, memory.shape.t).extras
         self.x, self.logarithm = memory.x, input_matrix(Place("table", n), (), member=True, like=memory.x)
         self.size, self.extras = Place("rows", first), {}
         memory.end, rows = first + 1, n + 1
@@ -94,30 +96,26 @@ class Layout:
         self.rows, self.numbers, self.weight = rows, memory.end - first, Place("table", rows)
         model.extras = self.extras
 
-    def moments(self, model: PagedModel, x: Matrix, w: Matrix, P: Matrix | None) -> tuple[Matrix, ...]:
-        """Particles with their angles on one branch, their mean and their covariance."""
-        x = on_branch(x, model.state_angles, w)
-        cov = weighted_covariance(x, w)
-        return x, wrap(weighted_mean(x, w), model.state_angles), cov if P is None else cov + weighted_mean(P, w)
-
 
 def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str, Stage]:
     """Stages of a particle filter's page, by name."""
     at = Layout(page, memory, model)
     x, log_w, extras = at.x, at.logarithm, at.extras
     innovation, cov, likelihood = memory.outputs
+    local, z = local_at_measurement(model, memory.z, memory.mean)  # the density of each particle is exact there
+    rejuvenate = renewed(page.rejuvenate) if model.turns and page.rejuvenate else page.rejuvenate
     of_each = {
         "start": (on_branch(at.start[0], model.state_angles), *at.start[1:]),
         "propagate": page.propagated(model, x, u=memory.u),
         "add_process_noise": page.add_process_noise(model, x, memory.w),
     }
-    if page.rejuvenate:
-        of_each["renew"] = page.rejuvenate(model, x, memory.mean, memory.P, memory.w)
+    if rejuvenate:
+        of_each["renew"] = rejuvenate(model, x, memory.mean, memory.P, memory.w)
     stages = {name: stored(results, (x,), extras) for name, results in of_each.items()}
     stages["choose"] = stored((weights(log_w),), (at.weight,))
-    stages["summarise"] = stored(at.moments(model, x, weights(log_w), extras.get("P")), (x, *memory.belief))
+    stages["summarise"] = stored(weighted_moments(model, x, weights(log_w), extras.get("P")), (x, *memory.belief))
     if page.lookahead:
-        mu, level, v, S = page.lookahead(model, x, log_w, memory.z)
+        mu, level, v, S = page.lookahead(local, x, log_w, z)
         w, first = normalised(log_w + level)
         targets_and_values: dict[Matrix | Place, Matrix] = {
             x: mu,
@@ -128,12 +126,12 @@ def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str,
             likelihood: first,
         }
         if page.rejuvenate:
-            targets_and_values |= dict(zip(memory.belief, at.moments(model, mu, w, None)[1:], strict=True))
+            targets_and_values |= dict(zip(memory.belief, weighted_moments(model, mu, w, None)[1:], strict=True))
         stages["foresee"] = stored(tuple(targets_and_values.values()), tuple(targets_and_values))
         log_w = log_w + memory.read("rows", likelihood.at)
-    x, log_w, *outputs, changed = with_extras(page.update(model, x, log_w, memory.z, memory.e))
+    x, log_w, *outputs, changed = with_extras(page.update(local, x, log_w, z, memory.e))
     w, level = normalised(log_w)
-    x, *moments = at.moments(model, x, w, changed.get("P"))
+    x, *moments = weighted_moments(model, x, w, changed.get("P"))
     log_w = at_least(log_w - level, LOWEST)  # a particle whose prediction is NaN gets nearly no weight
     results = x, log_w, level, effective_size(w), *moments, *outputs, changed
     targets: tuple[Matrix | Place, ...] = (
@@ -200,7 +198,7 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
     n, m, memory = shape.n, shape.m, MembersMemory(shape, page)
     layout = Layout(page, memory, PagedModel(memory))
     works = works_of(page, functions, shape, stages_of, layout.rows + 1)
-    row_layout, source, scratch = memory_offsets(n, m), number_offsets(n, m), layout.rows + 1
+    row_layout, source, scratch = memory_offsets(n, m, shape.t), shape.offsets, layout.rows + 1
     step, key_0, key_1, likelihood = row_layout.step, row_layout.key_0, row_layout.key_1, row_layout.log_likelihood
     innovation, cov = row_layout.innovation, row_layout.innovation_cov
     r_offset, mean_offset = source.r, row_layout.mean
@@ -295,6 +293,8 @@ def particle_kernels(page: Page, functions: Functions, shape: Shape, resample: b
         extras=layout.numbers,
         extra_kept_rows=layout.rows - n,
         acting=acting_places(layout.extras),
+        turns=len(shape.turns),
+        measured_turns=len(shape.measured_turns),
     )
 
 
@@ -335,7 +335,7 @@ def smooth(model, x, mean, P, e):
 
 def initial_weighted(model, w):
     """Draw a particle from the prior."""
-    return model.prior_mean + model.prior_root @ w
+    return added(model, model.prior_mean, model.prior_root @ w)
 
 
 def expect(model, x, log_w, z):
@@ -386,7 +386,18 @@ class WeightedFilter(FilterWithPage):
     @property
     def spread_states(self) -> int:
         """Number of states that the kernel spreads."""
-        return self.model.n
+        return self.model.t
+
+    @property
+    def takes_rotations(self) -> bool:
+        """Whether it takes the parts of its model that turn: the noise of a direction cannot be taken back."""
+        goes_back = self.written_page.per_particle == ("noise",)
+        return not (goes_back and any(turn.kind == "direction" for turn in self.model.turns))
+
+    @property
+    def shape(self) -> Shape:
+        """The shape of its model; ValueError for parts that it does not take."""
+        return self.kernel_model.any_shape if self.takes_rotations else self.kernel_model.shape
 
     @property
     def written_page(self) -> Page:
@@ -401,7 +412,7 @@ class WeightedFilter(FilterWithPage):
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
-        return particle_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
+        return particle_kernels(self.written_page, self.kernel_model.functions, self.shape)
 
     @staticmethod
     def effective_sample_size(belief: Belief) -> float:

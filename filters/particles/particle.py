@@ -21,6 +21,7 @@ from filters.algebra.points import (
     weights,
 )
 from filters.algebra.roots import hstack, pick, zeros
+from filters.algebra.tangents import added, reset
 from filters.baselines import indices_of
 from filters.engine.belief import Belief, Kernels
 from filters.ensembles.ensemble import add_process_noise, propagate
@@ -41,6 +42,7 @@ from filters.particles.kernels import (
 from thruster_env.core.checks import one_of
 from thruster_env.core.streams import FILTER_PROPOSAL, GROUP, fill_normals
 from thruster_env.model.shape import padded
+from thruster_env.model.turns import move
 
 PROPOSALS, RESAMPLINGS = ("prior", "optimal"), ("systematic", "gaussian")
 
@@ -53,12 +55,12 @@ def initial_auxiliary(model, w):
 def add_process_noise_auxiliary(model, x, w):
     """Add process noise at the end of a step, and keep it as an extra."""
     noise = model.Q_root @ w
-    return on_branch(x + noise, model.state_angles), {"noise": noise}
+    return on_branch(added(model, x, noise), model.state_angles), {"noise": noise}
 
 
 def lookahead(model, x, log_w, z):
     """A particle without its noise, mu, then log N(z; h(mu), R + V), and innovation and S of all with noise."""
-    measured, mu = present(z), x - model.extras["noise"]
+    measured, mu = present(z), added(model, x, -model.extras["noise"])
     y, v, S = expect(model, x, log_w, z)
     without = mask_missing(measured, model.h(mu))
     V = weighted_square(wrap(y - without, model.measurement_angles), weights(log_w))
@@ -71,8 +73,8 @@ def update_auxiliary(model, x, log_w, z, e):
 
     `log_w` is the logarithm of the mean of all lambda, over N(z; h(mu), R + V).
     """
-    x = x + model.extras["noise"]  # the noise is not resampled
-    return x, log_w + fit(model, mask_missing(present(z), model.h(x)), z), {"noise": zeros(model.Q, len(x))}
+    x = added(model, x, model.extras["noise"])  # the noise is not resampled
+    return x, log_w + fit(model, mask_missing(present(z), model.h(x)), z), {"noise": zeros(model.Q, len(model.Q))}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,12 +141,12 @@ def propose(model, x, d, Q, z, e):
     Each d is conditioned on z as in a stochastic ensemble filter, with a perturbation of z for each particle: this
     turns a sample of the prior into one of the proposal. With Q = 0 nothing moves.
     """
-    measured, mu = present(z), x - d
+    measured, mu = present(z), added(model, x, -d)
     H, R = mask_missing(measured, model.H(mu)), uncorrelated(measured, model.R)
     v = mask_missing(measured, wrap(z - model.h(mu), model.measurement_angles))
     S = sym(H @ Q @ H.T + R)
     d = d + divide(Q @ H.T, S) @ (v - H @ d - mask_missing(measured, model.R_root @ e))
-    x = mu + d
+    x = added(model, mu, d)
     rest = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     return x, d, log_density(v, S, measured) + log_density(rest, R, measured) - log_density(v - H @ d, R, measured)
 
@@ -153,7 +155,7 @@ def update_optimal(model, x, log_w, z, e):
     """Draw particles given the measurement z, and weigh them; NaN marks missing channels."""
     _, v, S = expect(model, x, log_w, z)
     x, d, level = propose(model, x, model.extras["noise"], model.extras["noise_cov"], z, e)
-    return x, log_w + level, v, S, no_noise(model, len(x))
+    return x, log_w + level, v, S, no_noise(model, len(model.Q))
 
 
 OPTIMAL = Page(
@@ -236,14 +238,14 @@ class ParticleFilter(ResampledFilter):
         super().__post_init__()
         one_of("proposal", self.proposal, PROPOSALS)
         one_of("resampling", self.resampling, RESAMPLINGS)
-        object.__setattr__(self, "smoothed", indices_of("smoothed", self.smoothed, self.model.n))
+        object.__setattr__(self, "smoothed", indices_of("smoothed", self.smoothed, self.model.t))
         if self.regularisation and self.resampling == "gaussian":
             raise ValueError("a filter that draws from a Gaussian must have no regularisation, but got one")
 
     @property
     def spread_states(self) -> int:
         """How many states the kernel spreads."""
-        return len(self.smoothed) or self.model.n
+        return len(self.smoothed) or self.model.t
 
     @property
     def parameters(self) -> Mapping[str, Any]:
@@ -252,7 +254,7 @@ class ParticleFilter(ResampledFilter):
         if not self.smoothed:
             return parameters
         width = min(parameters["width"], 1.0)
-        flags = [float(i in self.smoothed) for i in range(self.model.n)]
+        flags = [float(i in self.smoothed) for i in range(self.model.t)]
         return {**parameters, "width": width, "drawn": 1.0 - (1.0 - width**2) ** 0.5, "smoothed": flags}
 
     @property
@@ -267,29 +269,30 @@ class ParticleFilter(ResampledFilter):
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
-        model, resample = self.kernel_model, self.resampling == "systematic"
-        return particle_kernels(self.written_page, model.functions, model.shape, resample)
+        resample = self.resampling == "systematic"
+        return particle_kernels(self.written_page, self.kernel_model.functions, self.shape, resample)
 
 
-def sample(x, P, e, sampled):
+def sample(model, x, P, e, sampled):
     """Draw the sampled states from N(x, P); return mean and covariance of all states given these.
 
     With the sampled states first, P = [A 0; B C] [A 0; B C]'; given x_s the mean is x + [A; B] e and the
     covariance of the others C C'.
     """
-    n, count = len(x), len(sampled)
+    n, count = len(P), len(sampled)
     order = (*sampled, *(i for i in range(n) if i not in sampled))
     back, indices = tuple(map(order.index, range(n))), tuple(range(n))
     L = root(pick(P, order, order))
     AB, C = pick(L, back, indices[:count]), pick(L, back, indices[count:])
     if count == n:
-        return x + AB @ e, {"P": P * 0.0}
-    return x + hstack(AB, zeros(P, n, n - count)) @ e, {"P": square(C)}  # only the first entries of e are used
+        return added(model, x, AB @ e), {"P": P * 0.0}
+    d = hstack(AB, zeros(P, n, n - count)) @ e  # only the first entries of e are used
+    return added(model, x, d), {"P": reset(model, square(C), x, d)}
 
 
 def initial_rao_blackwell(model, w):
     """Draw a particle from the prior."""
-    return sample(model.prior_mean, square(model.prior_root), w, model.own.sampled)
+    return sample(model, model.prior_mean, square(model.prior_root), w, model.own.sampled)
 
 
 def propagate_rao_blackwell(model, x, u):
@@ -301,7 +304,7 @@ def propagate_rao_blackwell(model, x, u):
 def add_process_noise_rao_blackwell(model, x, w):
     """Add Q at the end of a step, and draw the sampled states."""
     x, P = extended.add_process_noise(model, x, model.extras["P"])
-    x, extras = sample(x, P, w, model.own.sampled)
+    x, extras = sample(model, x, P, w, model.own.sampled)
     return on_branch(x, model.state_angles), extras
 
 
@@ -373,7 +376,7 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
 
     def __post_init__(self):
         super().__post_init__()
-        indices = indices_of("sampled", self.sampled, self.model.n)
+        indices = indices_of("sampled", self.sampled, self.model.t)
         if not indices:
             raise ValueError("sampled must be a list of indices, at least one, but got none")
         object.__setattr__(self, "sampled", indices)
@@ -390,21 +393,21 @@ class RaoBlackwellisedParticleFilter(ResampledFilter):
         return {
             **parameters,
             "kernel": parameters["width"] ** 2,
-            "flags": [i in self.sampled for i in range(self.model.n)],
+            "flags": [i in self.sampled for i in range(self.model.t)],
         }
 
     def sample(self, belief: Belief) -> np.ndarray:
         """A state (n, N) drawn from each particle's N(x_j, P_j), and the row of log weights."""
-        n, size = self.model.n, self.ensemble_size
+        n, t, size = self.model.n, self.model.t, self.ensemble_size
         values, vectors = np.linalg.eigh(self.particle_covariances(belief))
-        draws = np.zeros(padded(n * size, GROUP))
-        fill_normals(draws, n * size, belief.step, FILTER_PROPOSAL, *belief.key)
-        e = np.sqrt(np.maximum(values, 0.0)) * draws[: n * size].reshape(size, n)
-        drawn = belief.members[:n] + np.einsum("jab,jb->aj", vectors, e)
+        draws = np.zeros(padded(t * size, GROUP))
+        fill_normals(draws, t * size, belief.step, FILTER_PROPOSAL, *belief.key)
+        e = np.sqrt(np.maximum(values, 0.0)) * draws[: t * size].reshape(size, t)
+        drawn = np.array(move(belief.members[:n], np.einsum("jab,jb->aj", vectors, e), self.model.turns))
         return np.concatenate([drawn, belief.members[n : n + 1]])
 
     def particle_covariances(self, belief: Belief) -> np.ndarray:
-        """The covariances P_j (N, n, n) of the particles of a belief."""
-        n, size = self.model.n, self.ensemble_size
-        lower = np.tril(belief.members[n + 1 :].reshape(n, n, size).transpose(2, 0, 1))
+        """The covariances P_j (N, n, n) of the particles of a belief, with rotations (N, t, t)."""
+        t, size = self.model.t, self.ensemble_size
+        lower = np.tril(belief.members[self.model.n + 1 :].reshape(t, t, size).transpose(2, 0, 1))
         return lower + np.tril(lower, -1).transpose(0, 2, 1)

@@ -45,7 +45,7 @@ from thruster_env.model.turns import refuse_rotations
 # The differences between modes i that lead to j count in the smoothed P_j, and again between the x_ij, so P is
 # rather too large. The smoothed x_j has no states that mode j lacks: their prediction from x_i, given the other
 # states, replaces them. After each step a mode gets them from modes that have them
-# (`filters.gaussian.unequal_modes`).
+# (`filters.gaussian.blending`).
 #
 # Source: Kim (1994), "Dynamic linear models with Markov-switching", and for the density Koch (2000), "Fixed-
 # interval retrodiction approach to Bayesian IMM-MHT for maneuvering multiple targets".
@@ -196,6 +196,7 @@ def smoothed_modes(
     step_filters: Sequence[MultipleModelFilter] | None = None,
 ) -> tuple[SmoothedModes, np.ndarray]:
     """The result of `smooth_modes`, and the filter's restarts (B,) in the forward pass, without a warning."""
+    refuse_rotations(filter_.model)
     keys, inputs, measurements = trajectories(filter_, keys, inputs, measurements)
     relations = [relation_of(filter_of_mode, "a mode of a smoother") for filter_of_mode in filter_.mode_filters]
     kinds: Any = filter_.mode_filters  # which have pages, as they have relations

@@ -30,6 +30,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import Rotation
 
 ENSEMBLES = "enkf", "etkf", "letkf", "ensrf", "denkf", "ienkf", "enkf-n"
+OTHERS = "pf", "apf", "rbpf", "imm", "mmae", "gsf"  # of particles, modes and parts
 DT, GYRO, WALK, SENSOR, BIAS = 0.1, 2e-3, 2e-4, 0.05, 0.02
 GRAVITY, FIELD = (0.0, 0.0, 1.0), (0.0, 0.6, -0.8)
 TAKE_ROTATIONS = {  # each with parameters that make it another one, with others
@@ -346,7 +347,7 @@ def test_every_filter_runs_on_rotations_or_refuses_them(name):
     """In one line, before it computes anything."""
     extra = {"low": -np.ones(7), "high": np.ones(7)} if name == "fuzzy" else {}
     make = lambda: FILTERS[name](model=attitude_model(), **extra)  # noqa: E731
-    if name in TAKE_ROTATIONS or name in ENSEMBLES:
+    if name in {*TAKE_ROTATIONS, *ENSEMBLES, *OTHERS}:
         assert make().takes_rotations
     else:
         with pytest.raises(ValueError, match="is of rotations|must have an affine model"):

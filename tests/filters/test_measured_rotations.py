@@ -14,7 +14,7 @@ from filters.c.project import c_filter
 from filters.registry import FILTERS
 from filters.sensitivity import likelihood
 from filters.starts import begun_at
-from tests.filters.test_attitude import BIAS, DT, ENSEMBLES, GYRO, TAKE_ROTATIONS, WALK, advance
+from tests.filters.test_attitude import BIAS, DT, ENSEMBLES, GYRO, OTHERS, TAKE_ROTATIONS, WALK, advance
 from thruster_env.core.compiled import interpreted
 from thruster_env.model import poses, rotations
 from thruster_env.model.state_space import StateSpaceModel
@@ -321,7 +321,7 @@ def test_a_pose_is_measured_whole():
 def test_what_cannot_measure_rotations_says_so():
     """In a line."""
     model = tracker_model()
-    for name in set(FILTERS) - set(TAKE_ROTATIONS) - set(ENSEMBLES) - {"fuzzy", "kf"}:
+    for name in set(FILTERS) - {*TAKE_ROTATIONS, *ENSEMBLES, *OTHERS, "fuzzy", "kf"}:
         with pytest.raises(
             ValueError, match="states and measurements must be numbers and angles here|must have an affine"
         ):

@@ -7,7 +7,7 @@ from scipy.stats import multivariate_normal
 
 from docs.scripts.filter_pictures import followed, half_lost
 from filters import StateSpaceModel, make_filter, run
-from filters.gaussian.mixtures import Parts, blender
+from filters.gaussian.blending import Parts, blender
 from tests.models import pendulum
 from tests.thruster_env.core.test_angles import turning
 from thruster_env.model.affine import affine_model, linearize

@@ -203,9 +203,17 @@ def refuse_rotations(model: Any) -> None:
         what = " and ".join(["states"] * bool(model.turns) + ["measurements"] * bool(model.measured_turns))
         raise ValueError(
             f"{what} must be numbers and angles here, but {names} {'is' if len(turns) == 1 else 'are'} of "
-            f"{kinds}: 'ekf', 'iekf', 'ukf', 'ckf', their kin and 'enkf' take these, in filters.run, "
+            f"{kinds}: 'ekf', 'iekf', 'ukf', 'ckf', their kin, 'enkf', 'pf' and 'imm' take these, in filters.run, "
             "sessions, C and EstimateState around an env of your own; problems, ModelEnv and tensors do not"
         )
+
+
+def refuse_measured(model: Any, where: str) -> None:
+    """Raise ValueError for a model that measures rotations, directions or poses; `where` takes none."""
+    if model.measured_turns:
+        names = " and ".join(repr(turn.name) for turn in model.measured_turns)
+        rule = f"measurements of {where} must be numbers and angles, but {names} turns"
+        raise ValueError(f"{rule}: filters.run, sessions, EstimateState and C take such models")
 
 
 def refuse_signs(observe: Callable[[np.ndarray], Any], model: Any) -> None:

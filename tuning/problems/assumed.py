@@ -28,6 +28,7 @@ from thruster_env.core.angles import on_one_branch
 from thruster_env.core.checks import at_least, one_of, positive, short_repr
 from thruster_env.core.modules import error_line
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import refuse_measured
 from tuning.problems.check import DIGEST_RUNS, check_data, digest_of, numbers_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step
 from tuning.problems.problem import GIVEN, SPREAD, Parameter, Problem
@@ -89,7 +90,7 @@ class AssumedProblem(Problem):
         self._dt = None if dt is None else positive("dt", dt)
         if self._parameters is not None and isinstance(assumed, StateSpaceModel):
             raise ValueError(f"a model with parameters must be a function of them, but got {short_repr(assumed)}")
-        self.model()
+        refuse_measured(self.model(), "a problem")
 
     @abstractmethod
     def make(self, seeds: tuple[int, ...]) -> Data:

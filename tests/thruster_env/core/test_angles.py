@@ -11,7 +11,7 @@ from filters import FILTERS, StateSpaceModel, Unknown, augmented_model, make_fil
 from filters.baselines import component_solver
 from filters.consistency.report import consistency_report
 from filters.ensembles.square_root import record_members
-from filters.gaussian.mixtures import Parts, part_aligner
+from filters.gaussian.blending import Parts, part_aligner
 from filters.sensitivity import likelihood
 from tests.models import affine, simulated, small
 from thruster_env.core.angles import difference, row_aligner, wrapped, wrapped_where
