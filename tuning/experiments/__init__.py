@@ -46,5 +46,7 @@ EXPERIMENTS = {
     "recordings": Experiment("A recorded thruster beside its load cell", "recordings.identification", "real_data"),
     "users": Experiment("Filters tuned on users' problems, beside users' baselines", "users", "tuning"),
     "methods": Experiment("Every method of tuning on the same data and budget", "methods.tables"),
-    "policies": Experiment("Policies on raw, filtered and true state, beside MPC, PI and LQG", "policies_report"),
+    "policies": Experiment(
+        "Policies on raw, filtered and true state, beside MPC, PI and LQG", "policies_report", "policies"
+    ),
 }

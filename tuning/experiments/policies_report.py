@@ -1,4 +1,4 @@
-"""The page of a comparison: tables in Markdown, sentences that answer its questions, and two pictures.
+"""A comparison in tables, sentences that answer its questions, and two pictures.
 
 There is a table for each noise level, and a summary with a row for each question. The pictures are learning curves
 by observation set, and cost against observation error.
@@ -6,9 +6,8 @@ by observation set, and cost against observation error.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,13 +15,14 @@ import numpy as np
 
 from filters.consistency.nees import Interval
 from filters.logs.findings import colour_of
-from thruster_env.core.files import DARK, check_target, new_figure, save_figure, tidy, write_whole
-from thruster_env.core.text_tables import Table, markdown_table, with_tables
+from thruster_env.core.files import DARK, new_figure, save_figure, tidy
+from thruster_env.core.text_tables import Table, markdown_table
 from tuning.api.markers import OUTPUT, RUNS, ExecutorOption, Option
 from tuning.api.result import Printed
 from tuning.cli.output import progress_of
 from tuning.experiments.policies import (
     BEST,
+    NOISES,
     QUICK,
     VARIANT_NOISE,
     WRONG,
@@ -84,9 +84,8 @@ COST = "cost of an episode: minus the return [-]"
 
 # Of the page.
 NOT_ON_PAGE = "lowpass", "kf", "ukf"
-PAGE, FOLDER = "policies.md", Path("out") / "comparison"
-CURVES, ERRORS = "policies_curves.png", "policies_errors.png"
-ROUGH = "**Rough**, by `--quick`: it shows that everything runs, not which policy is better."
+FOLDER = Path("out") / "comparison"
+ROUGH = "Rough, by --quick: it shows that everything runs, not which policy is better."
 
 
 def by_policy(results: Sequence[Result]) -> dict[Key, list[Result]]:
@@ -187,106 +186,76 @@ def _ratio_cell(groups: Groups, noise: str, above: tuple[str, str], below: tuple
 
 GOAL = 0.7  # of the gap between raw and true, at medium noise
 NEAR = 0.02  # of the best controller's cost: tolerance within which a learnt policy reaches it
-LEARNT = ("ppo", "sac", "ppo+mpc", "sac+mpc")
+TUNED, TUNED_WRONG = ("ekf, tuned", "ekf, untuned"), ("ekf, wrong model tuned", "ekf, wrong model")
+WORTH = {  # of a better estimate to the same controller, without training: what is better, and than what
+    "knowing the true state": ("true", "ekf"),
+    "tuning the EKF's Q and R, against the rule of thumb,": TUNED,
+    "tuning them, where the model is wrong, against the plant's": TUNED_WRONG,
+    "a right model": ("ekf", "ekf, wrong model"),
+}
+
+
+def pairs() -> Iterator[tuple[str, str, str, str, str, str]]:
+    """Sentences on medium noise: text, kind and label of two policies, and the form of the difference of returns.
+
+    Without a form it is the ratio of costs.
+    """
+    for what, (better, other) in WORTH.items():
+        yield f"With the same controller (MPC), {what} is worth {{}}: ", BEST, better, BEST, other, "+.4f"
+    for observed in ("true", "ekf"):
+        for kind in ("ppo", "sac", "ppo+mpc", "sac+mpc"):
+            yield (
+                f"{name_of(kind, observed)} costs {{}} times as much as MPC: ",
+                kind,
+                observed,
+                BEST,
+                observed,
+                "",
+            )
+    for label in (f"ekf, {variant}" for variant in WRONG):
+        for kind in ("ppo", "ppo+mpc"):
+            yield f"{name_of(kind, label)} returns {{}} more than MPC: ", kind, label, BEST, label, "+.3f"
+    for about, (tuned, other), called in (
+        ("the exact model", TUNED, "the untuned one"),
+        ("a wrong model", TUNED_WRONG, "the one with the plant's Q and R"),
+    ):
+        text = f"With {about}, PPO on the tuned EKF returns {{}} more than on {called}: "
+        yield text, "ppo", tuned, "ppo", other, "+.3f"
+    for observed in ("ekf", "enkf"):
+        for kind in ("ppo", BEST):
+            text = f"A wrong model multiplies the cost of {name_of(kind, observed)} by {{}}"
+            yield text, kind, f"{observed}, wrong model", kind, observed, ""
 
 
 def answers(results: Sequence[Result]) -> list[str]:
     """Sentences on medium noise."""
-    groups = by_policy(results)
-    questions = (_goal, _estimates, _learnt, _wrong, _tuned, _wrong_model)
-    return [sentence for question in questions for sentence in question(groups)]
-
-
-def _goal(groups: Groups) -> Iterator[str]:
+    groups, sentences = by_policy(results), []
     gap = ends_of_gap(groups, VARIANT_NOISE)
     figures = [figure_of(groups, VARIANT_NOISE, "ppo", observed) for observed in FILTERED]
     parts = [as_interval(closed(figure, *gap)) for figure in figures if gap is not None and figure is not None]
     if parts:
         least = min(parts, key=lambda value: value.low)
         outcome = "reached" if least.low >= GOAL else "not reached by all, intervals counted"
-        yield (
+        sentences.append(
             f"At medium noise PPO on filtered state closes at least {percent(least)} of the gap between PPO on "
             f"raw measurements and {name_of(BEST, 'true')}; the aim of {100 * GOAL:.0f} % is {outcome}."
         )
+    for text, kind, label, other_kind, other, form in pairs():
+        first, second = (figure_of(groups, VARIANT_NOISE, *of) for of in ((kind, label), (other_kind, other)))
+        if first is not None and second is not None:
+            value = as_interval(first - second if form else first / second)
+            ended = _verdict(value, bool(form)) if text.endswith(": ") else ""
+            sentences.append(f"{text.format(as_text(value, form or '.3f'))}{ended}.")
+    return sentences
 
 
-def _estimates(groups: Groups) -> Iterator[str]:
-    """The effect of a better estimate on the same controller, without training."""
-    for better, other, advantage in (
-        ("true", "ekf", "knowing the true state"),
-        ("ekf, tuned", "ekf, untuned", "tuning the EKF's Q and R, against the rule of thumb,"),
-        (
-            "ekf, wrong model tuned",
-            "ekf, wrong model",
-            "tuning them, where the model is wrong, against the plant's",
-        ),
-        ("ekf", "ekf, wrong model", "a right model"),
-    ):
-        known, usual = (figure_of(groups, VARIANT_NOISE, BEST, label) for label in (better, other))
-        if known is not None and usual is not None:
-            value = as_interval(known - usual)
-            gain = as_text(value, "+.4f")
-            yield f"With the same controller (MPC), {advantage} is worth {gain}: {_verdict(value)}."
-
-
-def _learnt(groups: Groups) -> Iterator[str]:
-    for observed in ("true", "ekf"):
-        best = figure_of(groups, VARIANT_NOISE, BEST, observed)
-        for kind in LEARNT:
-            figure = figure_of(groups, VARIANT_NOISE, kind, observed)
-            if best is not None and figure is not None:
-                value = as_interval(figure / best)
-                cost = as_text(value, ".3f")
-                yield f"{name_of(kind, observed)} costs {cost} times as much as MPC: {_near(value)}."
-
-
-def _wrong(groups: Groups) -> Iterator[str]:
-    for variant in WRONG:
-        best = figure_of(groups, VARIANT_NOISE, BEST, f"ekf, {variant}")
-        for kind in ("ppo", "ppo+mpc"):
-            figure = figure_of(groups, VARIANT_NOISE, kind, f"ekf, {variant}")
-            if best is not None and figure is not None:
-                value = as_interval(figure - best)
-                sentence = f"{name_of(kind, f'ekf, {variant}')} returns {as_text(value, '+.3f')} more than MPC"
-                yield f"{sentence}: {_verdict(value)}."
-
-
-def _tuned(groups: Groups) -> Iterator[str]:
-    for about, tuned_label, other, called in (
-        ("the exact model", "ekf, tuned", "ekf, untuned", "the untuned one"),
-        ("a wrong model", "ekf, wrong model tuned", "ekf, wrong model", "the one with the plant's Q and R"),
-    ):
-        tuned, reference = (figure_of(groups, VARIANT_NOISE, "ppo", label) for label in (tuned_label, other))
-        if tuned is not None and reference is not None:
-            value = as_interval(tuned - reference)
-            yield (
-                f"With {about}, PPO on the tuned EKF returns {as_text(value, '+.3f')} more than on {called}: "
-                f"{_verdict(value)}."
-            )
-
-
-def _wrong_model(groups: Groups) -> Iterator[str]:
-    for observed in ("ekf", "enkf"):
-        for kind in ("ppo", BEST):
-            wrong = figure_of(groups, VARIANT_NOISE, kind, f"{observed}, wrong model")
-            right = figure_of(groups, VARIANT_NOISE, kind, observed)
-            if wrong is not None and right is not None:
-                value = as_text(as_interval(wrong / right), ".3f")
-                yield f"A wrong model multiplies the cost of {name_of(kind, observed)} by {value}."
-
-
-def _near(value: Interval) -> str:
+def _verdict(value: Interval, is_difference: bool) -> str:
+    if is_difference:
+        return "better" if value.low > 0 else "worse" if value.high < 0 else "no significant difference"
     if value.high < 1:
         return "better"
-    if value.high <= 1 + NEAR:
-        return f"within {100 * NEAR:.0f} %"
-    return f"not within {100 * NEAR:.0f} %" if value.low > 1 + NEAR else f"perhaps within {100 * NEAR:.0f} %"
-
-
-def _verdict(value: Interval) -> str:
-    if value.low > 0:
-        return "better"
-    return "worse" if value.high < 0 else "no significant difference"
+    near = f"within {100 * NEAR:.0f} %"
+    return near if value.high <= 1 + NEAR else f"not {near}" if value.low > 1 + NEAR else f"perhaps {near}"
 
 
 def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
@@ -367,48 +336,28 @@ def _make_logarithmic(axis) -> None:
     axis.yaxis.set_major_formatter("{x:g}")
 
 
-def check_page(page: Path) -> None:
-    """Raise ValueError unless the tables can be written there: into a new page, or one with a place for them."""
-    if page.suffix != ".md":
-        raise ValueError(f"a page must be a file that ends in .md, but got {str(page)!r}")
-    check_target(page)
-    if page.is_file() and not re.search(
-        r"<!-- table (summary|answers|policies_\w+) -->", page.read_text(encoding="utf-8")
-    ):
-        rule = "a page that is there must have a place for a table, such as <!-- table summary --> <!-- end -->"
-        raise ValueError(f"{rule}, but {page} has none")
+@cache
+def stored() -> list[Result]:
+    """All results of the page, of which those in the folder are not computed again."""
+    return run_comparison(Comparison(), FOLDER, "processes")
 
 
-def write_report(results: Sequence[Result], comparison: Comparison, page: Path, rough: bool = False) -> list[Path]:
-    """Write the tables of a page again, and the pictures beside it; return the files.
-
-    A missing page is created. Tables stand between `<!-- table NAME -->` and `<!-- end -->`; rough ones say so.
-    """
-    tables: dict[str, Callable[[], str]] = {
-        f"policies_{noise}": partial(_noise_table, results, noise, rough) for noise in comparison.noises
-    }
-    tables["summary"] = lambda: markdown_table(["", *comparison.noises], summary_rows(results))
-    tables["answers"] = lambda: "\n".join(f"- {sentence}" for sentence in answers(results))
-    text = page.read_text(encoding="utf-8") if page.is_file() else _new_page(comparison, list(tables))
-    curves = learning_curves(results, page.with_name(CURVES))
-    errors = cost_against_error(results, page.with_name(ERRORS))
-    write_whole(page, with_tables(text, tables))
-    return [page, curves, errors]
-
-
-def _noise_table(results: Sequence[Result], noise: str, rough: bool) -> str:
+def noise_table(results: Sequence[Result], noise: str) -> str:
     """The return of a policy and, at medium noise, its errors; without the observations that are left out."""
     width = len(HEADER) if noise == VARIANT_NOISE else 3
     rows = [row[:width] for row in rows_of(results, noise) if row[0].partition(": ")[2] not in NOT_ON_PAGE]
-    return markdown_table(HEADER[:width], rows) + (f"\n\n{ROUGH}" if rough else "")
+    return markdown_table(HEADER[:width], rows)
 
 
-def _new_page(comparison: Comparison, names: Sequence[str]) -> str:
-    counts = f"{comparison.seeds} training seeds; {comparison.episodes} held-out episodes."
-    parts = [f"# Policies on raw, filtered and true state\n\n{counts} Thrust errors are in N."]
-    parts += [f"<!-- table {name} -->\n<!-- end -->" for name in names]
-    parts += [f"![Learning curves]({CURVES})", f"![Cost against the error of what is observed]({ERRORS})"]
-    return "\n\n".join(parts) + "\n"
+TABLES: dict[str, Callable[[], str]] = {
+    "summary": lambda: markdown_table(["", *NOISES], summary_rows(stored())),
+    "answers": lambda: "\n".join(f"- {sentence}" for sentence in answers(stored())),
+    **{f"policies_{noise}": lambda noise=noise: noise_table(stored(), noise) for noise in NOISES},
+}
+FIGURES = {
+    "appendix/policies_curves.png": lambda path: learning_curves(stored(), path),
+    "appendix/policies_errors.png": lambda path: cost_against_error(stored(), path),
+}
 
 
 def reproduce(
@@ -418,13 +367,12 @@ def reproduce(
     recurrent: Annotated[bool, Option(RUNS)] = False,
     executor: ExecutorOption = "processes",
     out: Annotated[Path, Option(OUTPUT)] = FOLDER,
-    page: Annotated[Path | None, Option(OUTPUT, metavar="FILE.md")] = None,
 ) -> Printed:
     """Train policies on raw, filtered and true state, and compare them with model-predictive control, PI and LQG.
 
     It trains PPO at three noise levels of the thrust sensor, SAC, and policies that correct the controller, scores
-    all on the same held-out episodes, and writes a page with tables and two pictures. Ctrl-C keeps finished work,
-    and the same command continues. On two cores it takes an hour or more.
+    all on the same held-out episodes, and draws two pictures. Ctrl-C keeps finished work, and the same command
+    continues. On two cores it takes an hour or more.
 
     Example: thruster reproduce policies --quick
 
@@ -435,26 +383,23 @@ def reproduce(
         recurrent: also PPO with an LSTM on raw measurements: many hours.
         executor: where policies are trained: in N processes (as many as cores), in those of `mpirun`, or on a Dask
             scheduler's workers, which must share the folder.
-        out: folder of results; existing ones are not recomputed.
-        page: page whose tables are rewritten, with the pictures beside it.
+        out: folder of results and pictures; existing results are not recomputed.
     """
     comparison = QUICK if quick else Comparison()
     changes: dict[str, Any] = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}
     comparison = comparison._replace(**{name: value for name, value in changes.items() if value is not None})
-    target = page or out / PAGE
-    check_page(target)
     with progress_of("policies", out) as progress:
         results = run_comparison(comparison, out, executor, lambda run, *counts: progress(run.name, *counts))
-    written = write_report(results, comparison, target, rough=quick)
+    files = [learning_curves(results, out / "curves.png"), cost_against_error(results, out / "errors.png")]
     rows = {noise: rows_of(results, noise) for noise in comparison.noises}
-    conclusions, files = answers(results), [str(path) for path in written]
-    summary = summary_rows(results)
+    conclusions, summary = answers(results), summary_rows(results)
     tables = [Table(f"{noise} noise; thrust errors in N", HEADER, rows[noise]) for noise in rows]
+    tables.append(Table("in short, with 95 % intervals", ["", *comparison.noises], summary))
     data = {
         "policies": {noise: [dict(zip(HEADER, row, strict=True)) for row in rows[noise]] for noise in rows},
         "summary": summary,
         "answers": conclusions,
-        "files": files,
+        "files": [str(path) for path in files],
     }
-    tables.append(Table("in short, with 95 % intervals", ["", *comparison.noises], summary))
-    return Printed([*tables, *conclusions, *[f"wrote {path}" for path in files]], data)
+    rough = [ROUGH] if quick else []
+    return Printed([*rough, *tables, *conclusions, *(f"wrote {path}" for path in files)], data)
