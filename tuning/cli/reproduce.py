@@ -60,7 +60,7 @@ class Experiments(LazyGroup):
         path = experiments()[name].command or f"{experiments()[name].module}:reproduce"
         module, _, function = path.partition(":")
         try:
-            run = tables if path == "tables" else getattr(imported(f"{PACKAGE}.{module}"), function, tables)
+            run = getattr(imported(f"{PACKAGE}.{module}"), function, tables)
         except ModuleNotFoundError as error:
             needed = f"{name} must have {error.name}, which is not installed: {to_install('rl')}"
             raise ValueError(needed) from None

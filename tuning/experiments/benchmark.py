@@ -23,7 +23,6 @@ from tuning.api.markers import RUNS as RUNS_PANEL
 from tuning.api.markers import Option, PythonOnly, Seed
 from tuning.api.result import Printed
 from tuning.cli.output import progress_of
-from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data, held_out_seeds
 from tuning.problems.model_problem import ModelProblem
@@ -247,23 +246,3 @@ def tune_inflation(
     choice = run_in_memory(Plan(filter_name, (problem,), seed, hold_r=True), trials).choice
     data, filter_ = problem.data(held_out_seeds(seed, runs)), choice.filter(problem)
     return choice, mean_interval(mean_of_roots(analysis_errors(filter_, data)[0]))
-
-
-def pendulum_errors() -> str:
-    """Filters of the pendulum before and after tuning."""
-    from tuning.experiments.pendulum import problem
-
-    rows = []
-    for name in ("ekf", "ukf"):
-        choice = run_in_memory(Plan(name, (problem,)), TRIALS).choice
-        comparison = evaluate_held_out(choice, problem, 0)
-        for word, evaluation in (("rule of thumb", comparison.untuned), ("tuned", comparison.tuned)):
-            sigma = choice.model["sigma"] if word == "tuned" else problem.untuned["sigma"]
-            errors = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in evaluation.rmse]
-            consistency = f"{evaluation.nees.value:.2f}", f"{evaluation.nis.value:.2f}"
-            rows.append([name, word, f"{sigma:.3f}", *errors, *consistency])
-    header = ["filter", "", "sigma [rad/s]", "theta [rad]", "omega [rad/s]", "mean NEES", "mean NIS"]
-    return markdown_table(header, rows)
-
-
-TABLES = {"pendulum": pendulum_errors}

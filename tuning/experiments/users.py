@@ -6,8 +6,6 @@ computed again. Holm's procedure finds the significant losses among all cases.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import re
@@ -21,7 +19,7 @@ import numpy as np
 
 import tuning
 from filters.consistency.nees import Interval, pooled_mean, slightly
-from thruster_env.core.files import check_target, write_whole
+from thruster_env.core.files import write_whole
 from thruster_env.core.text_tables import Table, markdown_table
 from tuning.api.markers import INPUT, OUTPUT, RUNS, Option
 from tuning.api.result import Printed
@@ -320,12 +318,6 @@ def rows_of(cases: Sequence[Case]) -> list[list[str]]:
     return rows
 
 
-def markdown(cases: Sequence[Case]) -> str:
-    """The table of a page."""
-    rows = [[f"`{row[0]}`" if row[0] else "", f"`{row[1]}`", *row[2:]] for row in rows_of(cases)]
-    return markdown_table(header(cases), rows)
-
-
 def sentences(cases: Sequence[Case]) -> list[str]:
     """What the table says, in words."""
     verdict, failed = verdict_of(cases), [case for case in cases if case.error]
@@ -345,23 +337,6 @@ def sentences(cases: Sequence[Case]) -> list[str]:
             + (f", {small}, which is practically none." if small else ".")
         )
     return lines + [f"{case.problem}, {case.filter} failed: {case.error}" for case in failed]
-
-
-def csv_text(cases: Sequence[Case]) -> str:
-    """A row a comparison, with a header."""
-    lost = {(loss.case.problem, loss.case.filter, loss.baseline) for loss in verdict_of(cases).losses}
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    heads = "problem", "filter", "baseline", "ratio", "low", "high", "chance_if_no_worse", "significantly_worse"
-    writer.writerow([*heads, "score", "nis", "restarts", "chosen", "seconds"])
-    for case in cases:
-        ended = _ended(case)
-        of_case = f"{case.score:.6g}", f"{case.nis:.4g}", case.restarts, ended, f"{case.seconds:.1f}"
-        for name, paired in case.baselines.items():
-            worse = (case.problem, case.filter, name) in lost
-            ratio = [f"{value:.6g}" for value in paired.ratio]
-            writer.writerow([case.problem, case.filter, name, *ratio, f"{paired.chance:.3g}", worse, *of_case])
-    return text.getvalue()
 
 
 def _ended(case: Case) -> str:
@@ -441,13 +416,8 @@ def reproduce(
         name: tuple(value) if isinstance(value, list) else value for name, value in arguments.items() if value
     }
     panel = (QUICK if quick else Panel())._replace(**changes)
-    files = out / "users.csv", out / "users.md"
-    for file in files:
-        check_target(file)
     with progress_of("tuning", out) as progress:
         cases = run_panel(panel, out, progress)
-    for file, text in zip(files, (csv_text(cases), markdown(cases) + "\n"), strict=True):
-        write_whole(file, text)
     conclusions = sentences(cases)
     heads, rows = header(cases), rows_of(cases)
     data = {
@@ -462,10 +432,9 @@ def reproduce(
             for case in cases
         ],
         "answers": conclusions,
-        "files": [str(file) for file in files],
     }
     title = f"scores of tuned filters over those of baselines, held out; {panel.trials} trials"
-    return Printed([Table(title, heads, rows), *conclusions, *[f"wrote {file}" for file in files]], data)
+    return Printed([Table(title, heads, rows), *conclusions], data)
 
 
 TABLES = {"users": users, "users_losses": losses}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp, ttest_rel
 
+from docs.scripts import DOCS
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.experiments.methods import runs
 from tuning.experiments.methods.problems import (
@@ -31,7 +32,7 @@ from tuning.experiments.methods.runs import (
     start_of,
     student,
 )
-from tuning.experiments.methods.tables import percent, tables
+from tuning.experiments.methods.tables import TABLES, percent, tables
 
 WALK = QUICK[0]
 
@@ -139,11 +140,9 @@ def test_a_ring_is_tuned_by_its_inflation_alone():
     assert run_method(case, "likelihood", 0, FAST).last is None
 
 
-def test_the_command_writes_its_page(as_json, thruster, tmp_path):  # noqa: F811
-    page = tmp_path / "methods.md"
-    page.write_text("<!-- table groups A to D -->\n<!-- end -->\n![](methods_groups.png)\n", encoding="utf-8")
-    told = as_json(
-        "reproduce", "methods", "--quick", "--method", "likelihood", "--method", "start", "--page", page
-    )
-    assert "| likelihood |" in page.read_text(encoding="utf-8") and (tmp_path / "methods_groups.png").is_file()
+def test_the_command_prints_its_tables_and_the_pages_have_them(as_json, thruster, tmp_path):  # noqa: F811
+    told = as_json("reproduce", "methods", "--quick", "--method", "likelihood", "--method", "start")
+    assert (tmp_path / told["files"][0]).read_bytes().startswith(b"\x89PNG")
+    pages = "".join((DOCS / name).read_text(encoding="utf-8") for name in ("methods.md", "appendix/methods.md"))
+    assert all(f"<!-- table {name} -->" in pages for name in TABLES)
     assert {one["method"] for one in told["results"]} == {"likelihood", "start", "reference"}

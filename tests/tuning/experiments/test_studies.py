@@ -6,7 +6,6 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from filters import KalmanFilter, run
-from tests.oracles import kalman_update
 from thruster_env.model.simulate import simulate
 from thruster_env.thruster.linear import PUBLISHED
 from tuning.cli.main import main
@@ -21,9 +20,9 @@ from tuning.experiments.thruster_papers import (
     discrete_model,
     findings,
     optimum,
+    study_statements,
     unupdated_ensemble_means,
 )
-from tuning.experiments.thruster_tables import series, study_statements
 
 # The Riccati values and the errors of the un-updated ensemble, computed independently of this package.
 OPTIMUM = {
@@ -162,29 +161,6 @@ def test_by_the_article_s_own_numbers_the_ensemble_filter_is_the_worse_one_in_th
     assert f"{min(ratios):.1f} to {max(ratios):.1f} times" in " ".join(STUDIES["nurhadi2022"].remarks)
 
 
-def test_a_series_is_a_run_of_the_model_and_of_its_filters():
-    one, same, other = (
-        series("open-bladed", 0.8, seed=3),
-        series("open-bladed", 0.8, seed=3),
-        series("tunnel", 0.8),
-    )
-    np.testing.assert_array_equal(one.enkf, same.enkf)
-    assert one.time[-1] == pytest.approx(1.0) and one.truth.shape == one.kf.shape == one.enkf.shape == (101, 2)
-    assert np.abs(one.truth[-1]).max() > 5 * np.abs(other.truth[-1]).max()  # the one is unstable
-    model = discrete_model("open-bladed", 0.8)
-    a, _, _, c, _ = model.matrices()
-    noise = one.truth[1:] - one.truth[:-1] @ a.T, one.measurements - one.truth @ c.T
-    assert all(0.6 < part.var() / 0.8 < 1.5 for part in noise)
-    mean, cov = model.prior_mean, model.prior_cov
-    for k in range(101):
-        if k > 0:
-            mean, cov = a @ mean, a @ cov @ a.T + 0.8 * np.eye(2)
-        mean, cov, _ = kalman_update(mean, cov, one.measurements[k] - c @ mean, c, 0.8 * np.eye(1))
-        np.testing.assert_allclose(one.kf[k], mean, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(one.rmse("enkf"), one.rmse("kf"), rtol=0.1)
-    np.testing.assert_allclose(one.rmse("kf") ** 2, np.square(one.kf - one.truth)[1:].mean(axis=0))
-
-
 def test_a_seed_fixes_the_result():
     first, again, other = (compare("tunnel", 0.6, runs=20, members=30, seed=seed) for seed in (4, 4, 5))
     for a, b, c in zip(first[3:], again[3:], other[3:], strict=True):
@@ -215,14 +191,10 @@ def command_line(monkeypatch, *arguments):
     return stop.value.code or 0
 
 
-def test_json_on_standard_output_is_whole(monkeypatch, capsys, tmp_path):
+def test_json_on_standard_output_is_whole(monkeypatch, capsys):
     few = ("--runs", "4", "--members", "5", "--seed", "3")
-    picture = tmp_path / "series.png"
-    assert command_line(monkeypatch, "thruster-papers", *few, "--series", str(picture), "--json", "-") == 0
+    assert command_line(monkeypatch, "thruster-papers", *few, "--json", "-") == 0
     data = json.loads(capsys.readouterr().out)
-    assert picture.read_bytes().startswith(b"\x89PNG") and data["picture"] == str(picture)
-    assert [(s["case"], s["q"]) for s in data["series"]] == [(c, q) for c in SYSTEMS for q in NOISE_LEVELS]
-    assert all(np.shape(s[line]) == (101, 2) for s in data["series"] for line in ("truth", "kf", "enkf"))
     assert data["settings"] == {"runs": 4, "members": 5, "seed": 3}
     assert [(r["case"], r["q"]) for r in data["results"]] == [(c, q) for c in SYSTEMS for q in NOISE_LEVELS]
     for result in data["results"]:
@@ -242,7 +214,6 @@ def test_json_on_standard_output_is_whole(monkeypatch, capsys, tmp_path):
         ("thruster-papers", "--runs", "1"),
         ("thruster-papers", "--members", "1"),
         ("thruster-papers", "--runs", "many"),
-        ("thruster-papers", "--series", "series.txt"),
     ],
 )
 def test_a_users_mistake_ends_with_code_2(monkeypatch, capsys, arguments):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.core.files import new_figure, save_figure, tidy, write_whole
-from thruster_env.core.text_tables import markdown_table, with_tables
+from thruster_env.core.files import new_figure, save_figure, tidy
+from thruster_env.core.text_tables import markdown_table
 from tuning.api.markers import OUTPUT, ExecutorOption, Option
 from tuning.api.markers import RUNS as RUNS_PANEL
 from tuning.api.result import Printed
@@ -261,7 +262,6 @@ def reproduce(
     executor: ExecutorOption = None,
     quick: Annotated[bool, Option(RUNS_PANEL)] = False,
     out: Annotated[Path, Option(OUTPUT)] = FOLDER,
-    page: Annotated[Path | None, Option(OUTPUT, metavar="FILE.md")] = None,
 ) -> Printed:
     """Run every method of tuning on the same data within the same budget, and score it on held-out truth.
 
@@ -282,29 +282,33 @@ def reproduce(
         executor: where results are computed: in N processes, in those of `mpirun`, or on the workers of a Dask
             scheduler; in this process by default.
         quick: a test run without meaningful results.
-        out: folder of results, which several hosts may share; existing ones are not recomputed.
-        page: page whose tables are rewritten, with the picture beside it.
+        out: folder of results and of the picture, which several hosts may share; existing results stay.
     """
     protocol = FAST if quick else Protocol()
     changes: dict[str, Any] = {"sets": sets, "runs": runs, "seconds": seconds, "many": many, "starts": starts}
     changes["methods"] = tuple(method) if method else None
     changes["cases"] = tuple(case for case in protocol.cases if case.group in groups) or None
     protocol = protocol._replace(**{name: value for name, value in changes.items() if value is not None})
-    text = None if page is None else page.read_text(encoding="utf-8")
     with progress_of("methods", out) as progress:
         results = run_protocol(protocol, out, executor, progress)
-    makers = tables(results, protocol)
-    picture, written = "methods_groups.png", []
-    if page is None or text is None or picture in text:
-        written.append(figure(results, protocol, (out if page is None else page.parent) / picture))
-    if page is not None and text is not None:
-        write_whole(page, with_tables(text, makers))
-        written.append(page)
-    texts = {name: make() for name, make in makers.items()}
+    picture = figure(results, protocol, out / "groups.png")
+    texts = {name: make() for name, make in tables(results, protocol).items()}
     data = {
         "results": [result._asdict() for result in results],
         "predictions": [prediction._asdict() for prediction in PREDICTIONS],
-        "files": [str(path) for path in written],
+        "files": [str(picture)],
     }
-    parts = [*(f"{name}\n\n{content}" for name, content in texts.items()), *[f"wrote {path}" for path in written]]
-    return Printed(parts, data)
+    return Printed([*(f"{name}\n\n{content}" for name, content in texts.items()), f"wrote {picture}"], data)
+
+
+ON_PAGE = Protocol(sets=6, runs=1e4, seconds=10.0, many=200, starts=4)
+
+
+@cache
+def stored() -> list[Result]:
+    """All results of the page, of which those in the folder are not computed again."""
+    return run_protocol(ON_PAGE, FOLDER)
+
+
+TABLES = {name: lambda name=name: tables(stored(), ON_PAGE)[name]() for name in tables((), ON_PAGE)}
+FIGURES = {"appendix/methods_groups.png": lambda path: figure(stored(), ON_PAGE, path)}
