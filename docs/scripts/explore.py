@@ -10,7 +10,7 @@ import numpy as np
 from docs.scripts import digits, subplots
 from thruster_env.core.files import BLUE, DARK, RUST, save_figure
 from thruster_env.core.text_tables import markdown_table
-from tuning.exploring.bench import SCENES, Bench, Scene
+from tuning.exploring.bench import SCENES, Scene
 from tuning.exploring.view import View
 
 BAND = 1.96  # half of a 95 % interval, in standard deviations
@@ -76,25 +76,7 @@ def figures_of(scene: Scene) -> str:
     return markdown_table(["", *heads], rows)
 
 
-def halved() -> str:
-    """Where on the map of `outliers` an EKF has half of the rule of thumb's error, or less."""
-    bench = Bench(SCENES["outliers"].bench().problem)
-    rule = _score(bench.view())
-    rows = []
-    for factor in (1, 22, 100):
-        values = {"R": factor * bench.start["R"]}
-        view = bench.view(values)
-        rows.append([digits(values["R"]), digits(_score(view)), digits(_score(view) / rule), *_consistency(view)])
-    return markdown_table(["R [N^2]", "score", "over the rule of thumb's", "NEES", "NIS"], rows)
-
-
-def _score(view: View) -> float:
-    return next(figure.value for name, figure in view.figures.items() if name.startswith("score"))
-
-
-def _consistency(view: View) -> list[str]:
-    return [digits(view.figures[name].value) for name in SHOWN]
-
-
 FIGURES = {f"explore_{name}.png": partial(draw, scene) for name, scene in SCENES.items()}
-TABLES = {**{name: partial(figures_of, scene) for name, scene in SCENES.items()}, "halved": halved}
+TABLES = {
+    **{name: partial(figures_of, scene) for name, scene in SCENES.items()},
+}

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from docs.scripts import by_name, digits, log_ticks, subplots
+from docs.scripts import by_name, log_ticks, subplots
 from docs.scripts.filter_pictures import (
     FLOW_RMSE,
     PICTURES,
@@ -27,15 +26,11 @@ from filters import (
     FILTERS,
     ExtendedKalmanFilter,
     SageHusaFilter,
-    StateSpaceModel,
-    Unknown,
     VariationalBayesFilter,
-    augmented_model,
     make_filter,
     run,
     thruster_model,
 )
-from filters.filter import Filter
 from filters.registry import filter_type
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.files import BLUE, DARK, MUSTARD, RUST, save_figure
@@ -183,14 +178,6 @@ inversion | h solvable for one component | a point | 70 | noise, most where h is
 WORDS = {name: Words(*cells) for name, *cells in (line.split(" | ") for line in WORDS_TEXT.strip().splitlines())}
 
 
-class Situation(NamedTuple):
-    """A case of the decision list: runs, and filters to compare on them."""
-
-    name: str
-    runs: Callable[[], Runs]
-    filters: dict[str, Filter]
-
-
 def kinds() -> str:
     """All filters: assumptions, belief, calls of the model in a step, and when they fail."""
     header = ["name", "class", "assumes", "belief", "f, h a step", "time", "fails"]
@@ -234,62 +221,8 @@ def calls(name: str) -> str:
     return ", ".join(("N" if times == 1 else f"{times} N") if sized else str(times) for times in each)
 
 
-def advice() -> str:
-    """The decision list as measured."""
-    rows = []
-    for situation in situations():
-        runs = situation.runs()
-        for number, (label, filter_) in enumerate(situation.filters.items()):
-            motor, flow, squares = errors_of(filter_, runs)
-            honesty = "" if np.isnan(squares) else digits(squares) if squares < 1000 else "> 1000"
-            rows.append(["" if number else situation.name, label, digits(motor), digits(flow), honesty])
-    return markdown_table(["situation", "filter", "omega_m [rad/s]", "U_a [m/s]", "NEES"], rows)
-
-
-def situations() -> list[Situation]:
-    """Cases of the decision list that the ranking does not have."""
-    plain, loud = thruster_model(), thruster_model(measurement_noise_cov=LOUD**2)
-    wrong = thruster_model(parameter_factors={"voltage_gain": 0.95})
-    wrong_twice = thruster_model(parameter_factors={"voltage_gain": 0.95, "lift_coefficient": 1.15})
-    gain = {"voltage_gain": Unknown(std=0.1 * plain.constants.voltage_gain)}
-
-    def named(model: StateSpaceModel, *names: str) -> dict[str, Filter]:
-        return {f"`{name}`": make_filter(name, model) for name in names}
-
-    return [
-        Situation(
-            "levels from 11 to 13 V",
-            partial(held_runs, amplitude=1.0, centre=12.0, initial_state={"voltage": 12.0}),
-            named(thruster_model(initial_state={"voltage": 12.0}), "kf", "kf-steady", "ekf"),
-        ),
-        Situation(
-            "levels within 12 V of 0",
-            held_runs,
-            named(plain, "kf")
-            | {"`kf`, schedule of 9": make_filter("kf", plain, schedule=9)}
-            | named(plain, "ekf", "ukf", "enkf", "pf", "open-loop", "inversion", "low-pass"),
-        ),
-        Situation(
-            "R is 16 times the assumed one",
-            partial(held_runs, measurement_noise_cov=LOUD**2),
-            named(plain, "ekf", "ekf-robust", "sage-husa", "vb") | {"`ekf`, right R": make_filter("ekf", loud)},
-        ),
-        Situation(
-            "voltage gain assumed 5 % low",
-            held_runs,
-            named(wrong, "ekf") | {"`ekf`, gain a state": make_filter("ekf", augmented_model(wrong, gain))},
-        ),
-        Situation(
-            "and lift assumed 15 % high",
-            held_runs,
-            named(wrong_twice, "ekf")
-            | {"`ekf`, gain a state": make_filter("ekf", augmented_model(wrong_twice, gain))},
-        ),
-    ]
-
-
 FIGURES = {
     **{f"filters_{name}.png": draw for name, draw in PICTURES.items()},
     **{f"filters_{draw.__name__}.png": draw for draw in (adaptive, varying)},
 }
-TABLES = by_name(kinds, advice, fuzzy)
+TABLES = by_name(kinds, fuzzy)

@@ -17,11 +17,13 @@ import thruster_env  # noqa: F401 - registers the envs
 from docs.scripts import subplots
 from filters import EstimateState
 from filters.engine.batch import run
+from filters.filter import Filter
 from thruster_env.core.files import BLUE, DARK, RUST, save_figure, write_whole
 from tuning.api.study import Study
 from tuning.api.tune import run_tuning
-from tuning.cli.demo import FILTER, SCENARIO, before_and_after
+from tuning.cli.demo import FILTER, SCENARIO
 from tuning.cli.output import progress_console
+from tuning.evaluation.baselines import NOISE, ORACLE, TUNED, baselines
 from tuning.exploring.bench import Bench
 from tuning.exploring.page.session import Server, page_of
 from tuning.problems.find import find_problem
@@ -40,6 +42,23 @@ def demo() -> Study:
     folder = Path(tempfile.mkdtemp())
     plan = Plan(FILTER, (find_problem(SCENARIO),), seed=0)
     return run_tuning(plan, 50, progress_console, f"{folder}/studies.journal", out=folder / "tuned.json")
+
+
+def before_and_after(tuning: Study) -> dict[str, Filter]:
+    """The best baseline and the tuned filter, by the titles of their pictures."""
+    before = best_baseline(tuning)
+    choices = {before: baselines(FILTER, tuning.problem, tuning.plan.seed)[before], TUNED: tuning.result.choice}
+    words = (f"before: {before}", f"after: {TUNED}")
+    return {word: choice.filter(tuning.problem) for word, choice in zip(words, choices.values(), strict=True)}
+
+
+def best_baseline(tuning: Study) -> str:
+    """The baseline with the lowest score among those that need no truth."""
+    evaluations = tuning.comparison.evaluations
+    return min(
+        (name for name in evaluations if name not in (TUNED, NOISE, ORACLE)),
+        key=lambda name: evaluations[name].score.value,
+    )
 
 
 def tuned(path: Path) -> Path:

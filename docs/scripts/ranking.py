@@ -24,7 +24,7 @@ from tuning.problems.data import held_out_seeds
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Problem
-from tuning.reporting.leaderboard import unless_blank
+from tuning.reporting.tables import unless_blank
 from tuning.search.parameters import KALMAN_SIZES, ensemble_sizes_of
 
 SEEDS = 200

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import optuna
 
 from docs.scripts import about, by_name, log_ticks, subplots
 from filters.augmented import Unknown, augmented_model
-from filters.consistency.nees import Interval
 from filters.filter import Filter
 from filters.registry import make_filter
 from thruster_env.core.files import BLUE, DARK, RUST, save_figure
@@ -25,11 +22,9 @@ from tuning.evaluation.baselines import ORACLE, RULE, SCALED, scaled_default
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.experiments.benchmark import run_in_memory
-from tuning.likelihood.gradient import BAD_START
-from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.plants.thruster import Scenario, find_scenario
 from tuning.search.plan import HELD_OUT_SEEDS, NIS_BAND, Plan, nis_violation, penalised
-from tuning.search.space import Choice, distributions, oracle_choice, parameters_of, suggest, trial_parameters
+from tuning.search.space import Choice, distributions, suggest, trial_parameters
 from tuning.search.trials import make_sampler
 
 SEED, TRIALS = 0, 100
@@ -91,72 +86,6 @@ def earned(scenarios: Sequence[str] = EARNING, trials: int = TRIALS) -> str:
 def _consistency(evaluation: Evaluation) -> list[str]:
     nees = evaluation.nees.value
     return [f"{nees:.3g}" if nees < 1000 else "> 1000", f"{evaluation.nis.value:.2f}"]
-
-
-STUDIES = ("ekf", "nominal", 100), ("kf", "published_tunnel", 100), ("kf", "published_open_bladed", 100)
-SEEDS = range(8)  # of studies
-EQUAL = 0.005  # a score this close to the true filter's is as good
-
-
-class Found(NamedTuple):
-    """What one study found."""
-
-    over_true: np.ndarray  # (p,), numbers over the true ones
-    score: Interval  # over that of the true filter, paired on held-out seeds
-    known: Identifiability
-
-
-def bad_start(kind: str, scenario: Scenario) -> Choice:
-    """The true filter with a hundredth of Q22 and a hundred times R."""
-    true = oracle_choice(kind, scenario)
-    q, r = np.array(true.model["process_noise_cov"]), true.model["measurement_noise_cov"]
-    bad = {"process_noise_cov": tuple((q * BAD_START[:2]).tolist()), "measurement_noise_cov": r * BAD_START[2]}
-    return true._replace(model=bad)
-
-
-@cache
-def found_again(kind: str, name: str, trials: int, seeds: Sequence[int] = SEEDS) -> list[Found]:
-    """What studies with several seeds find from the bad start."""
-    scenario = find_scenario(name)
-    true, recovered = parameters_of(oracle_choice(kind, scenario)), []
-    for seed in seeds:
-        plan = Plan(kind, (scenario,), seed)
-        choice = run_in_memory(plan, trials, bad_start(kind, scenario)).choice
-        comparison = evaluate_held_out(choice, scenario, seed)
-        known = identify(choice, plan.scenarios, plan.training_data(), plan.space())
-        ratios = known.tuned / [true[number] for number in known.names]
-        recovered.append(Found(ratios, score_ratio(comparison.tuned, comparison.true), known))
-    return recovered
-
-
-def numbers_found() -> str:
-    """Numbers over the true ones, and what the innovations determine."""
-    rows = []
-    for kind, name, trials in STUDIES:
-        recovered = found_again(kind, name, trials)
-        title = f"`{name}`, `{kind}`, {trials} trials"
-        for i, number in enumerate(recovered[0].known.names):
-            ratios = [study.over_true[i] for study in recovered]
-            factors = [study.known.factors[i] for study in recovered if study.known.identified[i]]
-            span, start = f"{min(ratios):.2g} to {max(ratios):.2g}", f"{BAD_START[i]:g}"
-            within = f"within a factor of {max(factors):.2f}" if factors else "no"
-            part = f" in {len(factors)} of {len(recovered)}" if 0 < len(factors) < len(recovered) else ""
-            rows.append(["" if i else title, number, start, span, within + part])
-    return markdown_table(["study", "", "start over true", "found over true", "determined"], rows)
-
-
-def scores_reached() -> str:
-    """Excess of the score over the true filter's."""
-    rows = []
-    for kind, name, trials in STUDIES:
-        scores = sorted(study.score for study in found_again(kind, name, trials))
-        median = np.median([score.value for score in scores])
-        excess = [f"{100 * (value - 1):.2f} %" for value in (median, scores[-1].value)]
-        worst = " to ".join(f"{100 * (end - 1):.2f}" for end in scores[-1][1:])
-        count = sum(score.high < 1 + EQUAL for score in scores)
-        title = f"`{name}`, `{kind}`, {trials} trials"
-        rows.append([title, excess[0], f"{excess[1]} ({worst})", f"{count} of {len(scores)}"])
-    return markdown_table(["study", "median excess of the score", "largest (95 %)", "surely below 0.5 %"], rows)
 
 
 SCENARIO = "mismatch"
@@ -286,4 +215,4 @@ def _line(name: str, evaluation: Evaluation, base: Evaluation) -> list[str]:
 
 
 FIGURES = {"tuning_ridge.png": ridge}
-TABLES = by_name(earned, numbers_found, scores_reached, bought)
+TABLES = by_name(earned, bought)

@@ -1,110 +1,26 @@
-"""The tables of docs/appendix/tuning.md on pruning and wrong choices; each takes some minutes."""
+"""The tables of docs/appendix/tuning.md on wrong choices; each takes some minutes.
+
+A study here is a Kalman filter of x_{k+1} = 0.95 x_k + w, z = x + v, whose Q and R come from a grid. The six grid
+points that are best on the training runs meet the given Q and R on validation runs, and the choice is that of
+`tuning.search.validation`. It is wrong if the held-out 95 % interval, paired by run, says so.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from optuna.trial import TrialState
-from scipy.stats import t as student
 
 from docs.scripts import by_name
-from filters.consistency.nees import Interval
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.logs.log import Log
 from thruster_env.model.affine import affine_model
-from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
-from tuning.experiments.benchmark import run_in_memory
-from tuning.plants.thruster import find_scenario
 from tuning.problems.log_parts import Block, parts_of
 from tuning.problems.log_problem import LogProblem
 from tuning.search.measures import Measured, Runs, over, signed_rank
 from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS, Plan
-from tuning.search.space import Choice, choice_of
-from tuning.search.trials import measure
 from tuning.search.validation import Choosing
-
-
-def held_out(choice: Choice, plan: Plan) -> Evaluation:
-    """A filter on the held-out seeds of a plan's scenario."""
-    (scenario,) = plan.scenarios
-    data = scenario.data(scenario.held_out_seeds(plan.seed, HELD_OUT_SEEDS))
-    return evaluate(choice.filter(scenario), data, scenario.scale)
-
-
-# Do studies with and without pruning end at the same score? Wilcoxon's test ranks the scores of single runs, the
-# objective pools the squares of all: where few runs carry the error, the two could disagree.
-
-
-PRUNING_CASES = (*product(("startup", "outliers"), ("ekf", "enkf")), ("mismatch", "ekf"))
-PRUNING_SEEDS, PRUNING_TRIALS = range(10), 60
-TOP_RUNS = 3  # of the training runs, whose part in the squares is told
-
-
-class PruningPair(NamedTuple):
-    """One study with pruning and the same without."""
-
-    ratio: float  # score of what the one chose over that of the other, on the same held-out seeds
-    pruned: int  # trials that ended early
-    missed: int  # of them, those whose score on all training seeds is below the best of their study
-    gain: float  # the lowest of those scores over that best; 1 where none is below
-    skipped: float  # share of the runs that pruning saved
-    concentration: float  # share of the best trial's squares in its worst runs, the larger of the states'
-
-
-def pruning_pair(kind: str, name: str, trials: int, seed: int) -> PruningPair:
-    """Run a study of a filter on a scenario with pruning and without, and score again what was pruned."""
-    scenario = find_scenario(name)
-    plans = [Plan(kind, (scenario,), seed, prune=prune) for prune in (True, False)]
-    pruned, unpruned = (run_in_memory(plan, trials) for plan in plans)
-    plan, training, best = plans[1], plans[1].training_data(), pruned.best_value
-    early = [trial for trial in pruned.trials if trial.state == TrialState.PRUNED and trial.intermediate_values]
-    choices = [choice_of(kind, trial.params, scenario) for trial in early]
-    full_scores = [measure(choice, plan, training)[0].score.value for choice in choices]
-    (chosen,) = measure(pruned.choice, plan, training)
-    worst = np.sort(chosen.mean_squares, axis=0)[-TOP_RUNS:].sum(axis=0) / chosen.mean_squares.sum(axis=0)
-    return PruningPair(
-        score_ratio(held_out(pruned.choice, plan), held_out(unpruned.choice, plan)).value,
-        len(early),
-        sum(value < best for value in full_scores),
-        min([1.0, *(value / best for value in full_scores)]),
-        sum(TRAINING_SEEDS - len(trial.intermediate_values) for trial in early) / (TRAINING_SEEDS * trials),
-        float(worst.max()),
-    )
-
-
-def over_studies(ratios: Sequence[float]) -> Interval:
-    """Geometric mean of ratios of independent studies, with Student's 95 % interval of their logarithms."""
-    logs = np.log(ratios)
-    half = student.ppf(0.975, len(logs) - 1) * logs.std(ddof=1) / len(logs) ** 0.5
-    return Interval(*np.exp([logs.mean(), logs.mean() - half, logs.mean() + half]))
-
-
-def pruning() -> str:
-    """With pruning over without, a row per filter and scenario."""
-    rows = []
-    for name, kind in PRUNING_CASES:
-        pairs = [pruning_pair(kind, name, PRUNING_TRIALS, seed) for seed in PRUNING_SEEDS]
-        ratios, pruned, missed, _, skipped, shares = zip(*pairs, strict=True)
-        ratio = over_studies(ratios)
-        cells = [
-            f"{100 * np.mean(shares):.0f} %",
-            f"{ratio.value:.4f} [{ratio.low:.4f}, {ratio.high:.4f}]",
-            f"{sum(missed)} of {sum(pruned)}",
-            f"{100 * np.mean(skipped):.0f} %",
-        ]
-        rows.append([f"`{name}`", f"`{kind}`", *cells])
-    header = ["scenario", "filter", f"squares in {TOP_RUNS} of {TRAINING_SEEDS} runs", "with over without"]
-    return markdown_table([*header, "better ones pruned", "runs saved"], rows)
-
-
-# How often is the choice wrong? A study here is a Kalman filter of x_{k+1} = 0.95 x_k + w, z = x + v, whose Q and
-# R come from a grid. The six grid points that are best on the training runs meet the given Q and R on validation
-# runs, and the choice is that of `tuning.search.validation`. It is wrong if the held-out 95 % interval, paired by
-# run, says so.
-
 
 A, Q, R = 0.95, 0.05, 0.3
 GRID = np.array([(q, r) for q in np.logspace(-2.6, 0.8, 12) for r in np.logspace(-1.3, 0.7, 8)])
@@ -420,4 +336,4 @@ def choice_sizes(studies: int = SIZE_STUDIES) -> str:
     return markdown_table(["scores", "time constant [rows]", *heads], rows)
 
 
-TABLES = by_name(pruning, log_choices, truth_choices, choice_sizes)
+TABLES = by_name(log_choices, truth_choices, choice_sizes)

@@ -23,11 +23,10 @@ from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import score_label
 from tuning.reporting import leaderboard
 from tuning.reporting.choice_words import gains
-from tuning.reporting.leaderboard import ABOVE, comparison_table
 from tuning.reporting.search_figures import draw_consistency
 from tuning.reporting.sections import advice, held_out_section
 from tuning.reporting.subject import Subject
-from tuning.reporting.tables import choice_table
+from tuning.reporting.tables import ABOVE, choice_table, comparison_table
 from tuning.search.plan import Plan, check_objectives, find_objective, nis_ratio
 from tuning.search.space import oracle_choice, untuned_choice
 

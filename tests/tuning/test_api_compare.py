@@ -22,7 +22,7 @@ from tuning.evaluation.residuals import model_error
 from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
-from tuning.reporting.leaderboard import as_json as boards_as_json
+from tuning.reporting.tables import as_json as boards_as_json
 from tuning.search.plan import Plan
 from tuning.search.space import given_choice
 

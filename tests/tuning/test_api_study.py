@@ -179,8 +179,11 @@ WRONG = [
     (lambda: tuning.evaluate(3), "a filter must be a name, a tuned file, a Study or an estimator, but got 3"),
     (lambda: tuning.tune("mismatch", len), "filter must be a name or 'module:object', by which trials keep it"),
     (lambda: tuning.report(3), "a report must be of a Study, a tuned file or the name of a study, but got 3"),
-    (lambda: tuning.report([]), "a side-by-side report must be of two studies, but got 0"),
-    (lambda: tuning.report("a.json", "b.json"), "two studies must be in one list, but got out='b.json'"),
+    (
+        lambda: tuning.report(["a.json"]),
+        "a report must be of a Study, a tuned file or the name of a study, but got",
+    ),
+    (lambda: tuning.report("a.json", "b.json"), "for it .tuning.compare compares studies., but got out='b.json'"),
     (lambda: tuning.report("no such study"), "a report must be of a tuned file or of a study in"),
     (
         lambda: tuning.tune(SHORT, trials=1).plot_sizes(),

@@ -86,18 +86,6 @@ def test_a_journal_that_says_way_is_continued(tmp_path, monkeypatch, as_python, 
     assert again.answer.runs == first.answer.runs
 
 
-def test_former_names_are_answered_with_those_of_today(thruster):  # noqa: F811
-    for command, name in (
-        (("tune", "--way", "em"), "--method"),
-        (("tune", "--sampler=gp"), "--method"),
-        (("ways",), "'methods'"),
-        (("study", "methods"), "'reproduce'"),
-    ):
-        refused = thruster(*command)
-        assert refused.returncode == 2 and refused.stderr.strip().endswith(f"Did you mean {name}?")
-        assert refused.stderr.count("\n") == 1
-
-
 def test_a_study_cannot_be_run_on_a_task():
     problem = singular()
     with pytest.raises(ValueError, match="a study must be run by tuning.tune"):

@@ -22,8 +22,8 @@ from tuning.problems.assumed import augmented
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem, log_of
 from tuning.reporting.choice_words import choice_sentences
-from tuning.reporting.leaderboard import report as leaderboard_report
 from tuning.reporting.subject import _plan
+from tuning.reporting.tables import report as leaderboard_report
 from tuning.reporting.tuning_report import as_json, report, way_out
 from tuning.search.measures import measured, over
 from tuning.search.plan import Plan

@@ -2,28 +2,31 @@
 
 import numpy as np
 import pytest
-from scipy import stats
+from optuna.trial import TrialState
 
-from docs.scripts.tuning_choice import TOP_RUNS, over_studies, pruning_pair
-from tuning.search.plan import TRAINING_SEEDS
-from tuning.search.storage import quiet_optuna
+from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.experiments.benchmark import run_in_memory
+from tuning.plants.thruster import find_scenario
+from tuning.search.plan import TRAINING_SEEDS, Plan
+from tuning.search.space import choice_of
+from tuning.search.trials import measure
 
 
 @pytest.mark.slow
 def test_with_pruning_a_study_ends_at_the_score_that_it_has_without():
-    quiet_optuna()
-    found = pruning_pair(
-        "ekf", "startup", 16, seed=2
-    )  # so short a study may end elsewhere by its other trials, too: seed 1
-    assert found.pruned >= 2 and found.skipped > 0.05
-    assert found.concentration > 2 * TOP_RUNS / TRAINING_SEEDS  # few runs do carry the error
-    assert found.gain > 0.995  # no pruned trial, run to its end, would have been better by more
-    assert found.ratio == pytest.approx(1.0, abs=0.02)
-
-
-def test_the_interval_over_studies_is_student_s():
-    ratios = [0.99, 1.01, 1.0, 1.02]
-    found, logs = over_studies(ratios), np.log(ratios)
-    expected = stats.t.interval(0.95, 3, loc=logs.mean(), scale=stats.sem(logs))
-    assert np.log([found.low, found.high]) == pytest.approx(expected)
-    assert found.value == pytest.approx(stats.gmean(ratios))
+    """So short a study may end elsewhere by its other trials, too: with seed 1."""
+    scenario = find_scenario("startup")
+    plans = [Plan("ekf", (scenario,), 2, prune=prune) for prune in (True, False)]
+    pruned, whole = (run_in_memory(plan, 16) for plan in plans)
+    training, held_out = plans[1].training_data(), scenario.data(scenario.held_out_seeds(2, 200))
+    early = [trial for trial in pruned.trials if trial.state == TrialState.PRUNED and trial.intermediate_values]
+    assert len(early) >= 2
+    assert sum(TRAINING_SEEDS - len(trial.intermediate_values) for trial in early) > 0.05 * TRAINING_SEEDS * 16
+    (chosen,) = measure(pruned.choice, plans[1], training)
+    worst = np.sort(chosen.mean_squares, axis=0)[-3:].sum(axis=0) / chosen.mean_squares.sum(axis=0)
+    assert worst.max() > 2 * 3 / TRAINING_SEEDS  # few runs do carry the error
+    for trial in early:  # none, run to its end, would have been better by more
+        (full,) = measure(choice_of("ekf", trial.params, scenario), plans[1], training)
+        assert full.score.value > 0.995 * pruned.best_value
+    by = [evaluate(result.choice.filter(scenario), held_out, scenario.scale) for result in (pruned, whole)]
+    assert score_ratio(*by).value == pytest.approx(1.0, abs=0.02)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from thruster_env.core.files import BLUE, MOST_POINTS, RUST, panels, thinned
-from tuning.reporting.page import Pair, Section, Table, figure_svg, html_page
+from tuning.reporting.page import figure_svg
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +61,3 @@ def test_a_thinned_line_keeps_its_extremes_and_its_ends():
     assert np.nanmax(above) == 9.0 and len(above) == MOST_POINTS // 2
     short = x[:100], y[:100]
     assert all(np.array_equal(one, other) for one, other in zip(thinned(*short), short, strict=True))
-
-
-def test_a_pair_shows_what_is_the_same_once():
-    table, other = Table("", ["", "a"], [["x", "1"]]), Table("", ["", "a"], [["x", "2"]])
-    parts = [Pair(["A", "B"], [table, table]), Pair(["A", "B"], [table, other]), Pair(["A", "B"], [table, None])]
-    text = html_page("t", ["one", "two"], [Section("s", parts)], two_columns=True)
-    assert text.count('class="whose"') == 4 and text.count("<table") == 4 and text.count('class="advice"') == 2

@@ -6,8 +6,8 @@ import pytest
 
 from filters.consistency.nees import Interval, span
 from thruster_env.core.text_tables import Table, typeset
-from tuning.reporting.leaderboard import about, limit_cell, unless_blank
 from tuning.reporting.page import Words
+from tuning.reporting.tables import about, limit_cell, unless_blank
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.assumed import Unknowns, constants_in, suited, unknowns_of
 from tuning.problems.find import built_in
 from tuning.problems.problem import Problem
-from tuning.reporting.leaderboard import as_json, report
+from tuning.reporting.tables import as_json, report
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 from tuning.search.storage import quiet_optuna

@@ -25,8 +25,7 @@ from tuning.evaluation.tuned import metrics
 from tuning.evaluation.worth import memory_sentence, scaling_sentence, warnings_of, without_truth
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import gains, model_doubts, residual_sentences
-from tuning.reporting.leaderboard import comparison_table
-from tuning.reporting.tables import choice_table
+from tuning.reporting.tables import choice_table, comparison_table
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 

@@ -1,20 +1,16 @@
-"""`tuning.report` and `thruster report`: a page on a tuned filter, its tables as Markdown, and on two studies."""
+"""`tuning.report` and `thruster report`: a page on a tuned filter, and its tables as Markdown."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
-from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import optuna
 from optuna.study import StudyDirection
 
-from filters.consistency.nees import Interval
-from filters.consistency.report import rounded
 from filters.registry import filter_type
 from thruster_env.core.checks import short_repr
 from thruster_env.core.files import check_target, write_whole
@@ -33,9 +29,7 @@ from tuning.api.problems import given_for, problems_of
 from tuning.api.progress import console_for, working
 from tuning.api.result import Result
 from tuning.api.study import STUDIES, Study
-from tuning.evaluation.evaluate import evaluate, likelihood_gain, score_ratio
 from tuning.evaluation.held_out import (
-    Comparison,
     evaluate_held_out,
     stored_comparison,
     stored_sizes,
@@ -44,7 +38,7 @@ from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.evaluation.tuned import tuned_content
 from tuning.likelihood.identifiability import Identifiability, identify, sentences, too_many
 from tuning.problems.problem import Problem
-from tuning.reporting.page import Pair, Section, Table, Words, html_page, markdown_page, of_sizes
+from tuning.reporting.page import Section, Table, Words, html_page, markdown_page, of_sizes
 from tuning.reporting.search_figures import Sketchbook, draw_sizes
 from tuning.reporting.sections import (
     advice,
@@ -64,7 +58,7 @@ from tuning.search.trials import measure
 
 @dataclass(frozen=True)
 class Report(Result):
-    """The files of a report, and a summary sentence per study; `open` and `Path` take it as its page.
+    """The files of a report, and its summary; `open` and `Path` take it as its page.
 
     Attributes:
         page: for any browser.
@@ -89,9 +83,7 @@ class Report(Result):
 
 
 def report(
-    source: Annotated[
-        str | Path | Study | Sequence[str | Path | Study], Argument(INPUT, (), "FILE_OR_STUDY...", list[str])
-    ],
+    source: Annotated[str | Path | Study, Argument(INPUT, (), "FILE_OR_STUDY", str)],
     out: Annotated[str | Path | None, Option(OUTPUT, metavar="FOLDER")] = None,
     *,
     storage: Annotated[str | Path, Option(INPUT)] = STUDIES,
@@ -105,18 +97,12 @@ def report(
     It shows errors and consistency before and after on held-out seeds, the convergence of the study, the
     importance of parameters, the error against ensemble size, one run over time with 95 % bands, and advice.
 
-    With two files it shows both side by side and, for the same problem, the paired ratio of their scores.
-
         tuning.report("tuned.json", out="report.html")
-        tuning.report(["ekf.json", "ukf.json"], out="both.html")
 
     Example: thruster report out/enkf-mismatch-seed0.json
 
-    Example: thruster report out/ekf-outliers-seed0.json out/ekf-robust-outliers-seed0.json
-
     Args:
-        source: tuned file, or name of a study in the storage; two are shown side by side. In Python also a
-            `Study`, or a list of two.
+        source: tuned file, or name of a study in the storage. In Python also a `Study`.
         out: the page, a .html file, or a folder for it; by default beside the tuned file, or in the folder out.
         storage: storage of the study, a journal file or an Optuna storage URL; without it the page on a file omits
             the search.
@@ -133,38 +119,26 @@ def report(
     Raises:
         ValueError: if the source is refused, or the page cannot be written.
     """
-    console = console_for(progress)
-    sources: list[Any] = list(source) if isinstance(source, list | tuple) else [source]
     if isinstance(out, Study) or (out is not None and Path(out).suffix == ".json"):
-        rule = "a page must be a file that ends in .html, or a folder for it, and two studies must be in one list"
+        rule = "a page must be a file that ends in .html, or a folder for it (tuning.compare compares studies)"
         raise ValueError(f"{rule}, but got out={short_repr(out if isinstance(out, Study) else str(out))}")
-    if len(sources) not in (1, 2):
-        raise ValueError(f"a side-by-side report must be of two studies, but got {len(sources)}")
-    names = list(map(_name_of, sources))
-    if len(sources) == 2 and names[0] == names[1]:
-        names = [f"{name} ({which})" for name, which in zip(names, "12", strict=True)]
-    with quiet_optuna(), working(f"reporting on {' and '.join(names)}", console):
-        where = storage_text(storage)
-        subjects = [
-            _of_value(each)
-            if isinstance(each, Study)
-            else find_subject(each, where, _given(each, problem, model, preset))
-            for each in sources
-        ]
-        page = page_of(sources, "-beside-".join(names), out)
-        prefixes = "p" if len(sources) == 1 else "ab"
-        parts = list(map(pages_of, map(_file_of, sources), subjects, prefixes))
-        contents = parts[0] if len(parts) == 1 else two_columns(names, parts)
-        advice = [contents.advice] if len(parts) == 1 else contents.advice.splitlines()
-        write_whole(page, html_page(contents.title, advice, contents.sections, two_columns=len(parts) == 2))
-        write_whole(page.with_suffix(".md"), markdown_page(contents.title, [*advice, *contents.results]))
+    name = _name_of(source)
+    with quiet_optuna(), working(f"reporting on {name}", console_for(progress)):
+        if isinstance(source, Study):
+            subject = _of_value(source)
+        else:
+            subject = find_subject(source, storage_text(storage), _given(source, problem, model, preset))
+        page = page_of(source, name, out)
+        contents = contents_of(_file_of(source), subject)
+        write_whole(page, html_page(contents.title, contents.advice, contents.sections))
+        text = markdown_page(contents.title, [contents.advice, *contents.results])
+        write_whole(page.with_suffix(".md"), text)
     return Report(page, page.with_suffix(".md"), contents.advice)
 
 
-def page_of(sources: Sequence[Any], name: str, out: str | Path | None) -> Path:
-    """The page: `out`, or a file of a name in the folder `out`, or beside the first tuned file; checked."""
-    first = sources[0]
-    folder = Path("out") if isinstance(first, Study) or not is_file(first) else Path(first).parent
+def page_of(source: str | Path | Study, name: str, out: str | Path | None) -> Path:
+    """The page: `out`, or a file of a name in the folder `out`, or beside the tuned file; checked."""
+    folder = Path("out") if isinstance(source, Study) or not is_file(source) else Path(source).parent
     page = (folder if out is None else Path(out)) / f"{name}.html"
     if out is not None and Path(out).suffix == ".html":
         page = Path(out)
@@ -210,15 +184,13 @@ def _of_value(study: Study) -> Subject:
     return Subject(study.name, plan, study.choice, trials, seeds, True, consistent, *stored)
 
 
-class Pages(NamedTuple):
-    """All results of one study, ready for a page."""
+class Contents(NamedTuple):
+    """All results of a study, ready for a page."""
 
-    subject: Subject
     title: str
     advice: str
     sections: list[Section]
     results: list[Table | str]  # tables and sentences, also for Markdown
-    comparisons: list[Comparison]
 
 
 def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:
@@ -240,8 +212,8 @@ def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) 
     return Section("Error against ensemble size", [picture, Table(explanation, columns, ratios)])
 
 
-def pages_of(file: str | None, subject: Subject, prefix: str = "p") -> Pages:
-    """The contents of a page on a study, whose pictures' names begin with a prefix.
+def contents_of(file: str | None, subject: Subject) -> Contents:
+    """The contents of a page on a study.
 
     Held-out metrics and the table of ensemble sizes come from the file or the study if they were made from the
     same problems by the same versions of packages; otherwise they are recomputed. `verify` always recomputes.
@@ -271,7 +243,7 @@ def pages_of(file: str | None, subject: Subject, prefix: str = "p") -> Pages:
     ]
     determined = [known_table(known)] if known else []
     words = [Words(identified)] if identified else []
-    book = Sketchbook(prefix)
+    book = Sketchbook()
     sections = [
         held_out_section(book, subject, comparisons, results),
         *data_sections(plan.scenarios),
@@ -284,14 +256,8 @@ def pages_of(file: str | None, subject: Subject, prefix: str = "p") -> Pages:
         lines_section(choice, plan.scenarios[0], file),
         facts_section(subject, nis),
     ]
-    return Pages(
-        subject,
-        title,
-        advice(choice, plan, comparisons, subject.validation),
-        sections,
-        [*sum(results, []), *determined, *identified],
-        comparisons,
-    )
+    summary = advice(choice, plan, comparisons, subject.validation)
+    return Contents(title, summary, sections, [*sum(results, []), *determined, *identified])
 
 
 def data_sections(problems: Sequence[Problem]) -> list[Section]:
@@ -303,74 +269,6 @@ def data_sections(problems: Sequence[Problem]) -> list[Section]:
 def _short(name: str) -> str:
     """A problem's name in a title: for a file only its name."""
     return Path(name).stem if name.endswith(".toml") else name
-
-
-def two_columns(names: Sequence[str], pages: Sequence[Pages]) -> Pages:
-    """The contents of a page on two studies; of the same problem with the paired ratio of their scores."""
-    advice = "\n".join(f"{name}: {contents.advice}" for name, contents in zip(names, pages, strict=True))
-    table, remark = _summary(names, pages)
-    sections = [Section("Side by side", [table, *([Words([remark])] if remark else [])]), *_paired(names, pages)]
-    results = [table, *pages[0].results, *pages[1].results]
-    comparisons = [*pages[0].comparisons, *pages[1].comparisons]
-    return Pages(pages[0].subject, " beside ".join(names), advice, sections, results, comparisons)
-
-
-def _paired(names: Sequence[str], pages: Sequence[Pages]) -> list[Section]:
-    """Sections of both, those of the same title beside each other."""
-    first, second = ({section.title: section.parts for section in page.sections} for page in pages)
-    sections = []
-    for title in [*first, *(title for title in second if title not in first)]:
-        rows: Iterable[Any] = zip_longest(first.get(title, []), second.get(title, []))
-        sections.append(Section(title, [Pair(names, row) for row in rows]))
-    return sections
-
-
-def _summary(names: Sequence[str], pages: Sequence[Pages]) -> tuple[Table, str]:
-    """Held-out metrics of both tuned filters, and the paired ratio if the problem is the same."""
-    choices = [page.subject.choice for page in pages]
-    tuned = [page.comparisons[0].tuned for page in pages]
-    rows = [
-        ["filter", *(choice.name for choice in choices)],
-        ["problem", *(page.subject.plan.scenarios[0].name for page in pages)],
-    ]
-    labels = dict.fromkeys(state.label for evaluation in tuned for state in evaluation.states)
-    by_state = [
-        {state.label: rmse for state, rmse in zip(evaluation.states, evaluation.rmse, strict=True)}
-        for evaluation in tuned
-    ]
-    rows += [[f"RMSE {label}", *(_value(rmse.get(label)) for rmse in by_state)] for label in labels]
-    rows += [
-        ["score", *(_value(evaluation.score) for evaluation in tuned)],
-        ["mean NEES", *(_value(evaluation.nees) for evaluation in tuned)],
-        ["mean NIS", *(_value(evaluation.nis) for evaluation in tuned)],
-        ["log-likelihood of a run", *(_value(Interval(*[evaluation.log_likelihood] * 3)) for evaluation in tuned)],
-    ]
-    rows = [row for row in rows if any(row[1:])]
-    return Table("On held-out data, with 95 % intervals", ["", *names], rows), _ratio(names, pages)
-
-
-def _ratio(names: Sequence[str], pages: Sequence[Pages]) -> str:
-    """The ratio of both scores, or the difference of likelihoods, paired; empty where problems differ."""
-    problems = [page.subject.plan.scenarios[0] for page in pages]
-    seeds = [page.comparisons[0].seeds for page in pages]
-    if problems[0].digest != problems[1].digest or seeds[0] != seeds[1]:
-        return "The two have different problems or held-out data, so their scores are not paired."
-    data = problems[0].data(seeds[0])
-    a, b = (evaluate(page.subject.choice.filter(problems[0]), data, problems[0].scale) for page in pages)
-    if a.has_truth:
-        ratio = score_ratio(a, b)
-        return f"Score of {names[0]} over that of {names[1]}, paired by run: {_value(ratio)}."
-    gain = likelihood_gain(a, b)
-    return f"Log-likelihood of a run of {names[0]} less that of {names[1]}, paired by run: {_value(gain)}."
-
-
-def _value(interval: Interval | None) -> str:
-    """A value with its interval; empty where there is none."""
-    if interval is None or not isfinite(interval.value):
-        return ""
-    if interval.low == interval.high:
-        return rounded(interval.value)
-    return f"{rounded(interval.value)} [{rounded(interval.low)}, {rounded(interval.high)}]"
 
 
 def known_table(result: Identifiability) -> Table:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping
 from importlib.metadata import version
 from inspect import cleandoc
 from pathlib import Path
@@ -19,7 +19,7 @@ from typer.main import get_command
 
 import tuning
 from thruster_env.core.text_tables import console
-from tuning.cli.main import PrintedWhole
+from tuning.cli.interrupts import PrintedWhole
 
 PANELS = {
     "First steps": ("demo", "inspect", "simulate", "filters", "new"),
@@ -39,35 +39,17 @@ PANELS = {
     "Published results and long studies": ("reproduce",),
 }
 COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
+BESIDE = {"methods": "filters", "score": "train"}  # commands in the file of another one
 VERBS = {
     name for name in COMMANDS if name.replace("-", "_") in tuning.__all__
 }  # made from the function of that name
 MARKUP: Final = "markdown"
 LOADING = "loading ..."
 VERSION = "Print the version and exit."
-RENAMED = {"--way": "--method", "--sampler": "--method", "ways": "methods", "study": "reproduce"}
-
-
-def with_todays_name(error: Exception, known: Iterable[str]) -> Exception:
-    """The error about an unknown option or command, which names today's if it had another name before."""
-    message = str(getattr(error, "message", ""))
-    for former, today in RENAMED.items():
-        unknown = getattr(error, "option_name", None) == former or f"'{former}'" in message
-        if unknown and today in known:
-            error.message = f"{message.rstrip('.')}. Did you mean {today if former[0] == '-' else repr(today)}?"  # type: ignore[attr-defined]
-            error.possibilities = None  # type: ignore[attr-defined]  # similar names
-    return error
 
 
 class Command(TyperCommand):
     """A command whose help Ctrl-C does not cut."""
-
-    def parse_args(self, ctx, args: list[str]) -> list[str]:
-        """Read the arguments."""
-        try:
-            return super().parse_args(ctx, args)
-        except typer.TyperException as error:
-            raise with_todays_name(error, [name for parameter in self.params for name in parameter.opts]) from None
 
     def format_help(self, ctx, formatter) -> None:
         """Print the help."""
@@ -77,13 +59,6 @@ class Command(TyperCommand):
 
 class Group(TyperGroup):
     """A group of commands whose help Ctrl-C does not cut."""
-
-    def resolve_command(self, ctx, args: list[str]):
-        """The command that the first argument names."""
-        try:
-            return super().resolve_command(ctx, args)
-        except typer.TyperException as error:
-            raise with_todays_name(error, self.list_commands(ctx)) from None
 
     def format_help(self, ctx, formatter) -> None:
         """Print the help."""
@@ -167,13 +142,9 @@ class Commands(LazyGroup):
 
     def loaded(self, name: str) -> typer.Typer:
         """The app of a command's module, or of its function."""
-        is_verb = name in VERBS
-        module = imported(tuning.home_of(file_of(name)) if is_verb else f"tuning.cli.{file_of(name)}")
-        return (
-            module.app
-            if hasattr(module, "app")
-            else app_of(getattr(module, file_of(name) if is_verb else "command"))
-        )
+        home, function = home_of(name)
+        module = imported(home)
+        return module.app if hasattr(module, "app") else app_of(getattr(module, function))
 
 
 def app_of(function: Callable, **chosen: Any) -> typer.Typer:
@@ -183,17 +154,18 @@ def app_of(function: Callable, **chosen: Any) -> typer.Typer:
     return alone
 
 
-def file_of(name: str) -> str:
-    """The name of a command's module."""
-    return name.replace("-", "_")
+def home_of(name: str) -> tuple[str, str]:
+    """The module of a command, and its function there."""
+    function = name.replace("-", "_")
+    if name in VERBS:
+        return tuning.home_of(function), function
+    return f"tuning.cli.{BESIDE.get(name, name)}", function if name in BESIDE else "command"
 
 
 def listed(name: str) -> TyperCommand:
     """A command with its name, panel and help alone, read from its file."""
-    file, function = Path(__file__).with_name(f"{file_of(name)}.py"), "command"
-    if name in VERBS:
-        parts = tuning.home_of(file_of(name)).split(".")[1:]
-        file, function = file.parents[1].joinpath(*parts).with_suffix(".py"), file_of(name)
+    home, function = home_of(name)
+    file = Path(__file__).parents[2].joinpath(*home.split(".")).with_suffix(".py")
     source = file.read_text(encoding="utf-8")
     match = re.search(rf'^def {function}\(.*?"""(.*?)(?:\n\n    Args:|""")', source, re.DOTALL | re.MULTILINE)
     text = cleandoc(match[1]) if match else source.split('"""')[1].partition(": ")[2].capitalize()

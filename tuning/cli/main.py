@@ -14,7 +14,9 @@ import sys
 import warnings
 from _signal import SIG_IGN, SIGINT, getsignal, signal  # `signal` itself takes milliseconds: Ctrl-C may come
 
-INTERRUPTED, BROKEN_PIPE = 130, 141
+from tuning.cli.interrupts import INTERRUPTED, leave, loads_a_package
+
+BROKEN_PIPE = 141
 
 
 def run() -> None:
@@ -40,7 +42,7 @@ def main() -> None:
     before, unraisable = getsignal(SIGINT), sys.unraisablehook
 
     def interrupt(number, frame):
-        if caught or _loads_a_package(frame):
+        if caught or loads_a_package(frame):
             leave()
         caught.append(number)
         raise KeyboardInterrupt
@@ -58,16 +60,37 @@ def main() -> None:
         from thruster_env.core.text_tables import adapt_standard_streams
 
         adapt_standard_streams()
-        from tuning.cli.app import app
-
+        plain = sys.argv[1:2] == ["new"] and len(sys.argv) == 4 and not any(word[:1] == "-" for word in sys.argv)
+        if not plain:
+            from tuning.cli.app import app
         sys.unraisablehook = lost
         signal(SIGINT, interrupt)
-        code, message = _outcome(app, caught)
+        code, message = _new(*sys.argv[2:]) if plain else _outcome(app, caught)
         _say(message)
     finally:
         signal(SIGINT, before)
         sys.unraisablehook = unraisable
     sys.exit(code)
+
+
+def _new(kind: str, name: str) -> tuple[int, str]:
+    """Run `thruster new KIND NAME` without Typer, whose imports take longer than all else."""
+    from pathlib import Path
+
+    from thruster_env.core.checks import any_case
+    from tuning.cli.new import FILES, command
+    from tuning.cli.output import emit
+
+    try:
+        emit(command(any_case(kind, tuple(FILES)), Path(name)).tables(), {}, None)
+        sys.stdout.flush()
+        return 0, ""
+    except KeyboardInterrupt:
+        return INTERRUPTED, "interrupted"
+    except ValueError as error:
+        return 2, str(error)
+    except OSError as error:
+        return _system_says(error)
 
 
 def _outcome(app, caught: list) -> tuple[int, str]:
@@ -175,54 +198,6 @@ def _as_one_line(
 ) -> str:
     """A warning, without the line of code that raised it."""
     return f"thruster: {message}\n" if category is UserWarning else f"thruster: {category.__name__}: {message}\n"
-
-
-def _loads_a_package(frame) -> bool:
-    """Whether an import is under way, in which an exception may get lost or leave a package in pieces."""
-    while frame is not None:
-        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
-            return True
-        frame = frame.f_back
-    return False
-
-
-def leave(*_) -> None:
-    """End the process now, as an interrupted one, with the cursor that a progress bar may have hidden."""
-    try:
-        if "multiprocessing.process" in sys.modules:
-            for child in sys.modules["multiprocessing.process"].active_children():
-                child.kill()
-        os.write(2, b"\x1b[?25h\n" * os.isatty(2) + b"thruster: interrupted\n")
-    finally:
-        os._exit(INTERRUPTED)
-
-
-class PrintedWhole:
-    """A context in which the first Ctrl-C waits for its end; the next one ends the process, as on a blocked pipe.
-
-    Outside the main thread, where Python delivers no signals, it has no effect.
-    """
-
-    def __enter__(self) -> None:
-        from threading import current_thread, main_thread
-
-        self._caught: list[int] = []
-        self._is_main = current_thread() is main_thread()
-        if self._is_main:
-            self._before = getsignal(SIGINT)
-            signal(SIGINT, self._note)
-
-    def __exit__(self, *_) -> None:
-        from signal import raise_signal
-
-        if self._is_main:
-            signal(SIGINT, self._before)
-        if self._caught:
-            raise_signal(SIGINT)
-
-    def _note(self, number, frame) -> None:
-        self._caught.append(number)
-        signal(SIGINT, leave)
 
 
 if __name__ == "__main__":

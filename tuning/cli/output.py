@@ -14,7 +14,7 @@ from rich.console import Console, RenderableType
 
 from thruster_env.core.files import check_target, write_whole
 from thruster_env.core.text_tables import Unfolded, console
-from tuning.cli.main import PrintedWhole
+from tuning.cli.interrupts import PrintedWhole
 
 progress_console = Console(stderr=True, markup=False, highlight=False)
 

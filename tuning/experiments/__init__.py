@@ -32,8 +32,8 @@ EXPERIMENTS = {
     "nurhadi2022": Experiment("KF and EnKF of two linear bow thrusters, Nurhadi et al. 2022", "thruster_papers"),
     "kiki2020": Experiment("KF and EnKF of two linear bow thrusters, Kiki 2020", "thruster_papers"),
     "thruster-papers": Experiment("Both papers on the bow thruster on the same runs", "thruster_papers"),
-    "ngatini2017": Experiment("Ensemble and fuzzy filters of a vehicle, Ngatini 2017", "vehicle.tables", "auv"),
-    "ngatini2019": Experiment("Ensemble filters of a vehicle, Ngatini 2019", "vehicle.tables", "auv"),
+    "ngatini2017": Experiment("Ensemble and fuzzy filters of a vehicle, Ngatini 2017", "vehicle_tables", "auv"),
+    "ngatini2019": Experiment("Ensemble filters of a vehicle, Ngatini 2019", "vehicle_tables", "auv"),
     "lorenz63": Experiment("Lorenz-63, beside published scores", "lorenz63", "benchmarks", SOLVED),
     "lorenz63-sparse": Experiment("Lorenz-63, measured seldom", "lorenz63", "benchmarks", SOLVED),
     "lorenz96": Experiment("Lorenz-96, beside published scores", "lorenz96", "benchmarks", SOLVED),
@@ -41,9 +41,9 @@ EXPERIMENTS = {
     "lidar": Experiment("Learned Q and R of a lidar's tracks, beside OKF", "lidar", "methods"),
     "identification": Experiment("Are the standard errors of identification right?", "identification", "identify"),
     "faults": Experiment("How soon a monitor notices faults", "faults", "monitoring"),
-    "recordings": Experiment("A recorded thruster beside its load cell", "recordings.identification", "real_data"),
+    "recordings": Experiment("A recorded thruster beside its load cell", "recordings", "real_data"),
     "users": Experiment("Filters tuned on users' problems, beside users' baselines", "users", "tuning"),
-    "methods": Experiment("Every method of tuning on the same data and budget", "methods.tables", "methods"),
+    "methods": Experiment("Every method of tuning on the same data and budget", "methods_tables", "methods"),
     "policies": Experiment(
         "Policies on raw, filtered and true state, beside MPC, PI and LQG", "policies_report", "policies"
     ),

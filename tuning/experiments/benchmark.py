@@ -24,7 +24,7 @@ from tuning.api.markers import Option, PythonOnly, Seed
 from tuning.api.result import Printed
 from tuning.cli.output import progress_of
 from tuning.evaluation.runs import state_errors
-from tuning.problems.data import Data, held_out_seeds
+from tuning.problems.data import Data
 from tuning.problems.model_problem import ModelProblem
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
@@ -229,20 +229,3 @@ def against_published(
         return rows
 
     return rows
-
-
-def tune_inflation(
-    filter_name: str, problem: ModelProblem, trials: int, runs: int, seed: int = 0
-) -> tuple[Choice, Interval]:
-    """Tune an ensemble filter's N, inflation and relaxation, with R held; also rmse.a on held-out seeds.
-
-    Args:
-        filter_name: "enkf", "etkf", "ensrf" or "denkf".
-        problem: a problem without process noise, so that Q is not tuned either.
-        trials: number of trials of the study.
-        runs: number of held-out seeds.
-        seed: seed of the study.
-    """
-    choice = run_in_memory(Plan(filter_name, (problem,), seed, hold_r=True), trials).choice
-    data, filter_ = problem.data(held_out_seeds(seed, runs)), choice.filter(problem)
-    return choice, mean_interval(mean_of_roots(analysis_errors(filter_, data)[0]))

@@ -33,15 +33,11 @@ import numpy as np
 
 from filters import StateSpaceModel
 from thruster_env.core.derivatives import complex_step, runge_kutta
-from thruster_env.core.text_tables import markdown_table
 from tuning.experiments.benchmark import (
-    RUNS,
-    TRIALS,
     Benchmark,
     Published,
     against_published,
     noise_free_problem,
-    tune_inflation,
 )
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Parameter
@@ -198,22 +194,4 @@ SPARSE = Benchmark(
 )
 
 
-def inflation() -> str:
-    """Inflation that a study finds on Lorenz-63."""
-    rows = []
-    for name in ("enkf", "etkf", "denkf"):
-        choice, score = tune_inflation(name, problem, TRIALS, RUNS)
-        parameters = choice.numbers
-        numbers = [f"{parameters['inflation']:.3f}", f"{parameters['relaxation']:.3f}"]
-        rows.append(
-            [
-                name,
-                f"{parameters['ensemble_size']}",
-                *numbers,
-                f"{score.value:.3f} [{score.low:.3f}, {score.high:.3f}]",
-            ]
-        )
-    return markdown_table(["filter", "N", "inflation", "relaxation", "rmse.a on held-out seeds"], rows)
-
-
-TABLES = {"lorenz63": BENCHMARK.markdown, "lorenz63_sparse": SPARSE.markdown, "inflation": inflation}
+TABLES = {"lorenz63": BENCHMARK.markdown, "lorenz63_sparse": SPARSE.markdown}

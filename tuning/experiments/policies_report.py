@@ -342,17 +342,17 @@ def stored() -> list[Result]:
     return run_comparison(Comparison(), FOLDER, "processes")
 
 
-def noise_table(results: Sequence[Result], noise: str) -> str:
+def noise_table(noise: str) -> str:
     """The return of a policy and, at medium noise, its errors; without the observations that are left out."""
     width = len(HEADER) if noise == VARIANT_NOISE else 3
-    rows = [row[:width] for row in rows_of(results, noise) if row[0].partition(": ")[2] not in NOT_ON_PAGE]
+    rows = [row[:width] for row in rows_of(stored(), noise) if row[0].partition(": ")[2] not in NOT_ON_PAGE]
     return markdown_table(HEADER[:width], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {
     "summary": lambda: markdown_table(["", *NOISES], summary_rows(stored())),
     "answers": lambda: "\n".join(f"- {sentence}" for sentence in answers(stored())),
-    **{f"policies_{noise}": lambda noise=noise: noise_table(stored(), noise) for noise in NOISES},
+    **{f"policies_{noise}": partial(noise_table, noise) for noise in NOISES},
 }
 FIGURES = {
     "appendix/policies_curves.png": lambda path: learning_curves(stored(), path),

@@ -50,7 +50,6 @@ COLOUR = re.compile(r"#([0-9a-fA-F]{6})\b")
 
 # Of tables and pictures on a page.
 WIDE = 480.0  # [pt] pictures beyond this are scrolled on a phone
-NARROW = 5  # columns of a table that fits beside another
 NO_TRIALS = "No trial was finished."
 TWO_SIDED = 1.96
 
@@ -232,28 +231,7 @@ def as_parts(results: Sequence[Table | str]) -> list[Part]:
     return parts
 
 
-class Pair(NamedTuple):
-    """Parts of two studies side by side where there is room, each below the name of its study."""
-
-    names: Sequence[str]
-    parts: Sequence[Table | Picture | Words | Code | None]
-
-    def html(self) -> str:
-        """A grid of the parts; one that is the same in both stands once."""
-        first, second = self.parts
-        if first is not None and second is not None and first == second:
-            return first.html()
-        cells = "".join(
-            f'<div><p class="whose">{escape(name)}</p>{part.html() if part else ""}</div>'
-            for name, part in zip(self.names, self.parts, strict=True)
-        )
-        tables = [part for part in self.parts if isinstance(part, Table)]
-        kind = "pair close" if not tables else "pair"
-        kind += " deep" if any(len(table.columns) > NARROW for table in tables) else ""
-        return f'<div class="{kind}">{cells}</div>'
-
-
-Part = Table | Picture | Words | Code | Pair
+Part = Table | Picture | Words | Code
 
 
 class Section(NamedTuple):
@@ -268,16 +246,13 @@ class Section(NamedTuple):
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-") or "section"
 
 
-def html_page(
-    title: str, advice: str | Sequence[str], sections: Sequence[Section], two_columns: bool = False
-) -> str:
+def html_page(title: str, advice: str | Sequence[str], sections: Sequence[Section]) -> str:
     """The whole page; all text is escaped.
 
     Args:
         title: of the page.
         advice: the summary, a sentence or several.
         sections: what follows.
-        two_columns: whether it is wide, for two studies.
     """
     sentences = [advice] if isinstance(advice, str) else advice
     paragraphs = "\n".join(f'<p class="advice">{escape(sentence)}</p>' for sentence in sentences)
@@ -289,11 +264,10 @@ def html_page(
         for section in sections
     )
     script = f"\n<script>{SCRIPT}</script>" if "data-read=" in body or 'class="code"' in body else ""
-    kind = ' class="two-columns"' if two_columns else ""
     return (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}{palette(body)}</style>\n</head>\n<body{kind}>\n<main>\n"
+        f"<title>{escape(title)}</title>\n<style>{STYLE}{palette(body)}</style>\n</head>\n<body>\n<main>\n"
         f"<h1>{escape(title)}</h1>\n{paragraphs}\n"
         f'<nav aria-label="contents"><strong>Contents</strong><ol>{contents}</ol></nav>\n'
         f"{body}\n</main>{script}\n</body>\n</html>\n"

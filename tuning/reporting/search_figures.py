@@ -310,9 +310,9 @@ def _size_axis(axis, sizes: Sequence[int]) -> None:
 class Sketchbook:
     """Numbers pictures, each with a caption and a text alternative."""
 
-    def __init__(self, prefix: str = "p"):
-        """Pictures are called by a prefix and a number."""
-        self._names = (f"{prefix}{number}" for number in count(1))
+    def __init__(self):
+        """Pictures are called by a number."""
+        self._names = (f"p{number}" for number in count(1))
 
     def picture(self, figure: Figure, caption: str, alt: str) -> Picture:
         """A figure as a part of a page."""

@@ -56,11 +56,6 @@ pre {{ background: var(--card); padding: .75rem 1rem; overflow-x: auto; font-siz
   color: var(--ink); background: var(--paper); border: 1px solid var(--strong); border-radius: .25rem; }}
 details {{ margin: .5rem 0; }}
 summary {{ cursor: pointer; font-weight: 600; }}
-.pair {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 30rem), 1fr)); gap: 0 2rem; }}
-.pair > * {{ min-width: 0; }}
-.pair.deep {{ display: block; }}
-.whose {{ font-weight: 600; color: var(--mark); margin: .75rem 0 0; }}
-body.two-columns {{ max-width: 84rem; }}
 @media screen and (max-width: 40rem) {{
   body {{ padding: 1rem .75rem 3rem; }}
   h1 {{ font-size: 1.35rem; }}
@@ -80,7 +75,7 @@ body.two-columns {{ max-width: 84rem; }}
 }}
 @media print {{
   @page {{ size: A4; margin: 14mm 12mm; }}
-  body, body.two-columns {{ max-width: none; padding: 0; font-size: 9.5pt; }}
+  body {{ max-width: none; padding: 0; font-size: 9.5pt; }}
   nav, .code button, .read .value {{ display: none !important; }}
   h2 {{ margin-top: 1.2rem; break-after: avoid; }}
   h3, .caption {{ break-after: avoid; }}
@@ -97,10 +92,8 @@ body.two-columns {{ max-width: 84rem; }}
   th:first-child {{ position: static; }}
   th {{ hyphens: auto; overflow-wrap: normal; }}
   pre {{ white-space: pre-wrap; font-size: 7.5pt; }}
-  figure, tr, .pair > * {{ break-inside: avoid; }}
+  figure, tr {{ break-inside: avoid; }}
   svg {{ max-height: 235mm; }}
-  .pair {{ display: block; }}
-  .pair.close {{ display: grid; grid-template-columns: 1fr 1fr; gap: 0 6mm; }}
 }}
 """
 

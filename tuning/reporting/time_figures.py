@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,7 +13,7 @@ from filters.engine.batch import Estimates
 from filters.filter import Filter
 from filters.logs.findings import MEASURED, TRUTH, colour_of
 from thruster_env.core.angles import with_breaks, wrapped, wrapped_where
-from thruster_env.core.files import BLUE, GREY, RUST, new_figure, save_figure, thinned, tidy
+from thruster_env.core.files import BLUE, GREY, RUST, new_figure, thinned, tidy
 from thruster_env.core.sources import as_value
 from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.model.quantities import Quantity
@@ -148,11 +147,6 @@ class Row(NamedTuple):
     label: str
     draw: Callable  # draw(axis, run, colour=that of the filter)
     limit: Callable  # limit(axes, runs, start) once all is drawn
-
-
-def estimates_figure(path: str | Path, filters: Mapping[str, Filter], data: Data, *arguments, **options) -> Path:
-    """Save what `draw_estimates` draws."""
-    return save_figure(draw_estimates(filters, data, *arguments, **options), path)
 
 
 def draw_estimates(

@@ -14,7 +14,7 @@ from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.loops import Loops
 from thruster_env.graphs.programs import Place, values_of
 from thruster_env.graphs.tracing import traced
-from tuning.experiments.vehicle.estimators import planar_kinematics
+from tuning.experiments.vehicle_papers import planar_kinematics
 
 
 def random_angles(count=100):

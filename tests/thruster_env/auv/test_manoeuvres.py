@@ -24,7 +24,7 @@ from thruster_env.auv.parameters import (
     SEGOROGENI_PAPERS,
     derive_constants,
 )
-from tuning.experiments.vehicle.estimators import planar_kinematics
+from tuning.experiments.vehicle_papers import planar_kinematics
 
 THRUST, TORQUE, DEGREE = 2.845, -0.017, math.pi / 180
 C = derive_constants(SEGOROGENI)

@@ -20,7 +20,7 @@ from thruster_env.auv.parameters import (
     preset_parameters,
     recipe,
 )
-from tuning.experiments.vehicle.tables import PRINTED_INVERSE
+from tuning.experiments.vehicle_papers import PRINTED_INVERSE
 
 every_preset = pytest.mark.parametrize("k", PRESETS.values(), ids=PRESETS)
 

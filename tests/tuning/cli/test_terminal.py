@@ -3,6 +3,7 @@
 import io
 import os
 import signal
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -41,7 +42,7 @@ def test_tables_and_pictures_of_scripts_and_experiments_stand_on_their_page(page
     files = [file for file in (DOCS / f"{page}.md", DOCS / "appendix" / f"{page}.md") if file.exists()]
     text = "\n".join(file.read_text() for file in files) or (DOCS.parent / "README.md").read_text()
     missing = [name for name in made_by(page, "TABLES") if f"<!-- table {name} -->" not in text]
-    assert not missing + [name for name in made_by(page, "FIGURES") if f"{name})" not in text]
+    assert not missing + [name for name in made_by(page, "FIGURES") if f"{Path(name).name})" not in text]
 
 
 def test_names_are_taken_in_any_case(as_json):  # noqa: F811

@@ -10,15 +10,15 @@ from scipy.stats import ttest_1samp, ttest_rel
 
 from docs.scripts import DOCS
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
-from tuning.experiments.methods import runs
-from tuning.experiments.methods.problems import (
+from tuning.experiments import methods_runs as runs
+from tuning.experiments.methods_problems import (
     CASES,
     FAST,
     QUICK,
     REFERENCE,
     ring,
 )
-from tuning.experiments.methods.runs import (
+from tuning.experiments.methods_runs import (
     Result,
     Scored,
     chance,
@@ -32,7 +32,7 @@ from tuning.experiments.methods.runs import (
     start_of,
     student,
 )
-from tuning.experiments.methods.tables import TABLES, percent, tables
+from tuning.experiments.methods_tables import TABLES, percent, tables
 
 WALK = QUICK[0]
 

@@ -8,7 +8,7 @@ import pytest
 from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.streams import episode_keys
 from thruster_env.model.simulate import simulate
-from tuning.experiments.recordings.identification import (
+from tuning.experiments.recordings import (
     CHOSEN,
     LOOKUP,
     OURS,
@@ -32,7 +32,7 @@ from tuning.experiments.recordings.identification import (
     tasks_of,
     thrusts,
 )
-from tuning.experiments.recordings.model import DT, clock_offset, model, read_recordings, to_identify
+from tuning.experiments.recordings_model import DT, clock_offset, model, read_recordings, to_identify
 from tuning.likelihood.result import valued
 
 RECORDED = Path(__file__).parents[4] / "shared" / "data" / "rov_thruster"
@@ -156,7 +156,7 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
 
     asked = []
     monkeypatch.setattr(
-        "tuning.experiments.recordings.identification.identified",
+        "tuning.experiments.recordings.identified",
         lambda structure, *_: asked.append(structure) or Learnt(structure),
     )
     file, told = tmp_path / "results.json", []
@@ -168,7 +168,7 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
     assert len(number_rows(runs, tasks)) == len(STRUCTURES[CHOSEN].free)
     assert len(estimates_of(runs, tasks)[OURS]) == 2
     few = {name: one for name, one in STRUCTURES.items() if name in (CHOSEN, "ambient")}
-    monkeypatch.setattr("tuning.experiments.recordings.identification.STRUCTURES", few)
+    monkeypatch.setattr("tuning.experiments.recordings.STRUCTURES", few)
     assert [row[0] for row in ladder_rows(runs, tasks)] == [one.about for one in few.values()]
 
 

@@ -8,7 +8,7 @@ from tests.slow import slow_but
 from tests.tuning.methods.problems import A, Q, R, at, linear, task_of
 from thruster_env.model.simulate import simulate
 from tuning.evaluation.residuals import estimated_from
-from tuning.experiments.methods.problems import ring
+from tuning.experiments.methods_problems import ring
 from tuning.likelihood.objective import symmetric_units
 from tuning.methods.innovations import (
     Noise,

@@ -31,25 +31,23 @@ from thruster_env.auv.paths import CRUISE_THRUST, MANOEUVRES, TORQUE_PER_THRUST
 from thruster_env.core.checks import at_least, one_of
 from thruster_env.core.files import BLUE, GREEN, PLUM, SKY, new_figure, save_figure
 from thruster_env.model.simulate import Truth, simulate
-from tuning.experiments.vehicle.estimators import (
-    Estimator,
-    ensembles,
-    full_pose,
-    fuzzy,
-    kalman,
-    measured,
-    planar_pose,
-    pose_errors,
-)
-from tuning.experiments.vehicle.papers import (
+from tuning.experiments.vehicle_papers import (
     DT,
     MEASURED,
     NGATINI2017,
     NGATINI2019,
     PRINTED_MEMBERS,
     RUNS,
+    Estimator,
     Paper,
+    ensembles,
+    full_pose,
+    fuzzy,
+    kalman,
+    measured,
     papers_model,
+    planar_pose,
+    pose_errors,
 )
 
 THRUST = 2.84531  # [N]; holds 1 m/s, the printed speed

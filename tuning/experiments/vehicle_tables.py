@@ -1,4 +1,4 @@
-"""The papers' tables beside ours, and sentences on them: for docs/appendix/auv.md and `thruster reproduce`."""
+"""The papers' tables beside ours: for docs/appendix/auv.md and `thruster reproduce`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from filters import FuzzyKalmanFilter
 from filters.consistency.nees import Interval
-from thruster_env.auv.parameters import SEGOROGENI, mass_matrix
 from thruster_env.core.checks import at_least
 from thruster_env.core.text_tables import Table, markdown_table
 from thruster_env.logs.write import check_picture
@@ -20,9 +18,16 @@ from tuning.api.markers import OUTPUT, WRITTEN, Option, PythonOnly, Seed
 from tuning.api.markers import RUNS as RUNS_PANEL
 from tuning.api.result import Printed
 from tuning.cli.output import progress_of
-from tuning.experiments.vehicle.estimators import MEASUREMENTS, level_model
-from tuning.experiments.vehicle.experiment import (
-    MEASURED_PLACES,
+from tuning.experiments.vehicle_papers import (
+    MEASUREMENTS,
+    NGATINI2019,
+    POSE,
+    PRINTED_PATHS,
+    RUNS,
+    TABLE_III,
+    PrintedRow,
+)
+from tuning.experiments.vehicle_runs import (
     MOST_RUNS,
     PAPERS,
     PathResult,
@@ -33,20 +38,9 @@ from tuning.experiments.vehicle.experiment import (
     run_tasks,
     tasks_of,
 )
-from tuning.experiments.vehicle.papers import (
-    DT,
-    FUZZY_HIGH,
-    FUZZY_LOW,
-    NGATINI2019,
-    NOISE,
-    POSE,
-    PRINTED_PATHS,
-    RUNS,
-    TABLE_III,
-    PrintedRow,
-)
 
 WHY = "why they differ"
+CONCLUSIONS = "docs/appendix/auv.md has the conclusions."
 FACTOR = 3.0  # up to which two errors are of the same size: path and duration are not printed
 FIELDS = {
     "full": "similar to ours by the full transformation",
@@ -54,13 +48,6 @@ FIELDS = {
     "planar": "similar to ours by yaw alone, an error that no filter can correct",
 }
 ENKF, FKF = "EnKF8 N=50", "fuzzy 0..1"  # our counterparts of the printed filters
-GOLDEN = math.sqrt((math.sqrt(5.0) - 1.0) / 2.0 * NOISE)  # P = 0.618 R: Q = R, and the state itself is measured
-MEAN_ONLY = math.sqrt(2.0 / 3.0 * NOISE)  # the same for a gain of 1/2
-NO_POSTERIOR_BOUND = (
-    "The bound is the Riccati recursion along the noise-free path. The posterior Cramer-Rao bound is useless "
-    "here: roll and pitch have a noise of 1e-6 rad a step, and its averages over truths take the smallest "
-    "differences of Jacobians for information: a pitch to 3 mrad, where a consistent filter has 10."
-)
 NOT_ON_PAGE = "N=100", "N=200", "0..1 offsets"  # ends of labels
 SHOWN = [0, 3, 4]  # of the velocities: u, whose errors those of v, w and r equal, and p and q
 RUNS_OF = {"ngatini2019": 50, "ngatini2017": 10}
@@ -74,24 +61,6 @@ class Finding(NamedTuple):
     printed: PrintedRow | None
     scores: Scores
     why: str
-
-
-PRINTED_INVERSE = np.array(
-    [
-        [0.162, -0.0024, 0.8989, 0.0011, 0.098, 0.0001],
-        [-0.0012, -0.8175, -0.0206, -0.0431, -0.0024, 0.0969],
-        [1.8855, -0.0418, -1.023, -0.0036, -0.2205, 0.0024],
-        [-0.0518, 0.8865, 0.0511, 1.0468, 0.0088, -0.105],
-        [15.9131, -0.3634, -17.0743, -0.0425, -1.8611, 0.0213],
-        [-0.0128, 15.7327, 0.1966, 0.8288, 0.024, -0.8641],
-    ]
-)
-"""A^-1 of equation (19), A the mass matrix with each row divided by its diagonal; "-08641" is read as -0.8641.
-
-Its inverse has a diagonal of ones to 8e-4 and the zeros of such a matrix, so the print holds what was meant. But
-its entries imply Xud = Yvd = Zwd, Ix - Kpd < 0 and Iy - Mqd = 0.09 kg m^2 for a body of 15 kg and almost a
-metre, and eigenvalues -0.24 and -0.49: an indefinite mass matrix, of which no vehicle has one.
-"""
 
 
 def findings(paper: str, results: list[PathResult]) -> list[Finding]:
@@ -160,167 +129,6 @@ def with_interval(estimate: Interval) -> str:
     """A value with its interval; nothing for NaN."""
     value, low, high = map(digits, estimate)
     return f"{value} [{low}, {high}]" if value else ""
-
-
-def unstable_corners(low=FUZZY_LOW, high=FUZZY_HIGH, world: str = "vehicle") -> tuple[int, float]:
-    """How many of the 64 matrices A in I + A dt of a fuzzy filter are unstable, and the fastest growth [1/s]."""
-    rules = FuzzyKalmanFilter(model=level_model(world), low=np.array(low), high=np.array(high)).rules
-    rates = [(rule.matrices()[0] - np.eye(6)) / DT for rule in rules]
-    growth = np.array([np.linalg.eigvals(rate).real.max() for rate in rates])
-    return int((growth > 1e-6).sum()), float(growth.max())
-
-
-def statements(paper: str, results: list[PathResult]) -> list[str]:
-    """Statements that compare a paper's tables with ours."""
-    by_path = {result.path: result for result in results if result.world == "vehicle"}
-    if paper == NGATINI2019.name:
-        iv = by_path["IV"]
-        return [*_of_transformation(iv), *_of_members(iv), *_of_attitude(iv), _of_matrix()]
-    (other,) = [result for result in results if result.world != "vehicle"]
-    return [*_of_paths(by_path), *_of_bounds(by_path), *_of_other_world(other)]
-
-
-def _of_transformation(iv: PathResult) -> list[str]:
-    printed = np.array([list(row.rmse.values()) for row in TABLE_III.values()])
-    flat = 100 * (printed.max(axis=0) / printed.min(axis=0) - 1.0).max()
-    by_yaw = np.array([scores.rmse("planar") for scores in iv.scores.values()])
-    ours = 100 * (by_yaw.max(axis=0) / by_yaw.min(axis=0) - 1.0).max()
-    gap, full = iv.planar_gap, iv.scores["EKF8"].rmse("full")
-    return [
-        f"The printed errors differ by {flat:.1f} % at most between 50 and 300 members, ours by yaw alone by "
-        f"{ours:.1f} % between all filters and the bare measurements: they do not measure the filter. The vehicle "
-        f"dives by pitching, which yaw alone ignores: on true velocities without noise its RMSE is {_pose(gap)}. "
-        f"By the full transformation the EKF has {_pose(full)}.",
-    ]
-
-
-def _of_members(iv: PathResult) -> list[str]:
-    scores, printed = iv.scores, TABLE_III
-    ours = [scores[f"EnKF8 N={count}"] for count in printed]
-    kalman = ("EKF8", "UKF8", "EKF6 level", "EKF6 own attitude")
-    measured = 1e3 * np.array([scores[label].rmse("velocities")[list(MEASURED_PLACES)] for label in kalman])
-    nees = ", ".join(f"{digits(of_members.nees_interval.value)}" for of_members in ours)
-    (mean_only,) = [of_mean for label, of_mean in scores.items() if "eq. (24)" in label]
-    return [
-        f"A measured velocity with Q = R is estimated to sqrt(0.618 R) = {1e3 * GOLDEN:.3f} mm/s (or mrad/s) "
-        f"with any filter; extended and unscented ones have {measured.min():.3f} to {measured.max():.3f}. Only p, "
-        "q, roll and pitch distinguish filters.",
-        f"The NEES of the EnKF for N = {', '.join(map(str, printed))} is {nees} for 8 states, that of the EKF "
-        f"{digits(scores['EKF8'].nees_interval.value)}: at 1 kHz each update reduces the spread of roll and "
-        "pitch by chance correlations, and nothing restores it. Seconds are printed for an unknown number of "
-        "steps.",
-        "Equation (24) discards the members, so its gain is 1/2 for measured states: sqrt(2/3 R) = "
-        f"{1e3 * MEAN_ONLY:.3f} mm/s in theory, {1e3 * mean_only.rmse('velocities')[0]:.3f} mm/s with the "
-        f"sampling noise of its members. p and q come only from the model, {_rates(mean_only)}; the correct EnKF, "
-        f"disturbed by chance correlations, has {_rates(ours[0])}.",
-    ]
-
-
-def _of_attitude(iv: PathResult) -> list[str]:
-    level, reckoned, eight = (iv.scores[label] for label in ("EKF6 level", "EKF6 own attitude", "EKF8"))
-    rates = [1e3 * scores.rmse("velocities")[3:5] for scores in (eight, reckoned, level)]
-    return [
-        "The papers' six states are not closed: weight and buoyancy depend on roll and pitch. RMSE of p and q "
-        f"[mrad/s] and NEES of an EKF of six states: {rates[2][0]:.0f}, {rates[2][1]:.0f}, "
-        f"{digits(level.nees_interval.value)} with zero roll and pitch; {rates[1][0]:.1f}, {rates[1][1]:.1f}, "
-        f"{digits(reckoned.nees_interval.value)} with its own dead-reckoned attitude. The EKF of eight states: "
-        f"{rates[0][0]:.1f}, {rates[0][1]:.1f}.",
-        NO_POSTERIOR_BOUND,
-    ]
-
-
-def _of_matrix() -> str:
-    printed = np.sort(np.linalg.eigvals(np.linalg.inv(PRINTED_INVERSE)).real)
-    ours = np.linalg.eigvalsh(mass_matrix(SEGOROGENI))
-    return (
-        f"The inverse of the printed A^-1 has eigenvalues {', '.join(f'{value:.2f}' for value in printed)}: two "
-        f"are negative, so no vehicle has this mass matrix. Ours has "
-        f"{', '.join(f'{value:.3g}' for value in ours)}, derived from the printed sizes."
-    )
-
-
-def _of_paths(by_path: dict[str, PathResult]) -> list[str]:
-    worse, printed_worse = [], []
-    for name, result in by_path.items():
-        ratio = position_ratio(result.scores[FKF], result.scores[ENKF], "full")
-        worse.append(f"{name} {with_interval(ratio)}")
-        enkf, fkf = (row.rmse for row in PRINTED_PATHS[name][:2])
-        printed_worse.append(f"{name} {math.hypot(*_metres(fkf)) / math.hypot(*_metres(enkf)):.2g}")
-    planar = [
-        position_ratio(result.scores[FKF], result.scores[MEASUREMENTS], "planar").value
-        for result in by_path.values()
-    ]
-    dynamic = by_path["dynamic"].scores[ENKF]
-    return [
-        "Position RMSE of the fuzzy filter over that of the EnKF with 50 members, printed: "
-        f"{', '.join(printed_worse)}. Ours, by the full transformation and paired by run: {', '.join(worse)}. "
-        "We cannot reproduce that the fuzzy filter wins on four paths; by yaw alone it has "
-        f"{min(planar):.2f} to {max(planar):.2f} times the error of the bare measurements.",
-        "On the dynamic path 1.5 mm, 1.4 mm and 1.1 mrad are printed for the EnKF. Ours has "
-        f"{_level_pose(dynamic.rmse('planar_both'))} with path and estimate both by yaw alone, and "
-        f"{_level_pose(dynamic.rmse('full'))} by the full transformation. z, which is not printed, is worse, "
-        f"because pitch is not measured: {digits(dynamic.rmse('full')[2])} m.",
-        f"We can reproduce that 50 members are faster than 64 rules; printed are {_seconds_ratio()} times.",
-    ]
-
-
-def _of_bounds(by_path: dict[str, PathResult]) -> list[str]:
-    outside = ", ".join(f"{name} {100 * result.outside[-1]:.0f} %" for name, result in by_path.items())
-    count, growth = unstable_corners()
-    return [
-        "The bounds 0..1 exclude every negative velocity. Without noise the share of time in which some "
-        f"velocity lies outside is {outside}. Corners such as v = w = 1 m/s are ten times the vehicle's "
-        f"velocities; {count} of the 64 tangents are unstable, the worst grows by {growth:.2f}/s.",
-        NO_POSTERIOR_BOUND,
-    ]
-
-
-def _of_other_world(other: PathResult) -> list[str]:
-    scores = other.scores
-    base = scores["EKF6 level"]
-    words = {
-        FKF: "bounds 0..1",
-        "fuzzy 0..1 own": "the same with a separate estimate for each rule",
-        "fuzzy narrow offsets": "a range around the manoeuvre, with offsets",
-    }
-    comparisons = []
-    for label, what in words.items():
-        p, q = scores[label].rmse("velocities")[3:5] / base.rmse("velocities")[3:5]
-        ratio = position_ratio(scores[label], base, "full")
-        comparisons.append(f"{what}: p {p:.2g}, q {q:.2g}, position {with_interval(ratio)}")
-    ensembles = ", ".join(
-        f"{digits(of_filter.nees_interval.value)}"
-        for label, of_filter in scores.items()
-        if label.startswith("EnKF6") and "(24)" not in label
-    )
-    return [
-        "On equal terms, in a world without restoring moments where six states are exact, the fuzzy filter's "
-        f"RMSE over that of the EKF of six states: {'; '.join(comparisons)}. The NEES of that EKF is "
-        f"{digits(base.nees_interval.value)}, of the EnKF {ensembles} for N = 50, 100, 200, 300.",
-    ]
-
-
-def _metres(rmse) -> list[float]:
-    return [value for name, value in rmse.items() if name != "psi"]
-
-
-def _seconds_ratio() -> str:
-    ratios = [path.fkf.seconds / path.enkf.seconds for path in PRINTED_PATHS.values()]
-    return f"{min(ratios):.2g} to {max(ratios):.2g}"
-
-
-def _pose(values: np.ndarray) -> str:
-    metres = ", ".join(f"{name} {value:.3g} m" for name, value in zip(POSE[:3], values[:3], strict=True))
-    return f"{metres}, psi {values[3]:.2g} rad"
-
-
-def _level_pose(values: np.ndarray) -> str:
-    return f"x {digits(values[0])} m, y {digits(values[1])} m, psi {digits(values[3])} rad"
-
-
-def _rates(scores: Scores) -> str:
-    p, q = 1e3 * scores.rmse("velocities")[3:5]
-    return f"{digits(p)} and {digits(q)} mrad/s"
 
 
 def members(iv: PathResult) -> Table:
@@ -440,15 +248,14 @@ def reproduce(
             steps=steps,
             on_part=lambda done, total, label: progress(label, done, total),
         )
-    compared, conclusions = findings(name, results), statements(name, results)
+    compared = findings(name, results)
     first = [members(results[0])] if name == NGATINI2019.name else [paths(results), ends(results)]
     output: list[Any] = [*first, *(velocities(result, "EKF8") for result in results)]
-    output += ["Conclusions from the runs", *conclusions, f"{name}: {PAPERS[name].source}", *PAPERS[name].remarks]
+    output += [f"{name}: {PAPERS[name].source}", *PAPERS[name].remarks, CONCLUSIONS]
     data = {
         "settings": {"runs": runs, "seed": seed, "steps": steps},
         "source": PAPERS[name].source,
         "results": [plain_result(result, compared) for result in results],
-        "statements": conclusions,
         "remarks": list(PAPERS[name].remarks),
     }
     if series is not None:
@@ -485,17 +292,6 @@ def results(paper: str) -> list[PathResult]:
     return run_tasks(tasks_of(paper), runs=RUNS_OF[paper])
 
 
-def paper_sentences() -> str:
-    """Lists of statements on the results of both papers."""
-    blocks: list[str] = []
-    for paper in RUNS_OF:
-        new = [
-            sentence for sentence in statements(paper, results(paper)) if not any(sentence in b for b in blocks)
-        ]
-        blocks.append(f"{paper}:\n\n" + "\n".join(f"- {sentence}" for sentence in new))
-    return "\n" + "\n\n".join(blocks)
-
-
 def _of_page(table: Callable[[], Table]) -> Callable[[], str]:
     def markdown() -> str:
         _, columns, rows, *_ = table()
@@ -511,5 +307,4 @@ TABLES = {
     "papers_paths": _of_page(lambda: paths(results("ngatini2017"))),
     "papers_ends": _of_page(lambda: ends(results("ngatini2017"))),
     "papers_world": _of_page(lambda: velocities(results("ngatini2017")[-1], "EKF6 level", NOT_ON_PAGE)),
-    "papers_said": paper_sentences,
 }

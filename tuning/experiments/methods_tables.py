@@ -16,7 +16,7 @@ from tuning.api.markers import OUTPUT, ExecutorOption, Option
 from tuning.api.markers import RUNS as RUNS_PANEL
 from tuning.api.result import Printed
 from tuning.cli.output import progress_of
-from tuning.experiments.methods.problems import (
+from tuning.experiments.methods_problems import (
     FAST,
     GROUPS,
     ORACLE,
@@ -30,7 +30,7 @@ from tuning.experiments.methods.problems import (
     Case,
     Protocol,
 )
-from tuning.experiments.methods.runs import Regret, Result, regrets, run_protocol, within
+from tuning.experiments.methods_runs import Regret, Result, regrets, run_protocol, within
 from tuning.methods.task import ALONE, TRUTH
 from tuning.search.plan import LIKELIHOOD
 

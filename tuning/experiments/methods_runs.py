@@ -24,7 +24,7 @@ from thruster_env.core.parallel import Where, task_map
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.evaluate import compute_metrics
 from tuning.evaluation.runs import metrics_of_all
-from tuning.experiments.methods.problems import (
+from tuning.experiments.methods_problems import (
     FROM_NOISE,
     FULL,
     LIDAR_RUNS,

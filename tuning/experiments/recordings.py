@@ -21,7 +21,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.markers import INPUT, OUTPUT, RUNS, Option
 from tuning.api.result import Printed
 from tuning.cli.output import progress_of
-from tuning.experiments.recordings.model import (
+from tuning.experiments.recordings_model import (
     DT,
     IDENTIFIED,
     LOAD_CELL,
