@@ -21,7 +21,7 @@ from tuning.evaluation.worth import tuning_effect
 from tuning.plants.thruster import find_scenario
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import score_label
-from tuning.reporting import leaderboard
+from tuning.reporting import tables as leaderboard
 from tuning.reporting.choice_words import gains
 from tuning.reporting.search_figures import draw_consistency
 from tuning.reporting.sections import advice, held_out_section
