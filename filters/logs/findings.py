@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from math import isnan
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -34,14 +33,12 @@ from thruster_env.core.files import (
     TRUE,
     WINE,
     new_figure,
-    save_figure,
     tidy,
 )
 from thruster_env.core.sources import as_value, is_array
 from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.logs.columns import OUTPUT, STATE, plain, suffix
 from thruster_env.logs.findings import GAP, OUTLIER, SPOILING, sentences
-from thruster_env.logs.grid import date_text, time_text
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.simulate import inputs_until
 
@@ -329,30 +326,6 @@ def episodes(alarms: Sequence[Alarm], memory: int) -> list[list[Alarm]]:
     return result
 
 
-def episode_sentence(episode: Sequence[Alarm], channel: Quantity, times: np.ndarray) -> str:
-    """An episode: "thrust: a bias of +0.32 N since 12.5 s, found at 14.1 s (cusum)".
-
-    It describes the first alarm, or a stuck or missing sensor, which explains the others.
-    """
-    cause = next((alarm for alarm in episode if alarm.test in ("stuck", "missing")), episode[0])
-    unit = f" {channel.unit}" if channel.unit else ""
-    what = {
-        "outlier": f"an outlier {cause.size:+.3g}{unit} off",
-        "variance": f"noise with {cause.size:.2g} times the expected variance",
-        "stuck": "equal readings",
-        "missing": "no readings",
-    }.get(cause.test, f"a bias of {cause.size:+.3g}{unit}")
-    dt = float(np.median(np.diff(times)))
-    at = [time_text(times[step], dt, 5) for step in (cause.since, cause.step, episode[-1].step)]
-    since = "" if cause.test == "outlier" else f" since {at[0]} s, found"
-    sentence = f"{channel.symbol}: {what}{since} at {at[1]} s{date_text(times[cause.step])} ({cause.test})"
-    tests = list(dict.fromkeys(alarm.test for alarm in episode if alarm is not cause))
-    if not tests:
-        return sentence
-    more = len(episode) - 1
-    return f"{sentence}; {more} more alarm{'s' * (more > 1)} until {at[2]} s ({', '.join(tests)})"
-
-
 # An estimate of a log as columns of a file.
 
 
@@ -439,11 +412,6 @@ def plot_style(name: str) -> dict[str, Any]:
 def colour_of(name: str) -> str:
     """Colour of a filter by name."""
     return STYLES.get(name, OTHER)[0]
-
-
-def log_figure(path: str | Path, estimate: LogEstimate, title: str, alarms: LogAlarms | None = None) -> Path:
-    """Save what `draw_log` draws; return the path."""
-    return save_figure(draw_log(estimate, title, alarms=alarms), path)
 
 
 def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: LogAlarms | None = None) -> Figure:

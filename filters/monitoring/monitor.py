@@ -483,17 +483,6 @@ def _longest(flags: np.ndarray) -> int:
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
-def monitor_data(monitor: Monitor, channels: int) -> dict[str, Any]:
-    """A monitor's attributes, and its thresholds by test, as JSON can hold them.
-
-    Thresholds of `outlier` are those of one channel, two, ... that are there; of `variance` the least and the
-    largest sum of a block.
-    """
-    _, cusum, glr, low, high, _, stuck, missing, *outliers = monitor.limits(channels).tolist()
-    thresholds = {"outlier": outliers, "cusum": cusum, "glr": glr, "variance": [low, high]}
-    return {**monitor.as_mapping(), THRESHOLDS: {**thresholds, "stuck": stuck, "missing": missing}}
-
-
 def tuned_monitor(path: str | Path) -> Monitor:
     """The monitor of a tuned file.
 

@@ -8,7 +8,7 @@ from scipy.stats import chi2, multivariate_normal
 
 from filters import make_filter, run, smooth
 from filters.logs.estimate import estimate
-from filters.logs.findings import columns_of, compared, draw_log, findings, log_figure
+from filters.logs.findings import columns_of, compared, draw_log, findings
 from tests.thruster_env.logs.test_logs import MODEL
 from thruster_env.core.streams import filter_keys
 from thruster_env.logs.log import Log
@@ -100,7 +100,7 @@ def test_a_filter_without_a_covariance_has_errors_alone(log):
     assert told.references[0].rmse > 0
 
 
-def test_columns_and_picture_hold_all_of_it(log, tmp_path):
+def test_columns_hold_all_of_it(log):
     found = estimate(log, "kf", SEEN)
     columns = columns_of(found)
     assert list(columns)[:4] == ["time_s", "input_V_s_V", "measured_tach_rad_per_s", "reference_n_rad_per_s"]
@@ -108,7 +108,6 @@ def test_columns_and_picture_hold_all_of_it(log, tmp_path):
     np.testing.assert_array_equal(columns["std_n_rad_per_s"], found.stds[:, 0])
     np.testing.assert_array_equal(columns["innovation_tach_rad_per_s"], found.innovations[:, 0])
     assert {"P_W", "std_P_W", "reference_P_W", "innovation_std_tach_rad_per_s"} <= set(columns)
-    assert log_figure(tmp_path / "est.png", found, "kf on run").read_bytes().startswith(b"\x89PNG")
 
 
 def test_what_is_measured_stands_behind_the_state_or_output_that_it_measures(log):

@@ -10,7 +10,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers its envs
 from filters import EstimateState, EstimateStates
 from filters.logs.estimate import estimate_with
-from filters.logs.findings import alarms_of, columns_of, episode_sentence, episodes
+from filters.logs.findings import alarms_of, columns_of, episodes
 from filters.monitoring import monitor as of_monitors
 from filters.monitoring.monitor import (
     TESTS,
@@ -27,6 +27,7 @@ from filters.registry import make_filter
 from thruster_env.core.compiled import interpreted, is_interpreting
 from thruster_env.logs.log import Log
 from thruster_env.model.quantities import Quantity
+from tuning.api.estimate import episode_sentence
 from tuning.problems.find import find_problem
 
 

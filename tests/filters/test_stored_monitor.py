@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from filters.monitoring import Monitor, tuned_monitor
-from filters.monitoring.monitor import monitor_data, monitor_for
+from filters.monitoring.monitor import monitor_for
 from tests.tuned_files import rewrite, write_untuned
+from tuning.evaluation.tuned import monitor_data
 
 NAN = math.nan
 

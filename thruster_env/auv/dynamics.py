@@ -273,14 +273,6 @@ def rotating_rates(x, u, c):
     return (*_in_current(x, current, downwards, u, c), x[3], x[4], x[5], *velocity)
 
 
-def rotating_state(x):
-    """(nu, quaternion, ...) of a state (nu, phi, theta, psi, ...): turned by yaw, then pitch, then roll."""
-    c_phi, s_phi, c_theta, s_theta = attitude_of(0.5 * x[6], 0.5 * x[7])
-    c_psi, s_psi = cosine_and_sine(0.5 * x[8])
-    rolled = rotations.product((c_theta, 0.0, s_theta, 0.0), (c_phi, s_phi, 0.0, 0.0))
-    return (*x[:6], *rotations.product((c_psi, 0.0, 0.0, s_psi), rolled), *x[9:])
-
-
 def angled_state(x):
     """(nu, phi, theta, psi, ...) of a state (nu, quaternion, ...); roll and yaw are within half a turn.
 

@@ -21,11 +21,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.auv.dynamics import angled_state, required_substeps, rotating_state
+from thruster_env.auv.dynamics import angled_state, attitude_of, required_substeps
 from thruster_env.auv.parameters import PRESETS, Constants, VehicleParameters, derive_constants, preset_parameters
 from thruster_env.core.checks import at_least, between, finite, one_of, positive, short_repr, within
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import tuple_of, written_out
+from thruster_env.core.streams import cosine_and_sine
 from thruster_env.effects.effects import (
     ConstantSignal,
     Effect,
@@ -405,6 +406,14 @@ class Plant(NamedTuple):
     def dropping_channels(self) -> tuple[int, ...]:
         """Numbers of the channels whose measurements may be missing."""
         return dropping_channels(self.sensors)
+
+
+def rotating_state(x):
+    """(nu, quaternion, ...) of a state (nu, phi, theta, psi, ...): turned by yaw, then pitch, then roll."""
+    c_phi, s_phi, c_theta, s_theta = attitude_of(0.5 * x[6], 0.5 * x[7])
+    c_psi, s_psi = cosine_and_sine(0.5 * x[8])
+    rolled = rotations.product((c_theta, 0.0, s_theta, 0.0), (c_phi, s_phi, 0.0, 0.0))
+    return (*x[:6], *rotations.product((c_psi, 0.0, 0.0, s_psi), rolled), *x[9:])
 
 
 def make_plant(

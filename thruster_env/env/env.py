@@ -13,13 +13,14 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from numpy import ndarray
 
 from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.checks import seed as checked_seed
 from thruster_env.core.sources import written_out
 from thruster_env.core.streams import EpisodeKeys, draw_key, reset_mask
 from thruster_env.env.copies import REWARD, TERMINATED, TIME, Page, PlantCopies
-from thruster_env.env.plant_data import as_json, of_copies, one_number, some_numbers
+from thruster_env.env.plant_data import as_json, of_copies, some_numbers
 from thruster_env.model.quantities import Quantity
 
 if TYPE_CHECKING:
@@ -140,6 +141,23 @@ def infos_of(report: np.ndarray, rows: ReportRows, mask: np.ndarray) -> dict[str
 
 # What `_set_views` makes.
 VIEWS = ("_command", "_advance", "_report", "_outcome", "_views", "_info")
+
+
+def one_number(action, quantity: Quantity) -> float:
+    """The command of a plant with one input; ValueError unless an action is one number and not NaN."""
+    if type(action) is ndarray and action.size == 1:  # the frequent case has to be quick
+        number = action.item()
+        if type(number) is float and number == number:
+            return number
+    try:
+        item = action.item if hasattr(action, "item") else np.asarray(action).item
+        entry = item()
+        number = math.nan if isinstance(entry, (str, bytes)) else float(entry)
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a torch tensor of several numbers
+        number = math.nan
+    if number != number:
+        raise ValueError(f"an action must be one {quantity.label} and not NaN, but got {short_repr(action)}")
+    return number
 
 
 class PlantEnv(gym.Env):

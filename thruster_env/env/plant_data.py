@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy import ndarray
 
 from thruster_env.core.checks import as_floats, covariance, one_of, positive, short_repr, vector, within
 from thruster_env.effects.effects import Registry
@@ -191,23 +190,6 @@ def _alike(first, other) -> bool:
     if isinstance(first, int | float) and isinstance(other, int | float):
         return math.isclose(first, other, rel_tol=1e-9)
     return first == other
-
-
-def one_number(action, quantity: Quantity) -> float:
-    """The command of a plant with one input; ValueError unless an action is one number and not NaN."""
-    if type(action) is ndarray and action.size == 1:  # the frequent case has to be quick
-        number = action.item()
-        if type(number) is float and number == number:
-            return number
-    try:
-        item = action.item if hasattr(action, "item") else np.asarray(action).item
-        entry = item()
-        number = math.nan if isinstance(entry, (str, bytes)) else float(entry)
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a torch tensor of several numbers
-        number = math.nan
-    if number != number:
-        raise ValueError(f"an action must be one {quantity.label} and not NaN, but got {short_repr(action)}")
-    return number
 
 
 def some_numbers(action, quantities: tuple[Quantity, ...]) -> np.ndarray:

@@ -19,7 +19,6 @@ from thruster_env.core.files import (
     RUST,
     WINE,
     new_figure,
-    save_figure,
     thinned,
     tidy,
     write_whole,
@@ -187,11 +186,6 @@ def _pyarrow():
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-def findings_figure(path: str | Path, log: Log) -> Path:
-    """Save what `draw_findings` draws; return the path."""
-    return save_figure(draw_findings(log), path)
 
 
 def draw_findings(log: Log) -> Figure:

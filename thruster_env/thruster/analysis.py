@@ -179,18 +179,6 @@ class LinearModel(NamedTuple):
     c: np.ndarray  # C (1, 2)
 
 
-def linear_model(p: ThrusterParameters, x, voltage: float = 0.0, ambient_velocity: float = 0.0) -> LinearModel:
-    """The slopes of rates and thrust at state x = (omega_m, U_a), voltage [V] and ambient flow [m/s].
-
-        B = [[K2, 0], [0, 2 (K4/K3) |U_a - U_0|]]
-
-    Beside `jacobians` it has the ambient flow as second input: the form in which the papers print theirs.
-    """
-    a, b, c = jacobians(p, x, voltage, ambient_velocity)
-    by_ambient = 2.0 * p.momentum_drag / p.added_mass * abs(float(x[1]) - ambient_velocity)
-    return LinearModel(a, np.column_stack([b, [0.0, by_ambient]]), c)
-
-
 def equilibrium(model: LinearModel, u) -> np.ndarray:
     """Equilibrium (omega_m, U_a, T) of a linear system under u = (V_s, U_0); not reached if it is unstable."""
     x = -np.linalg.solve(model.a, model.b @ np.asarray(u, dtype=np.float64))

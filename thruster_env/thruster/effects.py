@@ -85,11 +85,6 @@ class DeadBand(Effect):
         return outside(voltage, e.low, e.high), memory
 
 
-def dead_band_of(low: float, high: float) -> tuple[DeadBand, ...]:
-    """The dead band of ends low <= 0 <= high [V] as an effect; none where both are zero."""
-    return () if low == high else (DeadBand(high, -low),)
-
-
 @AMPLIFIER_EFFECTS.register("slew-limit")
 @dataclass(frozen=True)
 class SlewLimit(Effect):

@@ -24,10 +24,11 @@ from thruster_env.env.copies import Page, PlantCopies, clipped, correlated, root
 from thruster_env.env.record import check_finite, record
 from thruster_env.graphs.graphs import where
 from thruster_env.graphs.values import traceable
+from thruster_env.thruster.analysis import equilibrium, state_range
 from thruster_env.thruster.dynamics import substep, thrust_and_torque
 from thruster_env.thruster.effects import ThrusterContext, drawn_parameters
 from thruster_env.thruster.parameters import CHANNELS, ThrusterParameters, derive_constants
-from thruster_env.thruster.plant import Plant, Task, state_limits, thrust_scale
+from thruster_env.thruster.plant import Plant, Task, thrust_scale
 
 LARGEST_ERROR = 1e6  # of thrust over T_max: a reward stays finite when a state does not
 
@@ -158,6 +159,21 @@ def thruster(kinds: tuple, channels: tuple[Callable, ...], substeps: int, uncert
         return Memory(x, command, following, m.constants, effects), {"reward": -cost} | report
 
     return Page(begin, step, 1)
+
+
+ABSURD = 100.0  # a state this many times its range away from rest ends the episode
+
+
+def state_limits(plant: Plant) -> np.ndarray:
+    """Magnitudes (2,) of omega_m [rad/s] and U_a [m/s] at which an episode ends."""
+    if plant.linear is not None:
+        speed, flow, _ = equilibrium(plant.linear, (plant.max_voltage, plant.ambient_velocity))
+        # The open-bladed system hardly answers to the voltage: its noise is larger than its range.
+        spread = np.sqrt(np.diag(plant.initial_cov)) + np.sqrt(np.diag(plant.process_noise_cov))
+        return ABSURD * (2 * np.abs([speed, flow]) + np.abs(plant.initial_mean) + spread)
+    flow = abs(plant.ambient_velocity)
+    turned_by_flow = np.array([flow / plant.constants.blade_speed, flow])
+    return ABSURD * (state_range(plant.parameters, plant.max_voltage) + turned_by_flow)
 
 
 def page_of(plant: Plant, task: Task) -> tuple[Page, Parameters]:

@@ -94,14 +94,6 @@ NO_LINEARISATION = (
 )
 
 
-def published_for(preset: str) -> tuple[str, PublishedLinearModel] | None:
-    """Name and model of the published linear thruster of a preset, or None if there is none."""
-    for name, model in PUBLISHED.items():
-        if preset in model.presets:
-            return name, model
-    return None
-
-
 PUBLISHED_NOISE = 0.5  # variance of each state a step, and of the measurement, in the published runs
 
 

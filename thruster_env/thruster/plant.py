@@ -43,9 +43,9 @@ from thruster_env.thruster.effects import (
     FLOW_SIGNALS,
     REFERENCE_SIGNALS,
     UNCERTAIN,
+    DeadBand,
     LogNormal,
     Uniform,
-    dead_band_of,
 )
 from thruster_env.thruster.parameters import (
     CHANNELS,
@@ -204,7 +204,7 @@ def make_plant(
     Raises:
         ValueError: if an argument is wrong; the message states the rule and the value.
     """
-    parameters, dead_band = preset_and_dead_band(preset)
+    parameters, (low, high) = preset_and_dead_band(preset)
     dt = between("dt", positive("dt", dt), *SAMPLE_TIMES, "s")
     max_voltage = between("max_voltage", positive("max_voltage", max_voltage), *VOLTAGES, "V")
     ambient_velocity = within("ambient_velocity", ambient_velocity, FASTEST_FLOW)
@@ -243,9 +243,9 @@ def make_plant(
         cov,
         sensors,
         flow,
-        (*dead_band_of(*dead_band), *AMPLIFIER_EFFECTS.make(amplifier)),
+        (*([DeadBand(high, -low)] if low < high else []), *AMPLIFIER_EFFECTS.make(amplifier)),
         uncertainty,
-        dead_band=dead_band,
+        dead_band=(low, high),
     )
 
 

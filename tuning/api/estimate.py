@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import asdict, dataclass, replace
@@ -24,16 +24,19 @@ from filters.logs.findings import (
     Residual,
     alarms_of,
     columns_of,
-    episode_sentence,
+    draw_log,
     episodes,
     findings,
     verdict,
 )
-from filters.monitoring.monitor import Monitor, monitor_of, tuned_monitor
+from filters.monitoring.monitor import Alarm, Monitor, monitor_of, tuned_monitor
 from thruster_env.core.checks import short_repr
+from thruster_env.core.files import save_figure
 from thruster_env.core.text_tables import Table
+from thruster_env.logs.grid import date_text, time_text
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import check_picture, check_suffix, write_columns
+from thruster_env.model.quantities import Quantity
 from tuning.api.markers import (
     FILTER,
     OUTPUT,
@@ -57,6 +60,30 @@ if TYPE_CHECKING:
 
 MOST_EPISODES = 8  # of alarms in words
 OF_FILE = "tuned"  # the monitor of the tuned file
+
+
+def episode_sentence(episode: Sequence[Alarm], channel: Quantity, times: np.ndarray) -> str:
+    """An episode: "thrust: a bias of +0.32 N since 12.5 s, found at 14.1 s (cusum)".
+
+    It describes the first alarm, or a stuck or missing sensor, which explains the others.
+    """
+    cause = next((alarm for alarm in episode if alarm.test in ("stuck", "missing")), episode[0])
+    unit = f" {channel.unit}" if channel.unit else ""
+    what = {
+        "outlier": f"an outlier {cause.size:+.3g}{unit} off",
+        "variance": f"noise with {cause.size:.2g} times the expected variance",
+        "stuck": "equal readings",
+        "missing": "no readings",
+    }.get(cause.test, f"a bias of {cause.size:+.3g}{unit}")
+    dt = float(np.median(np.diff(times)))
+    at = [time_text(times[step], dt, 5) for step in (cause.since, cause.step, episode[-1].step)]
+    since = "" if cause.test == "outlier" else f" since {at[0]} s, found"
+    sentence = f"{channel.symbol}: {what}{since} at {at[1]} s{date_text(times[cause.step])} ({cause.test})"
+    tests = list(dict.fromkeys(alarm.test for alarm in episode if alarm is not cause))
+    if not tests:
+        return sentence
+    more = len(episode) - 1
+    return f"{sentence}; {more} more alarm{'s' * (more > 1)} until {at[2]} s ({', '.join(tests)})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -342,9 +369,8 @@ def estimate(
     if out is not None:
         write_columns(out, columns_of(result, estimates.watched), again=True)
     if plot is not None:
-        from filters.logs.findings import log_figure
-
-        log_figure(Path(plot), result, f"{estimates._what} on {recorded.name}", estimates.watched)
+        title = f"{estimates._what} on {recorded.name}"
+        save_figure(draw_log(result, title, alarms=estimates.watched), Path(plot))
     return replace(estimates, files=tuple(str(path) for path in (out, plot) if path is not None))
 
 

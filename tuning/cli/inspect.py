@@ -20,13 +20,14 @@ from thruster_env.thruster.analysis import (
     analyse,
     dc_gain,
     frequency_response,
-    linear_model,
+    jacobians,
     response_grids,
     state_range,
     steady_state,
     step_response,
 )
-from thruster_env.thruster.linear import NO_LINEARISATION, SAMPLE_TIME, PublishedLinearModel, published_for
+from thruster_env.thruster.linear import NO_LINEARISATION, PUBLISHED, SAMPLE_TIME, PublishedLinearModel
+from thruster_env.thruster.parameters import ThrusterParameters
 from thruster_env.thruster.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, Plant, make_plant
 from tuning.api.markers import INPUT, OUTPUT, WRITTEN, Option, PresetOption
 from tuning.api.result import Printed
@@ -34,6 +35,18 @@ from tuning.cli.output import warn_beyond
 
 GAIN_UNITS = {"V_s": "N/V", "U_0": "N s/m"}  # of thrust over each input
 OUTPUTS = ("omega_m [rad/s]", "U_a [m/s]", "T [N]")
+
+
+def linear_model(p: ThrusterParameters, x, voltage: float = 0.0, ambient_velocity: float = 0.0) -> LinearModel:
+    """The slopes of rates and thrust at state x = (omega_m, U_a), voltage [V] and ambient flow [m/s].
+
+        B = [[K2, 0], [0, 2 (K4/K3) |U_a - U_0|]]
+
+    Beside `jacobians` it has the ambient flow as second input: the form in which the papers print theirs.
+    """
+    a, b, c = jacobians(p, x, voltage, ambient_velocity)
+    by_ambient = 2.0 * p.momentum_drag / p.added_mass * abs(float(x[1]) - ambient_velocity)
+    return LinearModel(a, np.column_stack([b, [0.0, by_ambient]]), c)
 
 
 def command(
@@ -66,12 +79,12 @@ def command(
     ours = analyse(linear_model(plant.parameters, point[:2], voltage, ambient_velocity), dt, spread)
     title = f"Preset {preset} at {voltage:g} V, U_0 = {ambient_velocity:g} m/s, dt = {dt:g} s"
     columns, words, published = {"this thruster": ours}, [], None
-    if (known := published_for(preset)) is not None:
-        name, model = known
-        theirs = analyse(LinearModel(*map(np.array, (model.a, model.b, model.c))), dt, spread)
-        columns[f"published: {name}"] = theirs
-        words = ["", f"{NO_LINEARISATION} {model.remark} Source: {model.source}."]
-        published = _plain_published(name, model, theirs)
+    for name, model in PUBLISHED.items():
+        if preset in model.presets:
+            theirs = analyse(LinearModel(*map(np.array, (model.a, model.b, model.c))), dt, spread)
+            columns[f"published: {name}"] = theirs
+            words = ["", f"{NO_LINEARISATION} {model.remark} Source: {model.source}."]
+            published = _plain_published(name, model, theirs)
     if out is not None:
         response_figure(out, ours.model, dt, title.replace("U_0", "$U_0$"))
         words += ["", f"Bode plot and step response: {out}"]

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 from rich.console import RenderableType
 
 from thruster_env.core.checks import listed
+from thruster_env.core.files import save_figure
 from thruster_env.core.text_tables import Table, Unfolded, console, plain_text
 from thruster_env.env.record import ANY_DT
 from thruster_env.logs.columns import find_columns, quantities_of
@@ -22,7 +23,7 @@ from thruster_env.logs.recorders.bag_counts import METADATA
 from thruster_env.logs.recorders.bags import HEADER, RECEIPT
 from thruster_env.logs.recorders.registry import ENDINGS, Contents, Field, contents, format_of
 from thruster_env.logs.table import SUFFIXES, read_table
-from thruster_env.logs.write import check_picture, check_suffix, write_log
+from thruster_env.logs.write import check_picture, check_suffix, draw_findings, write_log
 from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, LogsArgument, Option
 from tuning.api.read_logs import recorded_runs
 from tuning.api.result import Printed
@@ -193,9 +194,7 @@ def command(
     if out is not None:
         write_log(out, recorded)
     if plot is not None:
-        from thruster_env.logs.write import findings_figure
-
-        findings_figure(plot, recorded)
+        save_figure(draw_findings(recorded), plot)
     files = [str(path) for path in (plot, out) if path is not None]
     return Printed([*_report(recorded), *(f"wrote {path}" for path in files)], _as_json(recorded, files))
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from filters.estimators.foreign import is_foreign, label_of
-from filters.monitoring.monitor import monitor_data, monitor_for
+from filters.monitoring.monitor import THRESHOLDS, Monitor, monitor_for
 from filters.tuned_file import (
     AUGMENTED,
     FACTORS,
@@ -132,6 +132,17 @@ def tuned_content(
         "choice": as_data(result.validation),
         "ensemble_sizes": sizes_as_data(result.sizes, result.sized or choice, plan) if result.sizes else None,
     }
+
+
+def monitor_data(monitor: Monitor, channels: int) -> dict[str, Any]:
+    """A monitor's attributes, and its thresholds by test, as JSON can hold them.
+
+    Thresholds of `outlier` are those of one channel, two, ... that are there; of `variance` the least and the
+    largest sum of a block.
+    """
+    _, cusum, glr, low, high, _, stuck, missing, *outliers = monitor.limits(channels).tolist()
+    thresholds = {"outlier": outliers, "cusum": cusum, "glr": glr, "variance": [low, high]}
+    return {**monitor.as_mapping(), THRESHOLDS: {**thresholds, "stuck": stuck, "missing": missing}}
 
 
 def _monitor_of(choice: Choice, plan: Plan) -> dict | None:

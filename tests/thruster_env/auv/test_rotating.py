@@ -6,12 +6,12 @@ import pytest
 
 import filters
 import thruster_env  # noqa: F401, registers the envs
-from thruster_env.auv.dynamics import ROTATING, angled_state, rotating_state, rotating_substep
+from thruster_env.auv.dynamics import ROTATING, angled_state, rotating_substep
 from thruster_env.auv.equations import by_vectors, simulate
 from thruster_env.auv.model import auv_model, continuous_auv
 from thruster_env.auv.parameters import SEGOROGENI, derive_constants
 from thruster_env.auv.paths import DepthAndCourse
-from thruster_env.auv.plant import FIELD, make_plant
+from thruster_env.auv.plant import FIELD, make_plant, rotating_state
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import rotations
 from thruster_env.model.turns import difference

@@ -14,7 +14,6 @@ from thruster_env.thruster.analysis import (
     dc_gain,
     frequency_response,
     jacobians,
-    linear_model,
     response_grids,
     state_range,
     steady_state,
@@ -22,9 +21,9 @@ from thruster_env.thruster.analysis import (
     transfer_function,
 )
 from thruster_env.thruster.dynamics import rates, thrust_and_torque_tangent
-from thruster_env.thruster.linear import PUBLISHED, SAMPLE_TIME, published_for
+from thruster_env.thruster.linear import PUBLISHED, SAMPLE_TIME
 from thruster_env.thruster.parameters import ANGLES, PRESETS, TUNNEL, derive_constants
-from tuning.cli.inspect import response_figure
+from tuning.cli.inspect import linear_model, response_figure
 
 every_preset = pytest.mark.parametrize("p", PRESETS.values(), ids=PRESETS.keys())
 every_print = pytest.mark.parametrize("name", PUBLISHED)
@@ -211,8 +210,6 @@ def test_in_every_state_a_slope_of_the_forces_has_another_sign_than_in_print(nam
 def test_published_models_belong_to_presets():
     named = [preset for system in PUBLISHED.values() for preset in system.presets]
     assert set(named) <= set(PRESETS) and len(named) == len(set(named))
-    assert published_for("tunnel_physical") == ("tunnel", PUBLISHED["tunnel"])
-    assert published_for("t200") is None
 
 
 def test_responses_are_drawn_into_a_whole_file(tmp_path):
