@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.signals import oscillator
+from filters.models import oscillator
 from thruster_env.core.checks import finite, positive
 from thruster_env.model import rotations
 from thruster_env.model.quantities import Quantity

@@ -20,7 +20,8 @@ import math
 import numpy as np
 
 from filters.attitude import AXES, FIRST_BIAS, GRAVITY, UNKNOWN, WORLD
-from filters.signals import block_diagonal, oscillator
+from filters.models import oscillator
+from filters.signals import block_diagonal
 from thruster_env.core.checks import finite, positive
 from thruster_env.model import rotations
 from thruster_env.model.continuous import noise_of_densities

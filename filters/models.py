@@ -23,20 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.signals import (
-    Signal,
-    added,
-    autoregression,
-    constant,
-    constant_acceleration,
-    constant_velocity,
-    harmonics,
-    local_trend,
-    ornstein_uhlenbeck,
-    oscillator,
-    seasonal,
-    singer,
-)
+from filters.signals import Signal, added, anywhere
 from thruster_env.core.checks import finite, one_of, positive, short_repr
 from thruster_env.model.affine import AffineModel, affine_model
 from thruster_env.model.quantities import Quantity
@@ -122,64 +109,189 @@ FREQUENCY = Free(
 DAMPING = Free("damping", "damping ratio", "", lambda s: (1e-4, 2.0), starts=3)
 
 
-NAMED = {
-    model.name: model
-    for model in (
-        NamedModel(
-            "constant", "a level that drifts", (_density("drift", "density of the level's drift", 1),), constant
-        ),
-        NamedModel(
-            "constant-velocity",
-            "a position with a velocity",
-            (_density("acceleration", "density of the white acceleration", 3),),
-            constant_velocity,
-        ),
-        NamedModel(
-            "constant-acceleration",
-            "a position with velocity and acceleration",
-            (_density("jerk", "density of the white jerk", 5),),
-            constant_acceleration,
-        ),
-        NamedModel(
-            "ornstein-uhlenbeck",
-            "deviations that return to the mean",
-            (TIME_CONSTANT, _std("std", "standard deviation of the signal")),
-            ornstein_uhlenbeck,
-            about_mean=True,
-        ),
-        NamedModel(
-            "local-trend",
-            "a level and its trend, each with noise",
-            (
-                _density("drift", "density of the level's drift", 1),
-                _density("trend_drift", "density of the trend's drift", 3),
-            ),
-            local_trend,
-        ),
-        NamedModel(
-            "singer",
-            "a position whose acceleration is correlated",
-            (
-                TIME_CONSTANT,
-                Free(
-                    "acceleration_std",
-                    "standard deviation of the acceleration",
-                    "U/s^2",
-                    lambda s: (1e-5 * s.spread / s.duration**2, 1e2 * s.spread / s.dt**2),
-                    starts=9,
-                ),
-            ),
-            singer,
-        ),
-        NamedModel(
-            "oscillator",
-            "a damped oscillation about the mean",
-            (FREQUENCY, DAMPING, _std("std", "standard deviation of the oscillation")),
-            oscillator,
-            about_mean=True,
-        ),
+NAMED: dict[str, NamedModel] = {}  # without settings
+
+
+def named(name: str, about: str, *free: Free, about_mean: bool = False) -> Callable:
+    """Decorator that registers a signal of free numbers as a model of this name."""
+
+    def register(signal: Callable[..., Signal]) -> Callable[..., Signal]:
+        NAMED[name] = NamedModel(name, about, free, signal, about_mean)
+        return signal
+
+    return register
+
+
+def _integrators(count: int, densities: tuple[float, ...], symbols: tuple[str, ...]) -> Signal:
+    """A chain x_1' = x_2, x_2' = x_3, ..., of which the first is measured."""
+    units = ("U", "U/s", "U/s^2")
+    states = tuple(zip(symbols, units[:count], strict=True))
+    orders = tuple(range(count))
+    return Signal(np.eye(count, k=1), np.diag(densities), np.eye(count)[0], states, orders, anywhere(count))
+
+
+@named("constant", "a level that drifts", _density("drift", "density of the level's drift", 1))
+def constant(drift: float) -> Signal:
+    """A level that drifts as a random walk: the local level model.
+
+        dx/dt = w,  Q = drift dt
+
+    Args:
+        drift: density of the white noise [U^2/s].
+    """
+    return _integrators(1, (drift,), ("level",))
+
+
+@named(
+    "constant-velocity",
+    "a position with a velocity",
+    _density("acceleration", "density of the white acceleration", 3),
+)
+def constant_velocity(acceleration: float) -> Signal:
+    """A position whose velocity changes by white-noise acceleration.
+
+        Q = acceleration [[dt^3/3, dt^2/2], [dt^2/2, dt]]
+
+    Args:
+        acceleration: density of the white acceleration [U^2/s^3].
+    """
+    return _integrators(2, (0.0, acceleration), ("position", "velocity"))
+
+
+@named(
+    "constant-acceleration",
+    "a position with velocity and acceleration",
+    _density("jerk", "density of the white jerk", 5),
+)
+def constant_acceleration(jerk: float) -> Signal:
+    """A position whose acceleration changes by white-noise jerk.
+
+    Args:
+        jerk: density of the white jerk [U^2/s^5].
+    """
+    return _integrators(3, (0.0, 0.0, jerk), ("position", "velocity", "acceleration"))
+
+
+@named(
+    "ornstein-uhlenbeck",
+    "deviations that return to the mean",
+    TIME_CONSTANT,
+    _std("std", "standard deviation of the signal"),
+    about_mean=True,
+)
+def ornstein_uhlenbeck(time_constant: float, std: float) -> Signal:
+    """A deviation that returns to the mean: exponentially correlated noise.
+
+        dx/dt = -x/T + w,  S = 2 std^2/T
+
+    Args:
+        time_constant: T [s].
+        std: stationary standard deviation [U].
+    """
+    return Signal(
+        np.array([[-1.0 / time_constant]]),
+        np.array([[2.0 * std**2 / time_constant]]),
+        np.ones(1),
+        (("deviation", "U"),),
+        (0,),
+        np.array([[std**2]]),
     )
-}
+
+
+@named(
+    "local-trend",
+    "a level and its trend, each with noise",
+    _density("drift", "density of the level's drift", 1),
+    _density("trend_drift", "density of the trend's drift", 3),
+)
+def local_trend(drift: float, trend_drift: float) -> Signal:
+    """A level and its trend, each with noise: the local linear trend.
+
+    Args:
+        drift: density of the level's noise [U^2/s].
+        trend_drift: density of the trend's noise [U^2/s^3].
+    """
+    return _integrators(2, (drift, trend_drift), ("level", "trend"))
+
+
+@named(
+    "singer",
+    "a position whose acceleration is correlated",
+    TIME_CONSTANT,
+    Free(
+        "acceleration_std",
+        "standard deviation of the acceleration",
+        "U/s^2",
+        lambda s: (1e-5 * s.spread / s.duration**2, 1e2 * s.spread / s.dt**2),
+        starts=9,
+    ),
+)
+def singer(time_constant: float, acceleration_std: float) -> Signal:
+    """A position whose acceleration is exponentially correlated: a target that manoeuvres.
+
+        da/dt = -a/T + w,  S = 2 std^2/T
+
+    Args:
+        time_constant: T of a manoeuvre [s].
+        acceleration_std: stationary standard deviation of the acceleration [U/s^2].
+    """
+    slope = np.eye(3, k=1)
+    slope[2, 2] = -1.0 / time_constant
+    chain = _integrators(
+        3, (0.0, 0.0, 2.0 * acceleration_std**2 / time_constant), ("position", "velocity", "acceleration")
+    )
+    return chain._replace(slope=slope, first=np.diag([np.inf, np.inf, acceleration_std**2]))
+
+
+@named(
+    "oscillator",
+    "a damped oscillation about the mean",
+    FREQUENCY,
+    DAMPING,
+    _std("std", "standard deviation of the oscillation"),
+    about_mean=True,
+)
+def oscillator(frequency: float, damping: float, std: float) -> Signal:
+    """A damped oscillation about the mean that white noise excites.
+
+        x'' = -2 zeta w_0 x' - w_0^2 x + w,  w_0 = 2 pi frequency,  S = 4 zeta w_0^3 std^2
+
+    The second state is x'/w_0, so both have the unit of the data.
+
+    Args:
+        frequency: natural frequency [Hz].
+        damping: zeta.
+        std: stationary standard deviation [U].
+    """
+    w = 2.0 * math.pi * frequency
+    return Signal(
+        np.array([[0.0, w], [-w, -2.0 * damping * w]]),
+        np.diag([0.0, 4.0 * damping * w * std**2]),
+        np.array([1.0, 0.0]),
+        (("oscillation", "U"), ("quadrature", "U")),
+        (0, 0),
+        std**2 * np.eye(2),
+    )
+
+
+def harmonics(drift: float, period: float, count: int) -> Signal:
+    """A periodic signal about the mean whose shape drifts: a daily or yearly course.
+
+        x_k'' = -(2 pi k/period)^2 x_k,  k = 1 ... count;  cosine and sine of each drift as random walks
+
+    Args:
+        drift: density of the noise on each cosine and sine [U^2/s].
+        period: [s].
+        count: harmonics; half the samples in a period describe any seasonal pattern.
+
+    Source: Harvey (1989), section 2.3.4.
+    """
+    w = 2.0 * math.pi / period
+    slope = np.kron(np.diag(np.arange(1.0, count + 1.0)), [[0.0, w], [-w, 0.0]])
+    states = [(f"{word}_{k + 1}", "U") for k in range(count) for word in ("harmonic", "quadrature")]
+    output = np.tile([1.0, 0.0], count)
+    orders = (0,) * (2 * count)
+    return Signal(slope, drift * np.eye(2 * count), output, tuple(states), orders, anywhere(2 * count))
 
 
 def _harmonic_model(settings: str) -> NamedModel:
@@ -194,6 +306,26 @@ def _harmonic_model(settings: str) -> NamedModel:
         return NamedModel(name, "a periodic course", (*free, PERIOD), partial(harmonics, **fixed), about_mean=True)
     signal = partial(harmonics, period=period, **fixed)
     return NamedModel(name, f"a course of period {period:g} s", free, signal, about_mean=True)
+
+
+def seasonal(drift: float, period: float, seasons: int) -> Signal:
+    """A pattern of as many values in a period, about the mean, that drifts: all of its `harmonics`.
+
+    The last one of an even number has no quadrature, as all its samples would be zero, and twice the density, as
+    half of its noise turns into the quadrature within a sample: Q of each cosine is drift dt.
+
+    Args:
+        drift: density of the noise on each cosine and sine [U^2/s].
+        period: [s].
+        seasons: samples in a period.
+
+    Source: Harvey (1989), section 2.3.4, the trigonometric form.
+    """
+    signal = harmonics(drift, period, seasons // 2)
+    if seasons % 2 == 0:
+        signal.densities[-1, -1] = signal.first[-1, -1] = 0.0
+        signal.densities[-2, -2] *= 2.0
+    return signal
 
 
 def _seasonal_model(settings: str) -> NamedModel:
@@ -211,6 +343,46 @@ def _seasonal_model(settings: str) -> NamedModel:
     return NamedModel(f"seasonal:{settings}", about, (SHAPE_DRIFT,), signal, about_mean=True, apart=apart)
 
 
+def autoregression(std: float, **partials: float) -> Signal:
+    """A deviation from the mean that depends on the last ones, in equal steps.
+
+        x_k = phi_1 x_{k-1} + ... + phi_p x_{k-p} + w_k
+
+    It is stationary for all partial autocorrelations r_i between -1 and 1, from which Durbin's recursion has phi:
+    phi_i,i = r_i, phi_i,j = phi_{i-1,j} - r_i phi_{i-1,i-j}.
+
+    Args:
+        std: stationary standard deviation [U].
+        **partials: r_1 ... r_p.
+
+    Raises:
+        ValueError: for a partial autocorrelation that is not between -1 and 1.
+
+    Source: Durbin (1960), "The fitting of time-series models", Review of the International Statistical Institute
+    28(3); Monahan (1984), "A note on enforcing stationarity in autoregressive-moving average models", Biometrika
+    71(2).
+    """
+    wrong = next((name for name, r in partials.items() if not abs(r) < 1.0), None)
+    if wrong is not None:
+        raise ValueError(f"{wrong} must be between -1 and 1, but got {partials[wrong]:g}")
+    p, phi, innovation, correlations = len(partials), np.empty(0), 1.0, [1.0]
+    for r in partials.values():
+        correlations.append(float(phi @ correlations[:0:-1]) + r * innovation)
+        phi = np.append(phi - r * phi[::-1], r)
+        innovation *= 1.0 - r**2
+    lags, densities = np.arange(p), np.zeros((p, p))
+    densities[0, 0] = std**2 * innovation
+    return Signal(
+        np.vstack([phi, np.eye(p)[:-1]]),
+        densities,
+        np.eye(p)[0],
+        tuple((f"lag_{i}" if i else "deviation", "U") for i in range(p)),
+        (0,) * p,
+        std**2 * np.array(correlations)[np.abs(lags[:, None] - lags)],
+        tuple(range(p)),
+    )
+
+
 def _autoregressive_model(settings: str) -> NamedModel:
     """`autoregression` of text such as "2", its order."""
     if not settings.isdecimal() or not 1 <= int(settings) <= MOST_ORDER:
@@ -222,7 +394,7 @@ def _autoregressive_model(settings: str) -> NamedModel:
             f"partial autocorrelation at lag {i}",
             "",
             lambda s: (-0.9999, 0.9999),
-            start=_first_partials if i == 1 else _further_partials,
+            start=(lambda s: (0.8, 0.2, -0.5)) if i == 1 else (lambda s: (0.4, -0.4)),
             log=False,
         )
         for i in range(1, int(settings) + 1)
@@ -230,14 +402,6 @@ def _autoregressive_model(settings: str) -> NamedModel:
     free = *partials, _std("std", "standard deviation of the signal")
     about = f"an autoregression of order {settings}, in equal steps"
     return NamedModel(f"ar:{settings}", about, free, autoregression, about_mean=True)
-
-
-def _first_partials(scales: Scales) -> Sequence[float]:
-    return 0.8, 0.2, -0.5
-
-
-def _further_partials(scales: Scales) -> Sequence[float]:
-    return 0.4, -0.4
 
 
 def _numbers_of(settings: str, rule: str, *names: str) -> dict[str, float]:

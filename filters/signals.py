@@ -1,17 +1,13 @@
-"""Linear signals in continuous time, and in equal steps: their rates, noises and first states.
+"""Linear signals in continuous time, and in equal steps: F and Q of steps of any length, and sums of signals.
 
     dx/dt = A x + w,  E[w(t) w(s)'] = S delta(t - s);   z = C x
 
-A `Signal` gives F and Q of any step, so each step of a record may have its own length.
-
-Sources: Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation, sections 6.2
-(kinematic models) and 8.2 (Singer's); Harvey (1989), Forecasting, Structural Time Series Models and the Kalman
-Filter, sections 2.3 (local levels and trends, cycles); van Loan (1978) for Q.
+A `Signal` gives F and Q of any step, so each step of a record may have its own length. `filters.models` has those
+with a name.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -161,197 +157,9 @@ def _polynomials(terms: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return (powers @ terms.reshape(*leading, count, n * n)).reshape(*leading, len(lengths), n, n)
 
 
-def _integrators(count: int, densities: tuple[float, ...], symbols: tuple[str, ...]) -> Signal:
-    """A chain x_1' = x_2, x_2' = x_3, ..., of which the first is measured."""
-    units = ("U", "U/s", "U/s^2")
-    states = tuple(zip(symbols, units[:count], strict=True))
-    orders = tuple(range(count))
-    return Signal(np.eye(count, k=1), np.diag(densities), np.eye(count)[0], states, orders, _anywhere(count))
-
-
-def _anywhere(count: int) -> np.ndarray:
+def anywhere(count: int) -> np.ndarray:
     """The first covariance of states that may begin anywhere."""
     return np.diag(np.full(count, np.inf))
-
-
-def constant(drift: float) -> Signal:
-    """A level that drifts as a random walk: the local level model.
-
-        dx/dt = w,  Q = drift dt
-
-    Args:
-        drift: density of the white noise [U^2/s].
-    """
-    return _integrators(1, (drift,), ("level",))
-
-
-def constant_velocity(acceleration: float) -> Signal:
-    """A position whose velocity changes by white-noise acceleration.
-
-        Q = acceleration [[dt^3/3, dt^2/2], [dt^2/2, dt]]
-
-    Args:
-        acceleration: density of the white acceleration [U^2/s^3].
-    """
-    return _integrators(2, (0.0, acceleration), ("position", "velocity"))
-
-
-def constant_acceleration(jerk: float) -> Signal:
-    """A position whose acceleration changes by white-noise jerk.
-
-    Args:
-        jerk: density of the white jerk [U^2/s^5].
-    """
-    return _integrators(3, (0.0, 0.0, jerk), ("position", "velocity", "acceleration"))
-
-
-def local_trend(drift: float, trend_drift: float) -> Signal:
-    """A level and its trend, each with noise: the local linear trend.
-
-    Args:
-        drift: density of the level's noise [U^2/s].
-        trend_drift: density of the trend's noise [U^2/s^3].
-    """
-    return _integrators(2, (drift, trend_drift), ("level", "trend"))
-
-
-def ornstein_uhlenbeck(time_constant: float, std: float) -> Signal:
-    """A deviation that returns to the mean: exponentially correlated noise.
-
-        dx/dt = -x/T + w,  S = 2 std^2/T
-
-    Args:
-        time_constant: T [s].
-        std: stationary standard deviation [U].
-    """
-    return Signal(
-        np.array([[-1.0 / time_constant]]),
-        np.array([[2.0 * std**2 / time_constant]]),
-        np.ones(1),
-        (("deviation", "U"),),
-        (0,),
-        np.array([[std**2]]),
-    )
-
-
-def singer(time_constant: float, acceleration_std: float) -> Signal:
-    """A position whose acceleration is exponentially correlated: a target that manoeuvres.
-
-        da/dt = -a/T + w,  S = 2 std^2/T
-
-    Args:
-        time_constant: T of a manoeuvre [s].
-        acceleration_std: stationary standard deviation of the acceleration [U/s^2].
-    """
-    slope = np.eye(3, k=1)
-    slope[2, 2] = -1.0 / time_constant
-    chain = _integrators(
-        3, (0.0, 0.0, 2.0 * acceleration_std**2 / time_constant), ("position", "velocity", "acceleration")
-    )
-    return chain._replace(slope=slope, first=np.diag([np.inf, np.inf, acceleration_std**2]))
-
-
-def oscillator(frequency: float, damping: float, std: float) -> Signal:
-    """A damped oscillation about the mean that white noise excites.
-
-        x'' = -2 zeta w_0 x' - w_0^2 x + w,  w_0 = 2 pi frequency,  S = 4 zeta w_0^3 std^2
-
-    The second state is x'/w_0, so both have the unit of the data.
-
-    Args:
-        frequency: natural frequency [Hz].
-        damping: zeta.
-        std: stationary standard deviation [U].
-    """
-    w = 2.0 * math.pi * frequency
-    return Signal(
-        np.array([[0.0, w], [-w, -2.0 * damping * w]]),
-        np.diag([0.0, 4.0 * damping * w * std**2]),
-        np.array([1.0, 0.0]),
-        (("oscillation", "U"), ("quadrature", "U")),
-        (0, 0),
-        std**2 * np.eye(2),
-    )
-
-
-def harmonics(drift: float, period: float, count: int) -> Signal:
-    """A periodic signal about the mean whose shape drifts: a daily or yearly course.
-
-        x_k'' = -(2 pi k/period)^2 x_k,  k = 1 ... count;  cosine and sine of each drift as random walks
-
-    Args:
-        drift: density of the noise on each cosine and sine [U^2/s].
-        period: [s].
-        count: harmonics; half the samples in a period describe any seasonal pattern.
-
-    Source: Harvey (1989), section 2.3.4.
-    """
-    w = 2.0 * math.pi / period
-    slope = np.kron(np.diag(np.arange(1.0, count + 1.0)), [[0.0, w], [-w, 0.0]])
-    states = [(f"{word}_{k + 1}", "U") for k in range(count) for word in ("harmonic", "quadrature")]
-    output = np.tile([1.0, 0.0], count)
-    orders = (0,) * (2 * count)
-    return Signal(slope, drift * np.eye(2 * count), output, tuple(states), orders, _anywhere(2 * count))
-
-
-def seasonal(drift: float, period: float, seasons: int) -> Signal:
-    """A pattern of as many values in a period, about the mean, that drifts: all of its `harmonics`.
-
-    The last one of an even number has no quadrature, as all its samples would be zero, and twice the density, as
-    half of its noise turns into the quadrature within a sample: Q of each cosine is drift dt.
-
-    Args:
-        drift: density of the noise on each cosine and sine [U^2/s].
-        period: [s].
-        seasons: samples in a period.
-
-    Source: Harvey (1989), section 2.3.4, the trigonometric form.
-    """
-    signal = harmonics(drift, period, seasons // 2)
-    if seasons % 2 == 0:
-        signal.densities[-1, -1] = signal.first[-1, -1] = 0.0
-        signal.densities[-2, -2] *= 2.0
-    return signal
-
-
-def autoregression(std: float, **partials: float) -> Signal:
-    """A deviation from the mean that depends on the last ones, in equal steps.
-
-        x_k = phi_1 x_{k-1} + ... + phi_p x_{k-p} + w_k
-
-    It is stationary for all partial autocorrelations r_i between -1 and 1, from which Durbin's recursion has phi:
-    phi_i,i = r_i, phi_i,j = phi_{i-1,j} - r_i phi_{i-1,i-j}.
-
-    Args:
-        std: stationary standard deviation [U].
-        **partials: r_1 ... r_p.
-
-    Raises:
-        ValueError: for a partial autocorrelation that is not between -1 and 1.
-
-    Source: Durbin (1960), "The fitting of time-series models", Review of the International Statistical Institute
-    28(3); Monahan (1984), "A note on enforcing stationarity in autoregressive-moving average models", Biometrika
-    71(2).
-    """
-    wrong = next((name for name, partial in partials.items() if not abs(partial) < 1.0), None)
-    if wrong is not None:
-        raise ValueError(f"{wrong} must be between -1 and 1, but got {partials[wrong]:g}")
-    p, phi, innovation, correlations = len(partials), np.empty(0), 1.0, [1.0]
-    for partial in partials.values():
-        correlations.append(float(phi @ correlations[:0:-1]) + partial * innovation)
-        phi = np.append(phi - partial * phi[::-1], partial)
-        innovation *= 1.0 - partial**2
-    lags, densities = np.arange(p), np.zeros((p, p))
-    densities[0, 0] = std**2 * innovation
-    return Signal(
-        np.vstack([phi, np.eye(p)[:-1]]),
-        densities,
-        np.eye(p)[0],
-        tuple((f"lag_{i}" if i else "deviation", "U") for i in range(p)),
-        (0,) * p,
-        std**2 * np.array(correlations)[np.abs(lags[:, None] - lags)],
-        tuple(range(p)),
-    )
 
 
 def added(signals: list[Signal]) -> Signal:
@@ -366,12 +174,6 @@ def added(signals: list[Signal]) -> Signal:
         block_diagonal([signal.first for signal in signals]),
         tuple(first + i for signal, first in zip(signals, firsts, strict=True) for i in signal.discrete),
     )
-
-
-def with_level(signal: Signal) -> Signal:
-    """A signal about a level that stays, its last state."""
-    zero = np.zeros((1, 1))
-    return added([signal, Signal(zero, zero, np.ones(1), (("mean", "U"),), (0,), _anywhere(1))])
 
 
 def block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:

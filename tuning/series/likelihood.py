@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.models import Scales, Sum, in_unit
-from filters.signals import Signal, with_level
+from filters.signals import Signal, added, anywhere
 from thruster_env.model.affine import AffineModel
 from tuning.likelihood.ascent import Evaluation
 from tuning.problems.problem import STEP, Coordinates, Parameter, squared
@@ -66,6 +66,12 @@ class Points(NamedTuple):
     densities: np.ndarray  # of the driven states, (g, d)
     first: np.ndarray  # covariances of the first state, (g, n, n)
     noises: np.ndarray  # R, (g,)
+
+
+def with_level(signal: Signal) -> Signal:
+    """A signal about a level that stays, its last state."""
+    zero = np.zeros((1, 1))
+    return added([signal, Signal(zero, zero, np.ones(1), (("mean", "U"),), (0,), anywhere(1))])
 
 
 class ColumnLikelihood:
