@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation as Turned
 
 import filters
 import tuning
-from filters.attitude import attitude
+from filters.inertial import attitude
 from filters.starts import begun_at
 from tests.data.broad import RATE, broad
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation as Turned
 
-from filters.attitude import attitude
+from filters.inertial import attitude
 from thruster_env.logs.read import read_log
 
 DT, ROWS = 0.015, 1500

@@ -1,25 +1,28 @@
-"""The model `heave`: heave, roll and pitch of a vessel from an IMU alone, in a sea of known period.
+"""The model `attitude`: a rotation by gyroscope, accelerometer and magnetometer, with the noise of data sheets.
 
-Rotation, sensors and the horizontal accelerations are those of `filters.attitude`. The displacement d upwards is a
-wave of two oscillators in series, of which noise drives the second:
+The gyroscope is the input; its bias walks. World axes are east, north, up, with magnetic north. The acceleration
+of the sensor on each world axis is an oscillation without a mean, as that of whatever stays in a room, on a body
+or on a vessel:
 
-    d'' + 2 zeta w d' + w^2 d = e',   e'' + 2 zeta w e' + w^2 e = white noise,   w = 2 pi/T,   std d = H_s/4
-    accelerometer:  R(q)' ((a_e, a_n, d'') + g) + (0, 0, b) + noise
+    q(t + dt) = q exp((u - b) dt),   b' = w_b,   o'' + 2 zeta w_0 o' + w_0^2 o = w_o,   a = o'/w_0
+    accelerometer:  R(q)' (a + g) + noise,   magnetometer:  R(q)' B (0, cos(dip), -sin(dip)) + noise
 
-It has no power at zero frequency, by e' in place of e, so that nothing drifts and no measurement of it is made up.
-One filter has attitude and heave together, and their covariances.
+Likelihood is a trap where the acceleration is not that of the model: it is higher with more noise of the
+gyroscope, which then pays for what the acceleration does, and attitudes are worse. So the gyroscope's two numbers
+are those of its data sheet or of a record at rest, and `FREE` are the others. An acceleration with power at zero
+frequency, such as white noise or a first-order process, is taken for a tilt.
 
-Source: Fossen (2011), "Handbook of Marine Craft Hydrodynamics and Motion Control", section 8.2, of one oscillator;
-the second makes the acceleration's power finite.
+Sources: Hertzberg, Wagner, Frese, Schroeder (2013), of `thruster_env.model.turns`; noise densities: IEEE Std 952
+(1997), annex C. The acceleration is that of a sea state's heave, as in Fossen (2011), section 8.2.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from filters.attitude import AXES, FIRST_BIAS, GRAVITY, UNKNOWN, WORLD
 from filters.models import oscillator
 from filters.signals import block_diagonal
 from thruster_env.core.checks import finite, positive
@@ -29,6 +32,115 @@ from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import Rotation
 
+GRAVITY = 9.81  # [m/s^2]
+UNKNOWN = 2.0  # standard deviation of the first attitude on each axis [rad], which is none
+FIRST_BIAS = 0.02  # of a gyroscope [rad/s]
+AXES = "xyz"
+WORLD = ("east", "north", "up")
+# What a log of motion determines.
+FREE = ("accelerometer", "magnetometer", "acceleration", "frequency", "damping", "field", "dip", "gravity")
+
+
+class Sensors(NamedTuple):
+    """Numbers of f and h: the step of an oscillation (o, a), and what sensors at rest measure."""
+
+    dt: float
+    o_by_o: float
+    o_by_a: float
+    a_by_o: float
+    a_by_a: float
+    gravity: float
+    north: float
+    up: float
+
+
+def _turn(x, u, c):
+    q = rotations.product(x[:4], rotations.exponential(tuple((u[i] - x[4 + i]) * c.dt for i in range(3))))
+    oscillation = tuple(c.o_by_o * x[7 + i] + c.o_by_a * x[10 + i] for i in range(3))
+    return *q, *x[4:7], *oscillation, *(c.a_by_o * x[7 + i] + c.a_by_a * x[10 + i] for i in range(3))
+
+
+def _sense(x, c):
+    accelerometer = rotations.to_body(x[:4], (x[10], x[11], x[12] + c.gravity))
+    return *accelerometer, *rotations.to_body(x[:4], (0.0, c.north, c.up))
+
+
+def attitude(
+    dt: float = 0.01,
+    gyroscope: float = 2e-4,
+    bias_walk: float = 1e-5,
+    accelerometer: float = 0.02,
+    magnetometer: float = 1.0,
+    acceleration: float = 1.0,
+    frequency: float = 1.0,
+    damping: float = 0.3,
+    field: float = 50.0,
+    dip: float = 60.0,
+    gravity: float = GRAVITY,
+) -> StateSpaceModel:
+    """A rotation with the bias of its gyroscope, and an acceleration that oscillates; the file has the equations.
+
+    P and Q are of errors of the body: a rotation vector [rad], then bias, oscillation and acceleration. The prior
+    knows no attitude: `filters.starts.begun_at` begins at that of the first measurement.
+
+    Args:
+        dt: sample time [s].
+        gyroscope: noise density of the gyroscope, its angle random walk [rad/s/sqrt(Hz)].
+        bias_walk: density of its bias's rate, the rate random walk [rad/s^2/sqrt(Hz)].
+        accelerometer: deviation of a sample of the accelerometer [m/s^2].
+        magnetometer: deviation of a sample of the magnetometer [uT].
+        acceleration: deviation of the sensor's acceleration on each axis [m/s^2].
+        frequency: of the acceleration [Hz].
+        damping: its damping ratio.
+        field: magnetic field strength B [uT], or whatever unit the magnetometer has.
+        dip: angle of the field below the horizon [deg].
+        gravity: g [m/s^2], as the accelerometer measures it.
+
+    Raises:
+        ValueError: if a number is not positive, but for the dip.
+    """
+    dt = positive("dt", dt)
+    swing = oscillator(
+        *(
+            positive(name, value)
+            for name, value in (("frequency", frequency), ("damping", damping), ("acceleration", acceleration))
+        )
+    )
+    step, pair = swing.step(dt)
+    turning = positive("gyroscope", gyroscope) ** 2 * dt
+    walk = positive("bias_walk", bias_walk) ** 2
+    gyro = np.array([[turning + walk * dt**3 / 3.0, -walk * dt**2 / 2.0], [-walk * dt**2 / 2.0, walk * dt]])
+    inclination, strength = math.radians(finite("dip", dip)), positive("field", field)
+    at_rest = positive("gravity", gravity), strength * math.cos(inclination), -strength * math.sin(inclination)
+    noise = np.zeros((12, 12))
+    noise[:6, :6], noise[6:, 6:] = np.kron(gyro, np.eye(3)), np.kron(pair, np.eye(3))
+    prior = [UNKNOWN] * 3 + [FIRST_BIAS] * 3
+    return StateSpaceModel(
+        transition=_turn,
+        observe=_sense,
+        process_noise_cov=noise,
+        measurement_noise_cov=[positive("accelerometer", accelerometer) ** 2] * 3
+        + [positive("magnetometer", magnetometer) ** 2] * 3,
+        prior_mean=[1.0] + [0.0] * 12,
+        prior_cov=[deviation**2 for deviation in prior] + [acceleration**2] * 6,
+        constants=Sensors._make([dt, *step.ravel().tolist(), *at_rest]),
+        states=(
+            Rotation("attitude"),
+            *(Quantity(f"gyroscope bias {axis}", f"b_{axis}", "rad/s") for axis in AXES),
+            *(Quantity(f"oscillation {axis}", f"o_{axis[0]}", "m/s^2") for axis in WORLD),
+            *(Quantity(f"acceleration {axis}", f"a_{axis[0]}", "m/s^2") for axis in WORLD),
+        ),
+        input_quantities=[Quantity(f"gyroscope {axis}", f"gyr_{axis}", "rad/s") for axis in AXES],
+        measurements=[
+            *(Quantity(f"accelerometer {axis}", f"acc_{axis}", "m/s^2") for axis in AXES),
+            *(Quantity(f"magnetometer {axis}", f"mag_{axis}", "uT") for axis in AXES),
+        ],
+    )
+
+
+attitude.free = FREE  # type: ignore[attr-defined]  # of `tuning.identify`, where no parameter is named
+
+
 SWAY, WAVE, BIAS = 7, 11, 15  # offsets of horizontal motion, the wave and the accelerometer's bias, as stored
 GYRO_WALK, BIAS_WALK = 1e-6, 3e-5  # root densities [rad/s^2/sqrt(Hz)], [m/s^3/sqrt(Hz)]
 
@@ -37,7 +149,7 @@ GYRO_WALK, BIAS_WALK = 1e-6, 3e-5  # root densities [rad/s^2/sqrt(Hz)], [m/s^3/s
 # wave's first two states, gravity, and the field to the north and upwards.
 
 
-def _turn(x, u, c):
+def _move(x, u, c):
     q = rotations.product(x[:4], rotations.exponential(tuple((u[i] - x[4 + i]) * c[0] for i in range(3))))
     sways = tuple(
         c[1 + 2 * row] * x[SWAY + i] + c[2 + 2 * row] * x[SWAY + 2 + i] for row in range(2) for i in range(2)
@@ -46,7 +158,7 @@ def _turn(x, u, c):
     return *q, *x[4:7], *sways, *wave, *x[BIAS:]
 
 
-def _sense(x, c):
+def _measure(x, c):
     upwards = c[21] * x[WAVE] + c[22] * x[WAVE + 1] + x[WAVE + 3] + c[23]
     force = rotations.to_body(x[:4], (x[SWAY + 2], x[SWAY + 3], upwards))
     field = rotations.to_body(x[:4], (0.0, c[24], c[25]))
@@ -125,8 +237,8 @@ def heave(
     wave = zip(("heave", "heave velocity", "wave", "wave's rate"), ("heave", "v_u", "e", "a_u"), strict=True)
     units = "m", "m/s", "m/s", "m/s^2"
     return StateSpaceModel(
-        transition=_turn,
-        observe=_sense,
+        transition=_move,
+        observe=_measure,
         process_noise_cov=block_diagonal(noise),
         measurement_noise_cov=[positive("accelerometer", accelerometer) ** 2] * 3
         + [positive("magnetometer", magnetometer) ** 2] * 3,
