@@ -1,8 +1,8 @@
-"""The model `attitude`: a rotation by gyroscope, accelerometer and magnetometer, with the noise of data sheets.
+"""Models of inertial sensors: `attitude` of a body, and `heave`, roll and pitch of a vessel in waves.
 
-The gyroscope is the input; its bias walks. World axes are east, north, up, with magnetic north. The acceleration
-of the sensor on each world axis is an oscillation without a mean, as that of whatever stays in a room, on a body
-or on a vessel:
+**attitude**: a rotation by gyroscope, accelerometer and magnetometer, with the noise of data sheets. The gyroscope
+is the input; its bias walks. World axes are east, north, up, with magnetic north. The acceleration of the sensor on
+each world axis is an oscillation without a mean, as that of whatever stays in a room, on a body or on a vessel:
 
     q(t + dt) = q exp((u - b) dt),   b' = w_b,   o'' + 2 zeta w_0 o' + w_0^2 o = w_o,   a = o'/w_0
     accelerometer:  R(q)' (a + g) + noise,   magnetometer:  R(q)' B (0, cos(dip), -sin(dip)) + noise
@@ -12,8 +12,18 @@ gyroscope, which then pays for what the acceleration does, and attitudes are wor
 are those of its data sheet or of a record at rest, and `FREE` are the others. An acceleration with power at zero
 frequency, such as white noise or a first-order process, is taken for a tilt.
 
+**heave** has the same rotation, sensors and horizontal accelerations. The displacement d upwards is a wave of two
+oscillators in series, of which noise drives the second:
+
+    d'' + 2 zeta w d' + w^2 d = e',   e'' + 2 zeta w e' + w^2 e = white noise,   w = 2 pi/T,   std d = H_s/4
+    accelerometer:  R(q)' ((a_e, a_n, d'') + g) + (0, 0, b) + noise
+
+It has no power at zero frequency, by e' in place of e, so that nothing drifts and no measurement of it is made up.
+One filter has attitude and heave together, and their covariances.
+
 Sources: Hertzberg, Wagner, Frese, Schroeder (2013), of `thruster_env.model.turns`; noise densities: IEEE Std 952
-(1997), annex C. The acceleration is that of a sea state's heave, as in Fossen (2011), section 8.2.
+(1997), annex C. The accelerations are those of a sea state's heave, as in Fossen (2011), "Handbook of Marine Craft
+Hydrodynamics and Motion Control", section 8.2, of one oscillator; heave's second makes the power finite.
 """
 
 from __future__ import annotations
@@ -37,6 +47,13 @@ UNKNOWN = 2.0  # standard deviation of the first attitude on each axis [rad], wh
 FIRST_BIAS = 0.02  # of a gyroscope [rad/s]
 AXES = "xyz"
 WORLD = ("east", "north", "up")
+GYROSCOPE = tuple(Quantity(f"gyroscope {axis}", f"gyr_{axis}", "rad/s") for axis in AXES)
+MEASURED = (
+    *(Quantity(f"accelerometer {axis}", f"acc_{axis}", "m/s^2") for axis in AXES),
+    *(Quantity(f"magnetometer {axis}", f"mag_{axis}", "uT") for axis in AXES),
+)
+TURNING = (Rotation("attitude"), *(Quantity(f"gyroscope bias {axis}", f"b_{axis}", "rad/s") for axis in AXES))
+FIRST = [UNKNOWN**2] * 3 + [FIRST_BIAS**2] * 3  # variances of these
 # What a log of motion determines.
 FREE = ("accelerometer", "magnetometer", "acceleration", "frequency", "damping", "field", "dip", "gravity")
 
@@ -52,6 +69,24 @@ class Sensors(NamedTuple):
     gravity: float
     north: float
     up: float
+
+
+def _gyroscope_noise(density: float, walk: float, dt: float) -> np.ndarray:
+    """Q (6, 6) of rotation and bias in a step, by the densities of a gyroscope's noise and of its bias's rate."""
+    turning, walk = positive("gyroscope", density) ** 2 * dt, walk**2
+    each = [[turning + walk * dt**3 / 3.0, -walk * dt**2 / 2.0], [-walk * dt**2 / 2.0, walk * dt]]
+    return np.kron(each, np.eye(3))
+
+
+def _sensor_variances(accelerometer: float, magnetometer: float) -> list[float]:
+    accelerometer, magnetometer = positive("accelerometer", accelerometer), positive("magnetometer", magnetometer)
+    return [accelerometer**2] * 3 + [magnetometer**2] * 3
+
+
+def _at_rest(gravity: float, field: float, dip: float) -> tuple[float, float, float]:
+    """What sensors measure that stand still: gravity, and the field to the north and upwards."""
+    inclination, strength = math.radians(finite("dip", dip)), positive("field", field)
+    return positive("gravity", gravity), strength * math.cos(inclination), -strength * math.sin(inclination)
 
 
 def _turn(x, u, c):
@@ -107,34 +142,22 @@ def attitude(
         )
     )
     step, pair = swing.step(dt)
-    turning = positive("gyroscope", gyroscope) ** 2 * dt
-    walk = positive("bias_walk", bias_walk) ** 2
-    gyro = np.array([[turning + walk * dt**3 / 3.0, -walk * dt**2 / 2.0], [-walk * dt**2 / 2.0, walk * dt]])
-    inclination, strength = math.radians(finite("dip", dip)), positive("field", field)
-    at_rest = positive("gravity", gravity), strength * math.cos(inclination), -strength * math.sin(inclination)
-    noise = np.zeros((12, 12))
-    noise[:6, :6], noise[6:, 6:] = np.kron(gyro, np.eye(3)), np.kron(pair, np.eye(3))
-    prior = [UNKNOWN] * 3 + [FIRST_BIAS] * 3
+    gyro = _gyroscope_noise(gyroscope, positive("bias_walk", bias_walk), dt)
     return StateSpaceModel(
         transition=_turn,
         observe=_sense,
-        process_noise_cov=noise,
-        measurement_noise_cov=[positive("accelerometer", accelerometer) ** 2] * 3
-        + [positive("magnetometer", magnetometer) ** 2] * 3,
+        process_noise_cov=block_diagonal([gyro, np.kron(pair, np.eye(3))]),
+        measurement_noise_cov=_sensor_variances(accelerometer, magnetometer),
         prior_mean=[1.0] + [0.0] * 12,
-        prior_cov=[deviation**2 for deviation in prior] + [acceleration**2] * 6,
-        constants=Sensors._make([dt, *step.ravel().tolist(), *at_rest]),
+        prior_cov=FIRST + [acceleration**2] * 6,
+        constants=Sensors._make([dt, *step.ravel().tolist(), *_at_rest(gravity, field, dip)]),
         states=(
-            Rotation("attitude"),
-            *(Quantity(f"gyroscope bias {axis}", f"b_{axis}", "rad/s") for axis in AXES),
+            *TURNING,
             *(Quantity(f"oscillation {axis}", f"o_{axis[0]}", "m/s^2") for axis in WORLD),
             *(Quantity(f"acceleration {axis}", f"a_{axis[0]}", "m/s^2") for axis in WORLD),
         ),
-        input_quantities=[Quantity(f"gyroscope {axis}", f"gyr_{axis}", "rad/s") for axis in AXES],
-        measurements=[
-            *(Quantity(f"accelerometer {axis}", f"acc_{axis}", "m/s^2") for axis in AXES),
-            *(Quantity(f"magnetometer {axis}", f"mag_{axis}", "uT") for axis in AXES),
-        ],
+        input_quantities=GYROSCOPE,
+        measurements=MEASURED,
     )
 
 
@@ -222,17 +245,10 @@ def heave(
         1.0 / period, damping, std * math.sqrt(slope[1] @ stationary @ slope[1] / stationary[0, 0])
     )
     sway, sway_noise = swaying.step(dt)
-    walk, bias = GYRO_WALK**2, positive("accelerometer_bias", accelerometer_bias)
-    gyro = [
-        [positive("gyroscope", gyroscope) ** 2 * dt + walk * dt**3 / 3.0, -walk * dt**2 / 2.0],
-        [-walk * dt**2 / 2.0, walk * dt],
-    ]
+    bias, gyro = positive("accelerometer_bias", accelerometer_bias), _gyroscope_noise(gyroscope, GYRO_WALK, dt)
     wave_noise = scale * noise_of_densities(density, slope, dt)
-    noise = np.kron(gyro, np.eye(3)), np.kron(sway_noise, np.eye(2)), wave_noise, BIAS_WALK**2 * dt * np.eye(1)
-    first = np.diag([UNKNOWN**2] * 3 + [FIRST_BIAS**2] * 3)
-    prior = first, np.kron(swaying.first, np.eye(2)), scale * stationary, bias**2 * np.eye(1)
-    inclination, strength = math.radians(finite("dip", dip)), positive("field", field)
-    at_rest = positive("gravity", gravity), strength * math.cos(inclination), -strength * math.sin(inclination)
+    noise = gyro, np.kron(sway_noise, np.eye(2)), wave_noise, BIAS_WALK**2 * dt * np.eye(1)
+    prior = np.diag(FIRST), np.kron(swaying.first, np.eye(2)), scale * stationary, bias**2 * np.eye(1)
     steps = np.concatenate([sway.ravel(), expm(slope * dt).ravel(), slope[1, :2]])
     wave = zip(("heave", "heave velocity", "wave", "wave's rate"), ("heave", "v_u", "e", "a_u"), strict=True)
     units = "m", "m/s", "m/s", "m/s^2"
@@ -240,24 +256,19 @@ def heave(
         transition=_move,
         observe=_measure,
         process_noise_cov=block_diagonal(noise),
-        measurement_noise_cov=[positive("accelerometer", accelerometer) ** 2] * 3
-        + [positive("magnetometer", magnetometer) ** 2] * 3,
+        measurement_noise_cov=_sensor_variances(accelerometer, magnetometer),
         prior_mean=[1.0] + [0.0] * 15,
         prior_cov=block_diagonal(prior),
-        constants=(dt, *steps.tolist(), *at_rest),
+        constants=(dt, *steps.tolist(), *_at_rest(gravity, field, dip)),
         states=(
-            Rotation("attitude"),
-            *(Quantity(f"gyroscope bias {axis}", f"b_{axis}", "rad/s") for axis in AXES),
+            *TURNING,
             *(Quantity(f"oscillation {axis}", f"o_{axis[0]}", "m/s^2") for axis in WORLD[:2]),
             *(Quantity(f"acceleration {axis}", f"a_{axis[0]}", "m/s^2") for axis in WORLD[:2]),
             *(Quantity(name, symbol, unit) for (name, symbol), unit in zip(wave, units, strict=True)),
             Quantity("accelerometer bias z", "b_a", "m/s^2"),
         ),
-        input_quantities=[Quantity(f"gyroscope {axis}", f"gyr_{axis}", "rad/s") for axis in AXES],
-        measurements=[
-            *(Quantity(f"accelerometer {axis}", f"acc_{axis}", "m/s^2") for axis in AXES),
-            *(Quantity(f"magnetometer {axis}", f"mag_{axis}", "uT") for axis in AXES),
-        ],
+        input_quantities=GYROSCOPE,
+        measurements=MEASURED,
         outputs={
             "roll": (Quantity("roll", "roll", "rad"), _roll),
             "pitch": (Quantity("pitch", "pitch", "rad"), _pitch),

@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.inertial import attitude
-from filters.inertial import heave
+from filters.inertial import attitude, heave
 from thruster_env.core.checks import one_of, positive, short_repr
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.model.continuous import ContinuousModel

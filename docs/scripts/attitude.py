@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import filters
-from filters.inertial import GRAVITY
-from filters.inertial import WAVE, heave
+from filters.inertial import GRAVITY, WAVE, heave
 from filters.starts import begun_at
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.model import rotations
