@@ -16,6 +16,7 @@ import numpy as np
 
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.checks import finite, positive
+from thruster_env.core.compiled import as_function, as_made
 from thruster_env.core.derivatives import step_growth, step_of
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import (
@@ -30,7 +31,6 @@ from thruster_env.core.sources import (
     vector_part,
     written_out,
 )
-from thruster_env.core.user_functions import as_function, as_made
 from thruster_env.model.affine import AffineModel, affine_model
 from thruster_env.model.quantities import Bound, Output, Quantity, checked_bounds
 from thruster_env.model.shape import constants_are_array

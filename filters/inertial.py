@@ -1,8 +1,8 @@
 """Models of inertial sensors: `attitude` of a body, and `heave`, roll and pitch of a vessel in waves.
 
 **attitude**: a rotation by gyroscope, accelerometer and magnetometer, with the noise of data sheets. The gyroscope
-is the input; its bias walks. World axes are east, north, up, with magnetic north. The acceleration of the sensor on
-each world axis is an oscillation without a mean, as that of whatever stays in a room, on a body or on a vessel:
+is the input; its bias walks. World axes are east, north, up, with magnetic north. The acceleration of the sensor
+on each world axis is an oscillation without a mean, as that of whatever stays in a room, on a body or on a vessel:
 
     q(t + dt) = q exp((u - b) dt),   b' = w_b,   o'' + 2 zeta w_0 o' + w_0^2 o = w_o,   a = o'/w_0
     accelerometer:  R(q)' (a + g) + noise,   magnetometer:  R(q)' B (0, cos(dip), -sin(dip)) + noise

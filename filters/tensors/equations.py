@@ -32,8 +32,8 @@ from filters.tensors.stages import (
     Stages,
     where,
 )
+from thruster_env.core.compiled import needs_floats
 from thruster_env.core.sources import is_array
-from thruster_env.core.user_functions import needs_floats
 from thruster_env.graphs.folding import POSITIVE, as_single
 from thruster_env.graphs.graphs import COMPARISONS, Graph, Number, needed_by
 from thruster_env.graphs.programs import Place

@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from thruster_env.core.compiled import OURS, Made, as_function, as_made, is_plain, names_read, remember
 from thruster_env.core.sources import made_here
-from thruster_env.core.user_functions import OURS, Made, as_function, as_made, is_plain, names_read, remember
 
 EXACT = bool | int | str | bytes | None  # compared by type and value
 CHANGES_OTHERS = {"STORE_GLOBAL", "DELETE_GLOBAL"}

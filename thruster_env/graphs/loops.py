@@ -29,10 +29,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 
-from thruster_env.core.compiled import FASTMATH, IN_PYTHON, is_interpreting
+from thruster_env.core.compiled import FASTMATH, IN_PYTHON, OURS, is_interpreting
 from thruster_env.core.modules import error_line
 from thruster_env.core.streams import fill_in_loop
-from thruster_env.core.user_functions import OURS
 from thruster_env.graphs.arithmetic import OnlyPython, Untranslated, is_known
 from thruster_env.graphs.arrays import LAPACK, POINTER, Memory, of_lapack
 from thruster_env.graphs.expressions import FILL_NORMALS, ByAddress, Expressions, Functions

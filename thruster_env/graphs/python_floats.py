@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.core.compiled import rounds
-from thruster_env.core.user_functions import (
+from thruster_env.core.compiled import (
     Copies,
     Module,
     caught,
     functions_in,
     inverts,
     needs_python,
+    rounds,
     takes_roots,
 )
 from thruster_env.graphs.tracing import OTHER_NAMES

@@ -22,8 +22,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from thruster_env.core.compiled import Copies, Module, needs_floats
 from thruster_env.core.streams import nearest_whole
-from thruster_env.core.user_functions import Copies, Module, needs_floats
 from thruster_env.graphs.branches import on_every_side
 from thruster_env.graphs.folding import worked_out
 from thruster_env.graphs.graphs import UNARY, Number, arctan2, where

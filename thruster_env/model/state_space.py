@@ -17,11 +17,11 @@ from typing import Any, Self
 import numpy as np
 
 from thruster_env.core.checks import as_floats, at_least, covariance, covariance_root, one_of, short_repr, vector
+from thruster_env.core.compiled import as_function, as_made
 from thruster_env.core.derivatives import by_complex_step, complex_step
 from thruster_env.core.equal_functions import first_equal
 from thruster_env.core.modules import error_line
 from thruster_env.core.sources import as_value, is_array
-from thruster_env.core.user_functions import as_function, as_made
 from thruster_env.graphs.python_floats import with_floats
 from thruster_env.model.quantities import (
     Positions,

@@ -15,12 +15,22 @@ from typing import Any
 
 import numpy as np
 
-from thruster_env.core.compiled import FASTMATH, Instead, compiled_in_place_of, fastmath_of, with_callees
+from thruster_env.core.compiled import (
+    FASTMATH,
+    Instead,
+    compiled_in_place_of,
+    fastmath_of,
+    functions_in,
+    is_copy,
+    needs_python,
+    stand_in,
+    stands_for,
+    with_callees,
+)
 from thruster_env.core.derivatives import by_complex_step
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.modules import error_line
 from thruster_env.core.sources import as_array, is_array, made_here, matrix_of, tuple_of, written_out
-from thruster_env.core.user_functions import functions_in, is_copy, needs_python, stand_in, stands_for
 from thruster_env.graphs.branches import along, on_every_side
 from thruster_env.graphs.graphs import Graph, Number, TooLarge
 from thruster_env.graphs.programs import OF_STEPS, Place, Program, callable_of, program_of, values_of

@@ -10,9 +10,8 @@ import pytest
 import filters
 from filters import StateSpaceModel, make_filter, run
 from filters.c.programs import programs_of
-from thruster_env.core.compiled import interpreted
+from thruster_env.core.compiled import caught, functions_in, interpreted, inverts, needs_floats, needs_python
 from thruster_env.core.streams import filter_keys
-from thruster_env.core.user_functions import caught, functions_in, inverts, needs_floats, needs_python
 from thruster_env.graphs.python_floats import Floats, in_python
 
 Z = np.array([0.3, 0.2, 0.5, 0.1])[None, :, None]
