@@ -10,7 +10,7 @@ import numpy as np
 
 from filters.engine.belief import Belief, vector_like
 from filters.engine.session import Session
-from filters.monitoring.monitor import Alarm, Health, Monitor, monitor_of, watch_of
+from filters.monitoring import Alarm, Health, Monitor, monitor_of, watch_of
 from filters.starts import FirstRestart, Restarts
 from thruster_env.core.checks import as_floats, finite, one_of, positive, short_repr
 from thruster_env.logs.grid import closeness, count_steps, resolution_of

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from filters.monitoring.monitor import MEANING, TESTS, Monitor
+from filters.monitoring import MEANING, TESTS, Monitor
 from thruster_env.graphs.programs import literal
 
 LARGEST = {False: 1e100, True: 1e15}  # of normalised innovations, in double and in single precision

@@ -19,7 +19,7 @@ from filters.c.monitor import TestsWriter
 from filters.c.programs import FilterPrograms, is_macro, is_name, programs_of
 from filters.c.writer import EnsembleWriter, Writer
 from filters.filter import Filter
-from filters.monitoring.monitor import Monitor, monitor_of
+from filters.monitoring import Monitor, monitor_of
 from thruster_env.core.files import check_target, write_whole
 from thruster_env.model.turns import refuse_rotations
 

@@ -19,7 +19,7 @@ from scipy.special import chdtri
 
 from filters.consistency.nees import LAGS, Whiteness, blow_up_sentence, root_mean_square, whitened, whiteness_of
 from filters.logs.estimate import SKIPPED, LogEstimate, estimate_with
-from filters.monitoring.monitor import Alarm, Monitor
+from filters.monitoring import Alarm, Monitor
 from thruster_env.core.angles import difference, with_breaks, wrapped
 from thruster_env.core.checks import at_least
 from thruster_env.core.files import (

@@ -19,7 +19,7 @@ from filters.engine.batch import Beliefs
 from filters.engine.belief import checked_actions
 from filters.estimators.foreign import Estimator, EstimatorBeliefs, ForeignFilter
 from filters.filter import Filter
-from filters.monitoring.monitor import Monitor, monitor_of, watch_of
+from filters.monitoring import Monitor, monitor_of, watch_of
 from filters.named import NamedMaker, model_named
 from filters.smoothers.smooth import WithSmoother
 from filters.starts import FirstRestart, FirstRestarts

@@ -9,8 +9,7 @@ from filters import run, thruster_model
 from filters.c.project import c_filter, sizes_of, write_project
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import alarms_of, columns_of
-from filters.monitoring import Monitor
-from filters.monitoring.monitor import TESTS
+from filters.monitoring import TESTS, Monitor
 from tests.filters.test_c import SANITIZERS, WARNINGS, log_of, made
 from tests.filters.test_filter_paths import diverging
 from tests.models import lonely_model, simulated, wide_model

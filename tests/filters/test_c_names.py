@@ -7,7 +7,7 @@ import pytest
 
 from filters import make_filter
 from filters.c.project import c_filter, write_project
-from filters.monitoring.monitor import monitor_of
+from filters.monitoring import monitor_of
 from tests.models import scalar_model, state_space
 
 TAKEN = """exp R propagate NAN new class double_t correct add_process_noise filter x u z t0 i P prior_mean line

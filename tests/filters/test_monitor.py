@@ -9,10 +9,10 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers its envs
 from filters import EstimateState, EstimateStates
+from filters import monitoring as of_monitors
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import alarms_of, columns_of, episodes
-from filters.monitoring import monitor as of_monitors
-from filters.monitoring.monitor import (
+from filters.monitoring import (
     TESTS,
     Alarm,
     Monitor,

@@ -6,8 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from filters.monitoring import Monitor, tuned_monitor
-from filters.monitoring.monitor import monitor_for
+from filters.monitoring import Monitor, monitor_for, tuned_monitor
 from tests.tuned_files import rewrite, write_untuned
 from tuning.evaluation.tuned import monitor_data
 

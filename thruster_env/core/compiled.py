@@ -1,4 +1,4 @@
-"""A user's functions as code: what they call and read, copies with other names bound, and whether they are compiled.
+"""A user's functions as code: what they call and read, copies with other names bound, whether they are compiled.
 
 Code is read where a call would not tell: whether a function catches exceptions, which machine code does not raise,
 or asks whether a comparison `is True`, which holds for Python's truth values alone.

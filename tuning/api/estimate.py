@@ -29,7 +29,7 @@ from filters.logs.findings import (
     findings,
     verdict,
 )
-from filters.monitoring.monitor import Alarm, Monitor, monitor_of, tuned_monitor
+from filters.monitoring import Alarm, Monitor, monitor_of, tuned_monitor
 from thruster_env.core.checks import short_repr
 from thruster_env.core.files import save_figure
 from thruster_env.core.text_tables import Table

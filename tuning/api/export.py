@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from filters.c.programs import programs_of, single_error
 from filters.c.project import c_filter, write_filter, write_project
-from filters.monitoring.monitor import Monitor, monitor_of
+from filters.monitoring import Monitor, monitor_of
 from thruster_env.core.checks import one_of
 from thruster_env.core.files import check_target
 from tuning.api.estimate import monitor_for

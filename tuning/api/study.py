@@ -11,7 +11,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.estimators.foreign import label_of
 from filters.filter import Filter
-from filters.monitoring.monitor import Monitor
+from filters.monitoring import Monitor
 from filters.registry import filter_type
 from thruster_env.core.text_tables import Table
 from thruster_env.model.state_space import StateSpaceModel

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from filters.estimators.foreign import is_foreign, label_of
-from filters.monitoring.monitor import THRESHOLDS, Monitor, monitor_for
+from filters.monitoring import THRESHOLDS, Monitor, monitor_for
 from filters.tuned_file import (
     AUGMENTED,
     FACTORS,

@@ -11,7 +11,7 @@ import numpy as np
 
 from filters.engine.batch import run
 from filters.filter import Filter
-from filters.monitoring.monitor import TESTS, Monitor, cusum_run_length, cusum_threshold
+from filters.monitoring import TESTS, Monitor, cusum_run_length, cusum_threshold
 from filters.registry import make_filter
 from thruster_env.core.streams import filter_keys
 from thruster_env.core.text_tables import markdown_table

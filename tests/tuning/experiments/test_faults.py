@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from filters.monitoring.monitor import cusum_threshold
+from filters.monitoring import cusum_threshold
 from tuning.experiments.faults import BIASES, LOST_BLADES, PLANTS, best_delay, delays
 
 
