@@ -31,7 +31,7 @@ CAPTION = (
 PARTS = {  # with the modules and functions that measure their rows
     **{"steps": "steps.rows", "vectors": "steps.vector_rows", "vector_filters": "steps.vector_filter_rows"},
     **{"batches": "batches.rows", "c_code": "c_code.rows", "horizon": "steps.horizon_rows"},
-    **{"vehicles": "vehicles.rows", "trajectories": "batches.trajectory_rows", "studies": "studies.rows"},
+    **{"vehicles": "steps.vehicle_rows", "trajectories": "batches.trajectory_rows", "studies": "studies.rows"},
     **{"assimilation": "studies.assimilation_rows", "policies": "policies.rows", "processes": "first_use.rows"},
     "peers": "peers.rows",
 }
