@@ -37,7 +37,6 @@ from filters.algebra.tangents import differences, local_at
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.pages.kernels import Stage, as_calls, as_programs, as_tuple, stage_of, with_extras
 from filters.pages.page import Equations, NumbersMemory, Page, PagedModel
-from thruster_env.core.compiled import is_interpreting
 from thruster_env.graphs.graphs import uncollected
 from thruster_env.graphs.programs import Place, callable_of
 from thruster_env.model.shape import (
@@ -190,14 +189,10 @@ class Recursion(NamedTuple):
         return (self.length * self.at_once,), changes, (parameters, parameters, self.at_once), (self.at_once,)
 
 
-def recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page = EXTENDED) -> Recursion:
-    """The recursion of a filter's page for a model's functions and sizes."""
-    return _recursion_of(functions, shape, wanted, page, is_interpreting())
-
-
 @lru_cache(maxsize=64)
 @uncollected()
-def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page, interpreting: bool) -> Recursion:
+def recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page, interpreting: bool) -> Recursion:
+    """The recursion of a filter's page for a model's functions and sizes; interpreting or not is one each."""
     memory = Memory(shape, page)
     try:
         model = Equations(functions, memory, constants_move=wanted.constants, trace=True)

@@ -30,6 +30,7 @@ from filters.pages.page import Page
 from filters.starts import Starts, as_the_prior_says
 from thruster_env.core.angles import wrapped_where
 from thruster_env.core.checks import as_floats, one_of
+from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.parallel import spread
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import of_channels, refuse_rotations
@@ -196,7 +197,7 @@ class RepeatedRuns:
             raise ValueError("predicted must be false for measurements with rotations, but some channels are true")
         begun = as_the_prior_says(model, len(measurements)) if starts is None else starts
         states, weights = truth or Truth(np.zeros((len(measurements), 0, 0)), np.zeros(0))
-        self._recursion = recursion_of(model.functions, model.any_shape, wanted, page)
+        self._recursion = recursion_of(model.functions, model.any_shape, wanted, page, is_interpreting())
         self._blocks, self._informative = blocks, wanted.information
         turns = 1 if (density.seen > 0).all() else 2  # channels that are predicted only come after the others
         tails = [tail_of(np.inf, m), tail_of(density.degrees, m)]

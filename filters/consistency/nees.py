@@ -224,11 +224,6 @@ def gaussian_crps(errors: np.ndarray, deviations: np.ndarray) -> np.ndarray:
     return np.where(deviations > 0, score, np.abs(errors))
 
 
-def expected_gaussian_crps(deviations: np.ndarray) -> np.ndarray:
-    """Mean CRPS of a Gaussian forecast if it is right: s/sqrt(pi)."""
-    return deviations / np.sqrt(np.pi)
-
-
 def ensemble_crps(
     truth: np.ndarray, members: np.ndarray, weights: np.ndarray | None = None, *, fair: bool = False
 ) -> np.ndarray:

@@ -37,7 +37,7 @@ def swing_undefined(x, u, c):
 
 def at_once(model):
     with interpreted():
-        return recursion_of(model.functions, model.shape, PLAIN).at_once
+        return recursion_of(model.functions, model.shape, PLAIN, differentiated.EXTENDED, True).at_once
 
 
 @pytest.mark.usefixtures("as_python")
@@ -50,9 +50,9 @@ def test_only_what_can_be_traced_becomes_a_program():
 @pytest.mark.usefixtures("as_python")
 def test_a_graph_that_is_too_large_is_called(monkeypatch):
     monkeypatch.setattr(differentiated, "MOST", 50)
-    differentiated._recursion_of.cache_clear()
+    recursion_of.cache_clear()
     assert at_once(wide_model()) == 1
-    differentiated._recursion_of.cache_clear()
+    recursion_of.cache_clear()
 
 
 def units(model):
@@ -130,10 +130,10 @@ def test_machine_code_of_a_program_is_found_again_and_that_of_another_is_not_tak
             with interpreted():
                 expected = likelihood(model, inputs, z, *units(model))
             np.testing.assert_allclose(found.values, expected.values, rtol=1e-12)
-    compiled = recursion_of(model.functions, model.shape, PLAIN).run
-    differentiated._recursion_of.cache_clear()
+    compiled = recursion_of(model.functions, model.shape, PLAIN, differentiated.EXTENDED, False).run
+    recursion_of.cache_clear()
     monkeypatch.setattr(machine_code, "_compiled", lambda text: pytest.fail("the code is compiled again"))
-    again = recursion_of(model.functions, model.shape, PLAIN).run
+    again = recursion_of(model.functions, model.shape, PLAIN, differentiated.EXTENDED, False).run
     assert again is not compiled
 
 

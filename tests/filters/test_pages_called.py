@@ -27,7 +27,7 @@ def turn_if(x, u, c):
 
 def at_once(model, filter_):
     used, page, _ = differentiable(model, filter_)
-    return recursion_of(used.functions, used.shape, PLAIN, page).at_once
+    return recursion_of(used.functions, used.shape, PLAIN, page, True).at_once
 
 
 @pytest.mark.usefixtures("as_python")
@@ -52,14 +52,14 @@ def test_functions_that_are_called_have_the_derivatives_of_those_that_are_traced
 @pytest.mark.parametrize("name", NAMES)
 def test_a_model_that_is_too_large_to_be_written_out_is_called(name, monkeypatch):
     monkeypatch.setattr(differentiated, "MOST", 50)
-    differentiated._recursion_of.cache_clear()
+    recursion_of.cache_clear()
     model = random_affine(n=7, m=2, p=1)  # its matrices are arrays
     inputs, z = simulated(model, 3, count=2, missing=0.2)
     slopes = units(model)
     slopes = slopes[0], np.array([np.zeros((2, 2))] * 7 + [np.eye(2)])
     assert at_once(model, made(name, model)) == 1
     kalman, other = (likelihood(model, inputs, z, *slopes, filter=one) for one in (None, made(name, model)))
-    differentiated._recursion_of.cache_clear()
+    recursion_of.cache_clear()
     np.testing.assert_allclose(other.values, kalman.values, rtol=1e-11)
     np.testing.assert_allclose(other.gradients, kalman.gradients, rtol=1e-7, atol=1e-7)
 

@@ -17,7 +17,9 @@ and psi are infinite; with a quaternion in their place (`rotating_rates`) the ve
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -251,6 +253,23 @@ def drifting_rates_tangent(x, dx, u, c):
         0.0,
         0.0,
     )
+
+
+class Motion(NamedTuple):
+    """The number of states of a model, and its equations of motion."""
+
+    count: int
+    rates: Callable
+    tangent: Callable  # of the rates
+
+
+MODELS = {
+    "velocities": Motion(6, velocity_rates, velocity_rates_tangent),
+    "motion": Motion(8, motion_rates, motion_rates_tangent),
+    "navigation": Motion(12, navigation_rates, navigation_rates_tangent),
+    "current": Motion(14, drifting_rates, drifting_rates_tangent),
+}
+"""Models by name: the papers' six velocities; with roll and pitch; with yaw and position; with the current."""
 
 
 # The same motion with a quaternion (w, x, y, z) of `thruster_env.model.rotations` for the attitude.

@@ -13,12 +13,18 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from thruster_env.auv import dynamics
-from thruster_env.auv.dynamics import angle_rates, attitude_of, cruise_thrust, in_earth_axes, operating_range
+from thruster_env.auv.dynamics import (
+    MODELS,
+    angle_rates,
+    attitude_of,
+    cruise_thrust,
+    in_earth_axes,
+    operating_range,
+)
 from thruster_env.auv.parameters import VehicleParameters, checked
 from thruster_env.auv.plant import (
     ATTITUDE_INPUTS,
@@ -81,23 +87,6 @@ def derivative_by_attitude(move: Callable, state: np.ndarray, inputs: list[float
 
     return np.transpose([(propagated(tilt) - propagated(-tilt)) / (2.0 * TILT) for tilt in TILT * np.eye(2)])
 
-
-@dataclass(frozen=True)
-class Motion:
-    """The number of states of a model, and its equations of motion."""
-
-    count: int
-    rates: Callable
-    tangent: Callable  # of the rates
-
-
-MODELS = {
-    "velocities": Motion(6, dynamics.velocity_rates, dynamics.velocity_rates_tangent),
-    "motion": Motion(8, dynamics.motion_rates, dynamics.motion_rates_tangent),
-    "navigation": Motion(12, dynamics.navigation_rates, dynamics.navigation_rates_tangent),
-    "current": Motion(14, dynamics.drifting_rates, dynamics.drifting_rates_tangent),
-}
-"""Models by name: the papers' six velocities; with roll and pitch; with yaw and position; with the current."""
 
 CURRENT_STD, CURRENT_TIME = 0.2, 60.0  # m/s, s; assumed, of tides and wind about a coast
 METHODS = ("runge-kutta", "euler")
