@@ -3,6 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from filters import wrappers  # noqa: F401 - registers ids with a filter, once Gymnasium is imported
 from filters.adaptive import RobustExtendedKalmanFilter, SageHusaFilter, VariationalBayesFilter
 from filters.augmented import Unknown, augmented_model, transformed_model
 from filters.baselines import Inversion, LowPass, OpenLoop
@@ -36,8 +37,6 @@ from filters.runs import run, smooth
 from filters.smoothers.smooth import Smoothed, SmoothedModes, smooth_modes
 from filters.starts import Restarts, RestartWarning, restarts_of
 from filters.tensors import torch
-from filters.wrappers import register_filtered_envs
-from thruster_env.core.modules import when_imported
 from thruster_env.model.affine import affine_model, linearize
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -104,8 +103,6 @@ __all__ = [
     "torch",
     "transformed_model",
 ]
-
-when_imported("gymnasium", register_filtered_envs)
 
 
 def __getattr__(name: str):

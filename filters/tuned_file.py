@@ -54,8 +54,7 @@ def check_same_quantities(tuned_for: Mapping, model: StateSpaceModel, dt: float 
         dt: its sample time [s]; None if unknown, which is not compared.
         file: its path.
     """
-    model = of_one_step(model)
-    here = {key: [list(quantity) for quantity in getattr(model, name)] for key, name in VECTORS.items()}
+    here = model_data(model, dt)
     differing = [
         f"{key} {_listed(tuned_for[key])} (here {_listed(here[key])})"
         for key in VECTORS

@@ -20,7 +20,6 @@ from thruster_env.core.checks import as_floats, correlation_flaws, short_repr
 from thruster_env.core.modules import error_line, is_code, object_named
 from thruster_env.core.streams import GLOBAL_GENERATORS, GlobalGenerators, derived_seed, seeded_copy
 from thruster_env.model.continuous import same_dt
-from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import refuse_rotations
 
 PARTS = {"mean": "n", "cov": "nn", "innovation": "m", "innovation_cov": "mm"}
@@ -518,40 +517,3 @@ def estimator_named(argument) -> Any:
     if is_trained(argument):
         return object_named(READER, "reader")(argument)
     return object_named(argument, "estimator") if isinstance(argument, str) else argument
-
-
-def as_filter(estimator: Any, label: str, model: StateSpaceModel, numbers: dict) -> Filter:
-    """An estimator in the place of a filter.
-
-    Args:
-        estimator: an estimator; or a function or class that makes one, or a `Filter`, from a model and `numbers`.
-        label: its name in tables, if it does not name itself.
-        model: passed to the function; it names states, inputs and measurements and says which are angles.
-        numbers: further arguments of the function.
-
-    Raises:
-        ValueError: if it neither is an estimator nor makes one.
-    """
-    if not is_estimator(estimator):
-        estimator = _made(estimator, label, model, numbers)
-    elif numbers:
-        rule = "numbers must come with a function that makes an estimator"
-        raise ValueError(f"{rule}, but {label!r} is one already, and got {', '.join(numbers)}")
-    if isinstance(estimator, Filter):
-        return estimator
-    return ForeignFilter(model=model, estimator=estimator, label=label)
-
-
-def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
-    what = f"{'filter' if is_filter_class(make) else 'estimator'} {label!r}"
-    if not callable(make):
-        raise ValueError(f"{what} must be an estimator, or make one of a model, but it is {short_repr(make)}")
-    try:
-        result = make(model=model, **numbers) if is_filter_class(make) else make(model, **numbers)
-    except Exception as error:
-        wanted = ", ".join(["a model", *numbers])
-        raise ValueError(f"{what} must be made of {wanted}, but raised {error_line(error)}") from error
-    if not isinstance(result, Filter) and not is_estimator(result):
-        rule = f"{what} must make an object with reset(key, z) and step(u, z), or run(keys, inputs, measurements)"
-        raise ValueError(f"{rule}, but made {short_repr(result)}")
-    return result

@@ -10,6 +10,8 @@ if the id has one.
 import warnings
 from importlib import import_module
 
+from thruster_env.core.modules import when_imported
+
 PLANTS = "filters.plants"  # group of entry points: packages that register their envs when imported
 ALIASES = {"kf": "KF", "ekf": "EKF", "ukf": "UKF", "enkf": "EnKF", "pf": "PF"}
 
@@ -59,3 +61,6 @@ def register_filtered_envs() -> None:
                     max_episode_steps=registry[env_id].max_episode_steps,
                     kwargs={"env_id": env_id} | ({} if filter is None else {"filter": filter}),
                 )
+
+
+when_imported("gymnasium", register_filtered_envs)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import codecs
 import re
-import sys
 import unicodedata
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from html import escape
@@ -45,19 +44,10 @@ TITLE = 90  # characters for which a figure has room
 STRAIGHT = {"HORIZONTAL": "-", "LEFT": "-", "RIGHT": "-", "VERTICAL": "|"}  # ends of names of box drawings
 
 
-def adapt_standard_streams() -> None:
-    """Make standard output and error replace the characters that their encoding lacks."""
-    codecs.register_error(HANDLER, _replace)
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors=HANDLER)
-
-
 def showable(text: str, encoding: str) -> str:
     """Text in the characters of an encoding, so that columns keep their widths when it is written."""
     if encoding.startswith("utf"):
         return text
-    codecs.register_error(HANDLER, _replace)
     return text.encode(encoding, HANDLER).decode(encoding)
 
 
@@ -72,6 +62,9 @@ def _replace(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
     return "".join(map(_in_ascii, error.object[error.start : error.end])), error.end
+
+
+codecs.register_error(HANDLER, _replace)
 
 
 def _in_ascii(character: str) -> str:

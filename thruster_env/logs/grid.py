@@ -23,8 +23,7 @@ Without a grid, a row is a time at which any channel has a sample (`at_own_stamp
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +45,6 @@ SAME_RATE = 0.25  # of a step, over a piece: a sample time that is given is that
 NEIGHBOURS = 1.5  # steps: samples that are farther apart are not interpolated
 
 # Of the times of a column.
-MISSING = "nan"
 SINCE_1970 = (6e8, 4.1e9)  # [s]: times from 1989 to 2099, which no clock that starts with its recorder reaches
 SECOND = "s"
 TICKS = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # a second
@@ -245,28 +243,6 @@ def mean_held(series: Series, dt: float, steps: int, offset: float = 0.0, angle:
 def _lies_on_grid(times: np.ndarray) -> bool:
     """Whether times in steps are whole numbers up to rounding."""
     return bool((abs(times - np.round(times)) <= CLOSE_TO_GRID * np.maximum(1.0, abs(times))).all())
-
-
-def seconds_of(cells: Sequence[str]) -> np.ndarray | None:
-    """Seconds since the first date of some texts, (rows,), NaN where one is none; None where no cell is a date.
-
-    Dates with a time zone are compared in UTC, dates without one as they stand, to the microsecond.
-
-    Args:
-        cells: texts, "nan" where one is missing.
-
-    Raises:
-        ValueError: if only some dates have a time zone.
-    """
-    dates = [None if cell == MISSING else date_of(cell) for cell in cells]
-    known = [date for date in dates if date is not None]
-    if not known:
-        return None
-    if len({date.tzinfo is None for date in known}) > 1:
-        raise ValueError("times must all have a time zone, or none, but got both")
-    known = [date if date.tzinfo is None else date.astimezone(UTC) for date in known]
-    seconds = iter([(date - known[0]) / timedelta(seconds=1) for date in known])
-    return np.array([np.nan if date is None else next(seconds) for date in dates])
 
 
 def date_of(text: str) -> datetime | None:

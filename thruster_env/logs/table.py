@@ -10,6 +10,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, timedelta
 from errno import EACCES, EISDIR, ENOENT
 from importlib.util import find_spec
 from os import PathLike, strerror
@@ -23,11 +24,11 @@ from thruster_env.core.checks import as_floats, listed, short_repr
 from thruster_env.core.modules import to_install
 from thruster_env.logs.columns import DATE_NAMES, TIME_NAMES, parted, simple
 from thruster_env.logs.findings import Remark
-from thruster_env.logs.grid import MISSING as MISSING_TEXT
-from thruster_env.logs.grid import seconds_of
+from thruster_env.logs.grid import date_of
 from thruster_env.logs.recorders.topics import Refused, check_bytes, opened
 
 # What stands for a missing number, in any case of letters.
+MISSING_TEXT = "nan"
 MISSING = ("", "nan", "na", "n/a", "null", "none", "<na>", "nat")
 DATES = "times must be dates as of ISO 8601, such as 2026-05-01T12:00:00.01"
 DELIMITERS = ",;\t"
@@ -42,6 +43,28 @@ def since_first(dates: np.ndarray) -> np.ndarray:
     if not len(known):
         return np.full(len(dates), np.nan)
     return (dates - known[0]) / np.timedelta64(1, "s")  # whole ticks are subtracted, so that no digit is lost
+
+
+def seconds_of(cells: Sequence[str]) -> np.ndarray | None:
+    """Seconds since the first date of some texts, (rows,), NaN where one is none; None where no cell is a date.
+
+    Dates with a time zone are compared in UTC, dates without one as they stand, to the microsecond.
+
+    Args:
+        cells: texts, "nan" where one is missing.
+
+    Raises:
+        ValueError: if only some dates have a time zone.
+    """
+    dates = [None if cell == MISSING_TEXT else date_of(cell) for cell in cells]
+    known = [date for date in dates if date is not None]
+    if not known:
+        return None
+    if len({date.tzinfo is None for date in known}) > 1:
+        raise ValueError("times must all have a time zone, or none, but got both")
+    known = [date if date.tzinfo is None else date.astimezone(UTC) for date in known]
+    seconds = iter([(date - known[0]) / timedelta(seconds=1) for date in known])
+    return np.array([np.nan if date is None else next(seconds) for date in dates])
 
 
 @dataclass(frozen=True, eq=False)

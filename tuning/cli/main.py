@@ -57,9 +57,11 @@ def main() -> None:
         Timer(0.05, pthread_kill, (main_thread().ident, SIGINT)).start()  # which also wakes it up
 
     try:
-        from thruster_env.core.text_tables import adapt_standard_streams
+        from thruster_env.core.text_tables import HANDLER
 
-        adapt_standard_streams()
+        for stream in (sys.stdout, sys.stderr):  # replace the characters that their encoding lacks
+            if hasattr(stream, "reconfigure"):
+                stream.reconfigure(errors=HANDLER)
         plain = sys.argv[1:2] == ["new"] and len(sys.argv) == 4 and not any(word[:1] == "-" for word in sys.argv)
         if not plain:
             from tuning.cli.app import app

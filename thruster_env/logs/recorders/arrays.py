@@ -21,6 +21,7 @@ from thruster_env.logs.grid import in_seconds
 from thruster_env.logs.recorders.topics import (
     MOST_COLUMNS,
     MOST_FIELDS,
+    Format,
     Opened,
     Refused,
     Topic,
@@ -36,7 +37,6 @@ NUMERIC = "biuf"  # NumPy's kinds
 FEWEST = 2  # samples; what has fewer is a constant
 
 # Of files.
-HDF5_KIND = "HDF5 file"
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 UNITS, SCALE, OFFSET = ("units", "unit"), "scale_factor", "add_offset"  # attributes
 MISSING = ("_fillvalue", "missing_value")
@@ -188,13 +188,16 @@ def hdf5_topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     Source: "NetCDF Climate and Forecast (CF) Metadata Conventions", 1.11, sections 2.5.1 and 8.1.
     """
     if find_spec("h5py") is None:
-        package("h5py", HDF5_KIND, path)  # which says how to install it
-    with reading(HDF5_KIND, path), opened("hdf5", path) as file:
+        package("h5py", HDF5.kind, path)  # which says how to install it
+    with reading(HDF5.kind, path), opened("hdf5", path) as file:
         datasets = {
             name: description if isinstance(description, str) else Dataset(file, number, description)
             for number, (name, description) in enumerate(file.contents["datasets"].items())
         }
         yield from topics_of(datasets, path, wanted, _unit)
+
+
+HDF5 = Format("HDF5 file", (".h5", ".hdf5", ".hdf"), HDF5_MAGIC, hdf5_topics, has_stamps=False)
 
 
 class Dataset:
@@ -271,9 +274,8 @@ DEEPEST = 32
 TAG = 8  # bytes of type and size before an element
 PIECE = 2**20  # bytes
 WHOLE = "what a MATLAB file holds"
-MATLAB = "MATLAB file"
 MATLAB_MAGIC = b"MATLAB "
-HDF5 = b"MATLAB 7.3"
+VERSION_7_3 = b"MATLAB 7.3"
 
 
 def arrays_of(path: Path) -> dict[str, Any]:
@@ -453,8 +455,11 @@ def matlab_topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     Source: MathWorks, "MAT-File Format".
     """
     with path.open("rb") as file:
-        if file.read(len(HDF5)) == HDF5:
+        if file.read(len(VERSION_7_3)) == VERSION_7_3:
             yield from hdf5_topics(path, wanted)
             return
-    with reading(MATLAB, path):
+    with reading(MATLAB.kind, path):
         yield from topics_of(arrays_of(path), path, wanted)
+
+
+MATLAB = Format("MATLAB file", (".mat",), MATLAB_MAGIC, matlab_topics, has_stamps=False)

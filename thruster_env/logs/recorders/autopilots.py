@@ -14,6 +14,7 @@ import numpy as np
 
 from thruster_env.logs.recorders.topics import (
     MOST_FIELDS,
+    Format,
     Refused,
     Topic,
     Wanted,
@@ -26,7 +27,6 @@ from thruster_env.logs.recorders.topics import (
     wants,
 )
 
-DATAFLASH = "DataFlash log"
 DATAFLASH_MAGIC = b"\xa3\x95"
 STAMPS = {"TimeUS": 1e6, "TimeMS": 1e3}  # ticks a second
 OF_WEEK = {"T": 1e3}  # of old messages GPS, whose TimeMS counts from the beginning of the week
@@ -63,8 +63,8 @@ def dataflash_topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
 
     Source: ArduPilot, AP_Logger, "LogStructure.h".
     """
-    reader = package("pymavlink.DFReader", DATAFLASH, path)
-    with reading(DATAFLASH, path), silent():
+    reader = package("pymavlink.DFReader", DATAFLASH.kind, path)
+    with reading(DATAFLASH.kind, path), silent():
         with _without_clock(reader.DFReader_binary)(str(path)) as index:
             offsets = [np.array(kind_offsets, np.int64) for kind_offsets in index.offsets]
             content = np.memmap(path, np.uint8, "r")
@@ -88,6 +88,9 @@ def dataflash_topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
                 parts.setdefault(topic.name, []).append((topic._replace(damage=damage), topic_offsets))
         for each in parts.values():
             yield joined(*map(list, zip(*each, strict=True)))
+
+
+DATAFLASH = Format("DataFlash log", (".bin",), DATAFLASH_MAGIC, dataflash_topics)
 
 
 class Definition(NamedTuple):
@@ -251,7 +254,6 @@ def _columns(form: Any, content: np.ndarray, offsets: np.ndarray) -> Iterator[tu
         yield name, kind, numbers if divisor == 1.0 else numbers / divisor
 
 
-ULOG = "ULog"
 ULOG_MAGIC = b"ULog\x01\x12\x35"
 STAMP = "timestamp"
 TICKS = 1e6  # a second
@@ -290,9 +292,9 @@ def ulog_topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     Sources: PX4, "ULog File Format"; PX4, "uORB Message Reference" (units).
     """
     check_bytes(path.stat().st_size, "a ULog", path)
-    core = package("pyulog.core", ULOG, path)
+    core = package("pyulog.core", ULOG.kind, path)
     names = None if wanted is None else sorted({column.partition(".")[0].partition("#")[0] for column in wanted})
-    with reading(ULOG, path), silent():
+    with reading(ULOG.kind, path), silent():
         content = path.read_bytes()
         parts = _whole_parts(content)
         strays = _checked_definitions(content, parts, path)
@@ -321,6 +323,9 @@ def ulog_topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
         name = f"{topic}#{instance}" if instance else topic
         if wants(wanted, name):
             yield joined([_topic(name, data, damage) for data in same_topic])
+
+
+ULOG = Format("ULog", (".ulg", ".ulog"), ULOG_MAGIC, ulog_topics, has_units=False)
 
 
 def _topic(name: str, data: Any, damage: str) -> Topic:

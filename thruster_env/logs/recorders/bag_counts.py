@@ -63,47 +63,6 @@ def counts_of(path: Path) -> dict[str, Counts]:
     raise ValueError(f"it begins with {first[:8]!r}")
 
 
-def check_counts(read: Counts, topics: Mapping[int, str], stated: Mapping[str, Counts], path: Path) -> None:
-    """Raise Refused unless as many messages were read as the file states.
-
-    Args:
-        read: messages of those connections that were read.
-        topics: names of all connections.
-        stated: from `counts_of`.
-        path: of the file, for messages.
-    """
-    for source, counts in stated.items():
-        for connection, count in read.items():
-            if count != counts.get(connection, 0):
-                raise _lost(repr(topics[connection]), count, counts.get(connection, 0), source, path)
-        nameless = sum(count for connection, count in counts.items() if connection not in topics)
-        if nameless:
-            raise _lost("a topic without a name", 0, nameless, source, path)
-
-
-def _lost(topic: str, read: int, stated: int, source: str, path: Path) -> Refused:
-    suffix = {".bag": ROS1, ".mcap": MCAP}.get(path.suffix.lower(), DB3)
-    return Refused(
-        f"a bag must hold the messages that it says it has, but {topic} has {read} of {stated} by its {source} "
-        f"({path}): it is damaged; repair it, as with {REPAIRS[suffix]}"
-    )
-
-
-def check_topics(read: Counts | Mapping[str, int], stated: Mapping[str, int], known: set[str], path: Path) -> None:
-    """Raise Refused unless the files of a bag hold as many messages of each topic as its metadata.yaml says.
-
-    Args:
-        read: messages by topic, of those that were read.
-        stated: messages by topic, by the metadata.
-        known: topics that the files have.
-        path: of the bag, for messages.
-    """
-    for topic, count in stated.items():
-        count_read = read.get(topic, 0)  # type: ignore[call-overload]
-        if count_read != count and (topic in read or topic not in known):
-            raise _lost(repr(topic), count_read, count, "metadata.yaml", path)
-
-
 def _of_mcap(file: BinaryIO, path: Path) -> dict[str, Counts]:
     size = path.stat().st_size
     alone, indexed, statistics, described = Counter[int](), Counter[int](), None, None

@@ -19,9 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thruster_env.logs.recorders.bag_counts import (
+    DB3,
+    MCAP,
+    REPAIRS,
+    ROS1,
     Bag,
-    check_counts,
-    check_topics,
+    Counts,
     counts_of,
     files_of,
     is_ros1,
@@ -32,7 +35,9 @@ from thruster_env.logs.recorders.topics import (
     MOST_COLUMNS,
     MOST_FIELDS,
     STAMPED,
+    Format,
     Pairs,
+    Refused,
     Topic,
     Wanted,
     bounded,
@@ -159,6 +164,47 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
 def wants_pairs(wanted: Wanted, topic: str) -> bool:
     """Whether a column is wanted that may belong to a pair of frames of a topic."""
     return wanted is not None and any(column.startswith(f"{topic}/") for column in wanted)
+
+
+def check_counts(read: Counts, topics: Mapping[int, str], stated: Mapping[str, Counts], path: Path) -> None:
+    """Raise Refused unless as many messages were read as the file states.
+
+    Args:
+        read: messages of those connections that were read.
+        topics: names of all connections.
+        stated: from `counts_of`.
+        path: of the file, for messages.
+    """
+    for source, counts in stated.items():
+        for connection, count in read.items():
+            if count != counts.get(connection, 0):
+                raise _lost(repr(topics[connection]), count, counts.get(connection, 0), source, path)
+        nameless = sum(count for connection, count in counts.items() if connection not in topics)
+        if nameless:
+            raise _lost("a topic without a name", 0, nameless, source, path)
+
+
+def _lost(topic: str, read: int, stated: int, source: str, path: Path) -> Refused:
+    suffix = {".bag": ROS1, ".mcap": MCAP}.get(path.suffix.lower(), DB3)
+    return Refused(
+        f"a bag must hold the messages that it says it has, but {topic} has {read} of {stated} by its {source} "
+        f"({path}): it is damaged; repair it, as with {REPAIRS[suffix]}"
+    )
+
+
+def check_topics(read: Counts | Mapping[str, int], stated: Mapping[str, int], known: set[str], path: Path) -> None:
+    """Raise Refused unless the files of a bag hold as many messages of each topic as its metadata.yaml says.
+
+    Args:
+        read: messages by topic, of those that were read.
+        stated: messages by topic, by the metadata.
+        known: topics that the files have.
+        path: of the bag, for messages.
+    """
+    for topic, count in stated.items():
+        count_read = read.get(topic, 0)  # type: ignore[call-overload]
+        if count_read != count and (topic in read or topic not in known):
+            raise _lost(repr(topic), count_read, count, "metadata.yaml", path)
 
 
 class Contents:
@@ -413,3 +459,8 @@ def _is_void(defined: dict, kind: str, depth: int = 0) -> bool:
     if kind not in defined or depth > DEEPEST:
         return False
     return all(node.name == "NAME" and _is_void(defined, what, depth + 1) for _, (node, what) in defined[kind][1])
+
+
+ROS1_BAG = Format("bag of ROS 1", (".bag",), ROS1, topics, has_receipt=True)
+MCAP_FILE = Format("MCAP file", (".mcap",), MCAP, topics, has_receipt=True)
+ROS2_BAG = Format("bag of ROS 2", (".db3",), DB3, topics, has_receipt=True)

@@ -16,10 +16,10 @@ from thruster_env.logs.columns import INPUT, MEASUREMENT, TIME, Column, find_col
 from thruster_env.logs.columns import Wanted as MergedWanted
 from thruster_env.logs.findings import CLOCK, OUTSIDE, Remark
 from thruster_env.logs.grid import SECOND, follows, in_seconds, time_text
-from thruster_env.logs.recorders import arrays, autopilots, bag_counts, bags
+from thruster_env.logs.recorders import arrays, autopilots, bags
 from thruster_env.logs.recorders.bag_counts import METADATA
 from thruster_env.logs.recorders.bags import HEADER, RECEIPT, STAMPS, Choice, Clocked, chosen_clock
-from thruster_env.logs.recorders.topics import Reader, Topic, Wanted, unreadable
+from thruster_env.logs.recorders.topics import Format, Topic, Wanted, unreadable
 from thruster_env.logs.table import SUFFIXES, Table, read_table
 
 BINS = 8  # of the course of a field
@@ -27,26 +27,10 @@ STAMP = "times"  # header of the rows' times
 MANY = 0.1  # of the samples of a channel outside the log: worth a word
 
 
-class Format(NamedTuple):
-    """A format of recorders' files."""
-
-    kind: str  # its name in messages
-    endings: tuple[str, ...]
-    magic: bytes  # the first bytes of a file
-    topics: Reader
-    has_stamps: bool = True  # whether each topic has times of its own, whatever its fields are called
-    has_units: bool = True  # whether units are in the file, and not only known of its messages
-    has_receipt: bool = False  # whether messages have times of reception beside those of headers
-
-
 FORMATS = (
-    Format(autopilots.ULOG, (".ulg", ".ulog"), autopilots.ULOG_MAGIC, autopilots.ulog_topics, has_units=False),
-    Format(autopilots.DATAFLASH, (".bin",), autopilots.DATAFLASH_MAGIC, autopilots.dataflash_topics),
-    Format("bag of ROS 1", (".bag",), bag_counts.ROS1, bags.topics, has_receipt=True),
-    Format("MCAP file", (".mcap",), bag_counts.MCAP, bags.topics, has_receipt=True),
-    Format("bag of ROS 2", (".db3",), bag_counts.DB3, bags.topics, has_receipt=True),
-    Format(arrays.MATLAB, (".mat",), arrays.MATLAB_MAGIC, arrays.matlab_topics, False),
-    Format(arrays.HDF5_KIND, (".h5", ".hdf5", ".hdf"), arrays.HDF5_MAGIC, arrays.hdf5_topics, False),
+    *(autopilots.ULOG, autopilots.DATAFLASH),
+    *(bags.ROS1_BAG, bags.MCAP_FILE, bags.ROS2_BAG),
+    *(arrays.MATLAB, arrays.HDF5),
 )
 ENDINGS = tuple(ending for form in FORMATS for ending in form.endings)
 

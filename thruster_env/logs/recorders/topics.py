@@ -81,6 +81,18 @@ def joined(parts: Sequence[Topic], order: Sequence[np.ndarray] | None = None) ->
 Reader = Callable[[Path, Wanted], Iterator[Topic]]
 
 
+class Format(NamedTuple):
+    """A format of recorders' files."""
+
+    kind: str  # its name in messages
+    endings: tuple[str, ...]
+    magic: bytes  # the first bytes of a file
+    topics: Reader
+    has_stamps: bool = True  # whether each topic has times of its own, whatever its fields are called
+    has_units: bool = True  # whether units are in the file, and not only known of its messages
+    has_receipt: bool = False  # whether messages have times of reception beside those of headers
+
+
 def wants(wanted: Wanted, topic: str) -> bool:
     """Whether a column of a topic is wanted."""
     return wanted is None or any(column.startswith(f"{topic}.") for column in wanted)
