@@ -361,13 +361,6 @@ class SquaresCheck(NamedTuple):
     distribution: Uniformity  # of the values' probabilities under chi-square
 
 
-def check_squares(
-    name: str, errors: np.ndarray, covs: np.ndarray, present: np.ndarray | None = None
-) -> SquaresCheck:
-    """`check_whitened` of errors with their covariances (B, T, d, d); singular ones are left out."""
-    return check_whitened(name, whitened(errors, covs), present)
-
-
 def check_whitened(name: str, errors: np.ndarray, present: np.ndarray | None = None) -> SquaresCheck:
     """Compare normalised squares of B independent runs with the chi-square distribution.
 

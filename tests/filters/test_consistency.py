@@ -5,11 +5,12 @@ import pytest
 from scipy.stats import chi2, kstest, norm
 
 from filters.consistency.nees import (
-    check_squares,
+    check_whitened,
     mean_interval,
     rmse_intervals,
     rmse_ratios,
     uniformity,
+    whitened,
     whiteness,
 )
 from filters.consistency.report import whiteness_sentence
@@ -59,7 +60,7 @@ class TestIntervals:
 
 class TestSquares:
     def test_an_honest_filter_passes(self):
-        check = check_squares("NEES", *honest_errors(200, 300))
+        check = check_whitened("NEES", whitened(*honest_errors(200, 300)))
         assert check.dimension == 2 and check.mean.covers(2.0) and check.beyond.covers(0.05)
         assert 0.92 < check.share_inside < 0.98  # 300 steps: 0.95 and two and a half standard errors
         assert check.distribution.p_value > 0.01
@@ -68,7 +69,7 @@ class TestSquares:
     @pytest.mark.parametrize("factor", [0.5, 2.0])
     def test_a_covariance_off_by_a_factor_is_found(self, factor):
         errors, covs = honest_errors(100, 100)
-        honest, check = check_squares("NEES", errors, covs), check_squares("NEES", errors, factor * covs)
+        honest, check = (check_whitened("NEES", whitened(errors, scale * covs)) for scale in (1.0, factor))
         np.testing.assert_allclose(check.mean, np.array(honest.mean) / factor)
         assert check.share_inside == 0.0 and check.distribution.p_value < 0.001
         expected = chi2.sf(chi2.ppf(0.95, 2) * factor, 2)  # e' P^-1 e has to exceed the point times the factor
@@ -80,7 +81,7 @@ class TestSquares:
         errors = np.random.default_rng(2).normal(size=errors.shape) * np.sqrt([2.0, 0.5])
         present = np.random.default_rng(3).random(errors.shape) > 0.3
         present[:, 7] = False
-        check = check_squares("NIS", np.where(present, errors, 0.0), covs, present)
+        check = check_whitened("NIS", whitened(np.where(present, errors, 0.0), covs), present)
         counted = present.any(axis=-1)
         assert check.dimension == pytest.approx(present.sum() / counted.sum())
         assert check.mean.covers(check.dimension)
@@ -91,7 +92,7 @@ class TestSquares:
 
     def test_without_covariances_there_is_nothing_to_check(self):
         errors, covs = honest_errors(30, 40)
-        check = check_squares("NEES", errors, 0.0 * covs)
+        check = check_whitened("NEES", whitened(errors, 0.0 * covs))
         assert np.isnan(check.mean.value) and np.isnan(check.share_inside) and np.isnan(check.distribution.p_value)
 
 

@@ -18,8 +18,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -255,7 +255,8 @@ def drifting_rates_tangent(x, dx, u, c):
     )
 
 
-class Motion(NamedTuple):
+@dataclass(frozen=True)
+class Motion:
     """The number of states of a model, and its equations of motion."""
 
     count: int

@@ -245,14 +245,6 @@ def _lies_on_grid(times: np.ndarray) -> bool:
     return bool((abs(times - np.round(times)) <= CLOSE_TO_GRID * np.maximum(1.0, abs(times))).all())
 
 
-def date_of(text: str) -> datetime | None:
-    """The date of a text in ISO 8601, None for other text."""
-    try:
-        return datetime.fromisoformat(text)
-    except ValueError:
-        return None
-
-
 def digits_for(largest: float, step: float, least: int) -> int:
     """Significant digits in which numbers up to `largest` differ by a tenth of `step`, at least `least`."""
     if not (0.0 < step < math.inf and 0.0 < largest < math.inf):

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import UTC, timedelta
+from datetime import UTC, datetime, timedelta
 from errno import EACCES, EISDIR, ENOENT
 from importlib.util import find_spec
 from os import PathLike, strerror
@@ -24,7 +24,6 @@ from thruster_env.core.checks import as_floats, listed, short_repr
 from thruster_env.core.modules import to_install
 from thruster_env.logs.columns import DATE_NAMES, TIME_NAMES, parted, simple
 from thruster_env.logs.findings import Remark
-from thruster_env.logs.grid import date_of
 from thruster_env.logs.recorders.topics import Refused, check_bytes, opened
 
 # What stands for a missing number, in any case of letters.
@@ -43,6 +42,14 @@ def since_first(dates: np.ndarray) -> np.ndarray:
     if not len(known):
         return np.full(len(dates), np.nan)
     return (dates - known[0]) / np.timedelta64(1, "s")  # whole ticks are subtracted, so that no digit is lost
+
+
+def date_of(text: str) -> datetime | None:
+    """The date of a text in ISO 8601, None for other text."""
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError:
+        return None
 
 
 def seconds_of(cells: Sequence[str]) -> np.ndarray | None:

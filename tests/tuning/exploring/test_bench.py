@@ -8,7 +8,7 @@ import pytest
 from optuna.trial import TrialState
 
 import tuning
-from filters.consistency.nees import check_squares
+from filters.consistency.nees import check_whitened, whitened
 from filters.registry import make_filter
 from tuning.evaluation.evaluate import check_consistency, evaluate
 from tuning.evaluation.tuned import read_tuned
@@ -76,7 +76,7 @@ def test_a_band_counts_the_measurements_that_there_are():
     there = (~np.isnan(view.innovation[..., 0])).sum(axis=0)[50:]
     assert np.array_equal(np.isnan(high[50:]), there == 0)
     errors, covs = np.ones((1, 1, 1)), np.ones((1, 1, 1, 1))
-    for end, one in zip((low, high), check_squares("NIS", errors, covs).band[0], strict=True):
+    for end, one in zip((low, high), check_whitened("NIS", whitened(errors, covs)).band[0], strict=True):
         assert end[50:][there == 1] == pytest.approx(one)
 
 
