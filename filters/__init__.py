@@ -34,7 +34,7 @@ from filters.horizon.moving_horizon import MovingHorizonFilter
 from filters.particles.particle import AuxiliaryParticleFilter, ParticleFilter, RaoBlackwellisedParticleFilter
 from filters.registry import FILTERS, make_filter
 from filters.runs import run, smooth
-from filters.smoothers.smooth import Smoothed, SmoothedModes, smooth_modes
+from filters.smoothers import Smoothed, SmoothedModes, smooth_modes
 from filters.starts import Restarts, RestartWarning, restarts_of
 from filters.tensors import torch
 from thruster_env.model.affine import affine_model, linearize

@@ -212,7 +212,7 @@ class Live:
             ValueError: for a filter without such a smoother, another time, or a restart in between.
         """
         from filters.filter import PageFilter  # which knows this module
-        from filters.smoothers.rts import passes, relation_of
+        from filters.rts import passes, relation_of
 
         self._has_begun()
         relation, time = relation_of(self._filter, "smoothed"), finite("time", time)

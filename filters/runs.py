@@ -12,7 +12,7 @@ import numpy as np
 from filters.engine import batch
 from filters.engine.batch import Estimates, Prepared, prepared
 from filters.filter import Filter
-from filters.smoothers.smooth import Smoothed, smoothed_rows
+from filters.smoothers import Smoothed, smoothed_rows
 from filters.starts import warn_of_restarts
 from thruster_env.core.checks import FEW, at_least
 from thruster_env.core.modules import to_install

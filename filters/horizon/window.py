@@ -42,7 +42,7 @@ from filters.engine.belief import memory_offsets
 from filters.gaussian import extended
 from filters.pages.kernels import Stage, programs_of, stored
 from filters.pages.page import ACTING, Equations, Page, RowMemory
-from filters.smoothers.rts import propagate_jacobian, represent_jacobian
+from filters.rts import propagate_jacobian, represent_jacobian
 from thruster_env.model.quantities import Bound
 from thruster_env.model.shape import Functions, Shape, starts_of
 

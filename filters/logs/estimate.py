@@ -14,7 +14,7 @@ from filters.engine.session import Session
 from filters.estimators.foreign import Estimator, ForeignFilter
 from filters.filter import Filter
 from filters.live import Live
-from filters.smoothers.smooth import smoothed_rows
+from filters.smoothers import smoothed_rows
 from filters.starts import FirstRestart, Restarts, begun_at, first_measured
 from filters.wrappers.arguments import filter_for
 from thruster_env.core.checks import at_least

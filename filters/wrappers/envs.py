@@ -21,7 +21,7 @@ from filters.estimators.foreign import Estimator, EstimatorBeliefs, ForeignFilte
 from filters.filter import Filter
 from filters.monitoring import Monitor, monitor_of, watch_of
 from filters.named import NamedMaker, model_named
-from filters.smoothers.smooth import WithSmoother
+from filters.smoothers import WithSmoother
 from filters.starts import FirstRestart, FirstRestarts
 from filters.wrappers.arguments import (
     APPENDED,

@@ -9,7 +9,7 @@ from scipy.stats import truncnorm
 from filters import ExtendedKalmanFilter, augmented_model, linearize, make_filter, run, smooth
 from filters.augmented import Unknown
 from filters.consistency.nees import mean_interval
-from filters.smoothers.smooth import WithSmoother
+from filters.smoothers import WithSmoother
 from tests.models import KEY, scalar_model, simulated, wide_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import truncated_normal

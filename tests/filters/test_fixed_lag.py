@@ -19,7 +19,7 @@ from filters import (
     run,
     smooth,
 )
-from filters.smoothers.smooth import WithSmoother
+from filters.smoothers import WithSmoother
 from tests.models import KEY, affine, pendulum, scalar_model, simulated, wide_model
 from thruster_env.core.compiled import interpreted
 

@@ -10,7 +10,7 @@ from scipy.linalg import inv, sqrtm
 from filters import make_filter, run
 from filters.c.project import c_filter
 from filters.ensembles.square_root import record_members
-from filters.smoothers.smooth import smooth_ensembles
+from filters.smoothers import smooth_ensembles
 from filters.tensors import torch
 from tests.filters.test_ensemble_twins import step, whole
 from tests.filters.test_filter_paths import assert_compiled_as_python, assert_paths_agree

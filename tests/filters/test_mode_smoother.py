@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, make_filter, run, smooth, smooth_modes
-from filters.smoothers.rts import passes, relation_of
-from filters.smoothers.smooth import condition_on_later, merged
+from filters.rts import passes, relation_of
+from filters.smoothers import condition_on_later, merged
 from tests.filters.test_multiple_models import merged as mixture
 from tests.filters.test_multiple_models import moving
 from tests.filters.test_unequal_modes import moving as point

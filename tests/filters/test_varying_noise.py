@@ -10,7 +10,7 @@ import pytest
 from filters import FILTERS, KalmanFilter, make_filter, run, smooth, torch
 from filters.differentiated import Wanted
 from filters.sensitivity import ModelSlopes, derivatives
-from filters.smoothers.smooth import WithSmoother
+from filters.smoothers import WithSmoother
 from tests.filters.test_session import cart
 from tests.fuzz import unequal_steps
 from tests.kalman_by_hand import LIKE_KALMAN, KalmanByHand, LinearModel, close, covariance_of, smoothed_by_hand

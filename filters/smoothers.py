@@ -22,7 +22,7 @@ from filters.ensembles.ensemble import EnsembleFilter, named
 from filters.filter import Filter, PageFilter
 from filters.gaussian.multiple_models import MultipleModelFilter
 from filters.pages.kernels import analysis_of
-from filters.smoothers.rts import earliest_rows, passes, relation_of, smooth_backwards
+from filters.rts import earliest_rows, passes, relation_of, smooth_backwards
 from filters.starts import warn_of_restarts
 from thruster_env.core.angles import difference, wrapped_where
 from thruster_env.core.checks import at_least

@@ -1,1 +1,0 @@
-"""Smoothers: estimates that also use later measurements."""
