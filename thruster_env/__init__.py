@@ -60,7 +60,7 @@ def _register_all() -> None:
             reward_threshold=threshold,
         )
     if "Replay-v0" not in registry:
-        register(id="Replay-v0", entry_point="thruster_env.env.record:ReplayEnv")
+        register(id="Replay-v0", entry_point="thruster_env.env.model_env:ReplayEnv")
 
 
 when_imported("gymnasium", _register_all)

@@ -19,7 +19,7 @@ from filters.starts import FirstRestart, Restarts, begun_at, first_measured
 from filters.wrappers.arguments import filter_for
 from thruster_env.core.checks import at_least
 from thruster_env.core.streams import filter_keys
-from thruster_env.env.record import ReplayEnv
+from thruster_env.env.model_env import ReplayEnv
 from thruster_env.logs.log import Log, seen_by
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.state_space import StateSpaceModel
@@ -133,7 +133,7 @@ def estimate(
     Args:
         log: recorded run, or the path of a file.
         filter: as `EstimateState` takes it; "ekf" if None and no tuned file.
-        model: of the log, as `thruster_env.env.record.ReplayEnv` takes it: a model, a function that makes one, an
+        model: of the log, as `thruster_env.env.model_env.ReplayEnv` takes it: a model, a function that makes one, an
             object that offers one, or "module:object".
         tuned: path of a tuned file, which gives filter, parameters and model arguments.
         smoother: whether estimates are corrected by later measurements.

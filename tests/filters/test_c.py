@@ -22,7 +22,7 @@ from tests.slow import slow_but
 from thruster_env.auv.model import auv_model
 from thruster_env.core.angles import difference
 from thruster_env.core.streams import filter_keys
-from thruster_env.env.record import ReplayEnv
+from thruster_env.env.model_env import ReplayEnv
 from thruster_env.graphs.graphs import Graph, arctan2, where
 from thruster_env.graphs.programs import Place, literal, program_of, statements_of
 from thruster_env.logs.read import read_log

@@ -14,7 +14,7 @@ from tests.filters.test_c import SANITIZERS, WARNINGS, log_of, made
 from tests.filters.test_filter_paths import diverging
 from tests.models import lonely_model, simulated, wide_model
 from thruster_env.core.streams import filter_keys
-from thruster_env.env.record import ReplayEnv
+from thruster_env.env.model_env import ReplayEnv
 
 MAIN = """\
 #include "one.h"

@@ -28,8 +28,7 @@ from filters.sensitivity import likelihood
 from tests.filters.test_c import WARNINGS, built, printed
 from tests.slow import slow_but
 from thruster_env.core.streams import episode_keys, filter_keys
-from thruster_env.env.model_env import ModelEnv, ModelVectorEnv
-from thruster_env.env.record import ReplayEnv
+from thruster_env.env.model_env import ModelEnv, ModelVectorEnv, ReplayEnv
 from thruster_env.logs.log import in_any_steps
 from thruster_env.logs.read import read_log
 from thruster_env.logs.write import EXACT, write_columns, write_log

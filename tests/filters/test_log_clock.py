@@ -12,7 +12,7 @@ from filters.logs.estimate import by_the_clock, estimate
 from filters.logs.findings import alarms_of
 from filters.monitoring import Monitor
 from tests.filters.test_live import oscillator
-from thruster_env.env.record import ReplayEnv
+from thruster_env.env.model_env import ReplayEnv
 from thruster_env.logs.grid import Series
 from thruster_env.logs.log import Log, in_steps
 from thruster_env.logs.read import at_own_stamps, read_log

@@ -20,7 +20,7 @@ from filters.logs.findings import columns_of
 from filters.registry import make_filter
 from tests.fuzz.logs import MODEL
 from thruster_env.core.compiled import interpreted
-from thruster_env.env.record import ReplayEnv
+from thruster_env.env.model_env import ReplayEnv
 
 ROWS = 25
 DT = 0.01

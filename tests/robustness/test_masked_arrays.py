@@ -11,7 +11,7 @@ from tests.models import KEY, line_model, simulated, wide_model
 from tests.thruster_env.logs.test_logs import MODEL
 from thruster_env.core.checks import as_floats, vector
 from thruster_env.core.streams import filter_keys
-from thruster_env.env.record import ReplayEnv
+from thruster_env.env.model_env import ReplayEnv
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 from thruster_env.model.simulate import simulate

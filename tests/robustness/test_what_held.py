@@ -20,7 +20,7 @@ from tests.thruster_env.logs.test_logs import MODEL
 from thruster_env.core.angles import difference
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import filter_keys
-from thruster_env.env.record import ReplayEnv
+from thruster_env.env.model_env import ReplayEnv
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 

@@ -42,8 +42,7 @@ from thruster_env.auv.plant import (
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS, REFERENCE_SIGNAL, cosine_and_sine
 from thruster_env.effects.effects import SPACING, Context, Moment, chain_of, chain_runner
 from thruster_env.effects.sensors import Reading
-from thruster_env.env.copies import Page, PlantCopies, clipped, correlated, root_of
-from thruster_env.env.record import check_finite, record
+from thruster_env.env.copies import Page, PlantCopies, check_finite, clipped, correlated, record, root_of
 from thruster_env.graphs.graphs import where
 from thruster_env.graphs.values import Table, traceable
 from thruster_env.model.turns import move

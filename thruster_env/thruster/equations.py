@@ -20,8 +20,7 @@ from thruster_env.core.matrices import zero_order_hold
 from thruster_env.core.streams import INITIAL, MEASUREMENT, PROCESS
 from thruster_env.effects.effects import SPACING, Moment, chain_of, chain_runner
 from thruster_env.effects.sensors import Reading
-from thruster_env.env.copies import Page, PlantCopies, clipped, correlated, root_of
-from thruster_env.env.record import check_finite, record
+from thruster_env.env.copies import Page, PlantCopies, check_finite, clipped, correlated, record, root_of
 from thruster_env.graphs.graphs import where
 from thruster_env.graphs.values import traceable
 from thruster_env.thruster.analysis import equilibrium, state_range

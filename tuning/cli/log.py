@@ -14,7 +14,7 @@ from rich.console import RenderableType
 from thruster_env.core.checks import listed
 from thruster_env.core.files import save_figure
 from thruster_env.core.text_tables import Table, Unfolded, console, plain_text
-from thruster_env.env.record import ANY_DT
+from thruster_env.env.model_env import ANY_DT
 from thruster_env.logs.columns import find_columns, quantities_of
 from thruster_env.logs.findings import sentences
 from thruster_env.logs.grid import time_text

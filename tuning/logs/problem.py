@@ -20,7 +20,7 @@ from filters.named import NamedMaker, is_model_name
 from filters.plants import PLANTS
 from filters.tuned_file import check_preset_file, made_with, read_tuned_file, tune_options
 from thruster_env.core.checks import short_repr
-from thruster_env.env.record import read_for
+from thruster_env.env.model_env import read_for
 from thruster_env.logs.findings import has_outliers, remarks_on
 from thruster_env.logs.log import FEWEST_STEPS, Log, in_any_steps, piece_of
 from thruster_env.model.continuous import in_discrete_time

@@ -22,7 +22,7 @@ from filters.tuned_file import check_preset_file, read_tuned_file, tune_options
 from thruster_env.core.checks import finite, listed, short_repr
 from thruster_env.core.files import read_toml
 from thruster_env.core.modules import is_code, object_named
-from thruster_env.env.record import ANY_DT, read_for
+from thruster_env.env.model_env import ANY_DT, read_for
 from thruster_env.logs.columns import NO_COLUMN
 from thruster_env.logs.findings import Remark
 from thruster_env.logs.log import Log

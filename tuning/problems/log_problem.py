@@ -14,7 +14,7 @@ from filters.consistency.time_constants import Run
 from filters.starts import MEASUREMENT, STARTS, begun_at, cov_of_measured_starts, first_measured
 from thruster_env.core.checks import at_least, one_of, short_repr
 from thruster_env.core.streams import filter_keys
-from thruster_env.env.record import ReplayEnv
+from thruster_env.env.model_env import ReplayEnv
 from thruster_env.logs.findings import OUTLIERS, Recording, has_outliers, remarks_on
 from thruster_env.logs.findings import outliers as rows_of_outliers
 from thruster_env.logs.log import RATIO, Log, in_any_steps, in_steps, seen_by

@@ -9,7 +9,7 @@ import filters  # noqa: F401 - its wrappers
 from filters import EstimateState, EstimateStates
 from filters.logs.estimate import estimate
 from tests.thruster_env.logs.test_logs import MODEL
-from thruster_env.env.record import ReplayEnv
+from thruster_env.env.model_env import ReplayEnv
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import write_log
 
