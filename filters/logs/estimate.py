@@ -133,8 +133,8 @@ def estimate(
     Args:
         log: recorded run, or the path of a file.
         filter: as `EstimateState` takes it; "ekf" if None and no tuned file.
-        model: of the log, as `thruster_env.env.model_env.ReplayEnv` takes it: a model, a function that makes one, an
-            object that offers one, or "module:object".
+        model: of the log, as `thruster_env.env.model_env.ReplayEnv` takes it: a model, a function that makes one,
+            an object that offers one, or "module:object".
         tuned: path of a tuned file, which gives filter, parameters and model arguments.
         smoother: whether estimates are corrected by later measurements.
         lag: how many later measurements, also without `smoother`; all if None.

@@ -1,4 +1,4 @@
-"""Envs of any model: `ModelEnv`, whose plant is the model, its vector form, and `ReplayEnv`, a log of its plant."""
+"""Envs of any model: `ModelEnv`, whose plant it is, with its vector form, and `ReplayEnv` of a log."""
 
 from __future__ import annotations
 
