@@ -381,7 +381,7 @@ def mean_sentence(name: str, mean: Interval, dimension: float) -> str:
     """The verdict of a mean NEES or NIS on the covariance."""
     if np.isnan(mean.value):
         return f"No {name}: the filter gives no covariance, or a singular one."
-    return f"{confidence(mean, dimension).capitalize()}: mean {name} {_span(mean)} where {dimension:.3g} is right."
+    return f"{confidence(mean, dimension).capitalize()}: mean {name} {span(mean)} where {dimension:.3g} is right."
 
 
 def squares_sentence(check: SquaresCheck, runs: int) -> str:
@@ -450,9 +450,9 @@ def crps_sentence(name: str, crps: Interval, expected: float, of_members: Interv
     """A state's CRPS, also relative to its expectation under the covariance."""
     if np.isnan(crps.value):
         return ""
-    members = "" if of_members is None else f"; that of the members themselves is {_span(of_members)}"
+    members = "" if of_members is None else f"; that of the members themselves is {span(of_members)}"
     return (
-        f"CRPS of {name}: {_span(crps)}, {crps.value / expected:.3g} times its expected value under the "
+        f"CRPS of {name}: {span(crps)}, {crps.value / expected:.3g} times its expected value under the "
         f"covariance{members}."
     )
 
@@ -488,12 +488,6 @@ def divergence_sentence(divergences: int, diverged_runs: int, runs: int) -> str:
     if divergences == 0:
         return "No run diverged."
     return f"{diverged_runs} of {runs} runs diverged and restarted from the prior, {divergences} times in all."
-
-
-def comparison_sentence(name: str, first: str, second: str, ratio: Interval) -> str:
-    """One state's RMSE of two filters on the same runs, from a ratio of `intervals.rmse_ratios`."""
-    verdict = f"{first} is better" if ratio.high < 1 else f"{second} is better" if ratio.low > 1 else "a tie"
-    return f"RMSE of {name}, {first} over {second} on the same runs: {_span(ratio)}: {verdict}."
 
 
 def remedy_sentence(report: ConsistencyReport) -> str:
@@ -587,5 +581,6 @@ def rounded(value: float) -> str:
     return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
-def _span(value: Interval) -> str:
+def span(value: Interval) -> str:
+    """An interval as text: its value, and the ends in brackets."""
     return f"{rounded(value.value)} [{rounded(value.low)}, {rounded(value.high)}]"

@@ -6,7 +6,6 @@ import pytest
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run
 from filters.consistency.nees import Interval, gaussian_crps, mean_interval, normalized_squares, rmse_ratios
 from filters.consistency.report import (
-    comparison_sentence,
     confidence,
     consistency_report,
     coverage_sentence,
@@ -24,6 +23,7 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.core.files import save_figure
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
+from tuning.api.held_out import comparison_sentence
 from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds
 from tuning.reporting.search_figures import draw_consistency

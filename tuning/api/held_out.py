@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from filters.consistency.nees import Interval, SquaresCheck
-from filters.consistency.report import MOST_STATES, ConsistencyReport, comparison_sentence, sentences
+from filters.consistency.report import MOST_STATES, ConsistencyReport, sentences, span
 from filters.estimators.foreign import label_of
 from filters.filter import Filter
 from thruster_env.core.checks import at_least
@@ -230,6 +230,12 @@ class HeldOut(Result):
             return [*sentences, *model_doubts(self.problem, self.comparison, self.seed), *restarts]
         truth = [] if self.evaluation.has_truth else [without_truth(self.problem.name)]
         return [*truth, scaling_sentence(self.comparison), *restarts]
+
+
+def comparison_sentence(name: str, first: str, second: str, ratio: Interval) -> str:
+    """One state's RMSE of two filters on the same runs, from a ratio of `intervals.rmse_ratios`."""
+    verdict = f"{first} is better" if ratio.high < 1 else f"{second} is better" if ratio.low > 1 else "a tie"
+    return f"RMSE of {name}, {first} over {second} on the same runs: {span(ratio)}: {verdict}."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
