@@ -9,7 +9,7 @@ size of model: they call the stages by their addresses.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -48,23 +48,22 @@ def _stages(kernels: Kernels) -> Stages:
     if not kernels.vectors:
         parts = _of_memory(kernels.predict), None, None, _of_memory(kernels.update)
         return Stages(_without_given(start), *parts, _without_given(restart))
-    length, width = row_length(kernels), LANES
 
     def start_group(row, belief, numbers):
-        for i in range(length):
+        for i in range(belief.shape[0]):
             belief[i] = 0.0
         start((belief, None, None), numbers, 0)
-        for i in range(length):
-            for j in range(width):
-                row[i * width + j] = belief[i]
+        for i in range(belief.shape[0]):
+            for j in range(LANES):
+                row[i * LANES + j] = belief[i]
 
     def restart_group(row, belief, numbers):
-        for j in range(width):
-            for i in range(length):
-                belief[i] = row[i * width + j]
+        for j in range(LANES):
+            for i in range(belief.shape[0]):
+                belief[i] = row[i * LANES + j]
             restart((belief, None, None), numbers, 0)
-            for i in range(length):
-                row[i * width + j] = belief[i]
+            for i in range(belief.shape[0]):
+                row[i * LANES + j] = belief[i]
 
     return Stages._make([start_group, *kernels.vectors, restart_group])
 
@@ -228,13 +227,14 @@ def batch(kernels: Kernels) -> Callable:
     these; `memory` is that of `batch_memory`.
     """
     size = kernels.n, kernels.m, kernels.t, kernels.channels, bool(kernels.vectors)
-    code = None if is_interpreting() else _code_of_stages(kernels)
-    loops = None if code is None else _code_of_batch(*size)
-    if code is None or loops is None:
+    codes = () if is_interpreting() else _codes_of_stages(kernels)
+    loops = _code_of_batch(*size) if codes else None
+    if loops is None:
         return partial(_as_python(build_batch(*size)), _stages(kernels))
     from thruster_env.graphs.machine_code import function_of
 
-    return partial(function_of(loops, code), Stages(*(code.addresses.get(name, 0) for name in Stages._fields)))
+    addresses = {name: address for code in codes for name, address in code.addresses.items()}
+    return partial(function_of(loops, *codes), Stages(*(addresses.get(name, 0) for name in Stages._fields)))
 
 
 def _as_python(function: Callable) -> Callable:
@@ -249,30 +249,31 @@ def _code_one_by_one(kernels: Kernels) -> Code | None:
     operation = Entry(
         build_operation(kernels), (*_memory_shapes(kernels), None, (None,), (None,), None), as_builtin=True
     )
-    return common_code_of(operation, *(() if kernels.vectors else _entries(kernels)))
-
-
-def _code_of_stages(kernels: Kernels) -> Code | None:
-    return _code_side_by_side(kernels) if kernels.vectors else _code_one_by_one(kernels)
+    return common_code_of(operation, *(() if kernels.vectors else _entries(kernels, Stages._fields)))
 
 
 @lru_cache(maxsize=64)
-def _code_side_by_side(kernels: Kernels) -> Code | None:
+def _codes_of_stages(kernels: Kernels) -> tuple[Code, ...]:
+    """Machine code of the stages; filters of the same model share what starts beliefs side by side."""
     from thruster_env.graphs.loops import common_code_of
 
-    return common_code_of(*_entries(kernels), unrolled=False)
+    if not kernels.vectors:
+        code = _code_one_by_one(kernels)
+        return () if code is None else (code,)
+    around = "start", "restart"
+    parts = around, [name for name in Stages._fields if name not in around]
+    codes = [common_code_of(*_entries(kernels, names), unrolled=False) for names in parts]
+    return tuple(code for code in codes if code is not None) if None not in codes else ()
 
 
-def _entries(kernels: Kernels) -> list[Entry]:
-    """The stages of a batch by address."""
+def _entries(kernels: Kernels, names: Sequence[str]) -> list[Entry]:
+    """Stages of a batch by address."""
     from thruster_env.graphs.loops import Entry
 
-    width, _ = _lanes(bool(kernels.vectors))
-    ensemble = () if kernels.vectors else (*_memory_shapes(kernels)[1:], None)
-    row = (row_length(kernels) * width,)
-    lengths = {"update": kernels.channels * width, "start": row_length(kernels), "restart": row_length(kernels)}
-    stages = [(name, stage) for name, stage in _stages(kernels)._asdict().items() if stage is not None]
-    return [Entry(stage, (row, (lengths.get(name),), (None,), *ensemble), name=name) for name, stage in stages]
+    row, table, draws = _memory_shapes(kernels)
+    shapes = [(None,), (None,), (None,)] if kernels.vectors else [row, (None,), (None,), table, draws, None]
+    stages = _stages(kernels)._asdict()
+    return [Entry(stages[name], shapes, name=name) for name in names if stages[name] is not None]
 
 
 def _memory_shapes(kernels: Kernels) -> tuple:

@@ -32,6 +32,7 @@ from thruster_env.graphs.machine_code import WIDE
 from thruster_env.graphs.programs import CALLED, OF_MEMBERS, READ_NUMBERS, cut
 
 FILL_NORMALS = "fill_normals"
+MOST_WITHIN = 60  # operations of a program that is compiled together with what calls it
 MOST_NUMBERS = 2**40  # the length of an array of which only the pointer is known
 
 
@@ -39,18 +40,19 @@ class Functions(dict):
     """The functions and programs of a module, by what they are made of.
 
     Attributes:
-        programs_apart: whether programs are never inlined: within a loop they would take other last digits.
         draws: whether normals are drawn, by machine code that all modules share.
         natives: functions that are machine code already, by their names.
+        apart: programs that are modules of their own, as many filters of a model share them, by their names.
         innermost: the function that is translated.
     """
 
-    programs_apart, draws = True, False
+    draws = False
     innermost: Any = None
 
     def __init__(self):
         super().__init__()
         self.natives: dict[str, Native] = {}
+        self.apart: dict[str, Any] = {}
 
 
 class Native:
@@ -387,7 +389,7 @@ class Expressions(Arrays):
     def _call_program(self, function: Any, arguments: Sequence) -> None:
         """Call a program, which is a function of its own."""
         self.has_loops = True
-        program, width, names, scratch = function.program
+        program, _, names, _ = function.program
         arrays = [argument for argument in arguments if isinstance(argument, Array)]
         if any(isinstance(step, int) and step != 1 for array in arrays for step in array.steps[-1:]):
             raise Untranslated("a program on every few numbers of an array")
@@ -396,30 +398,33 @@ class Expressions(Arrays):
             more = [arrays[names.index("memory")].steps[0]]
         if names == OF_MEMBERS:
             more = [arrays[names.index("table")].shape[1], arguments[-1]]
-        called = self._functions.get(function)
-        if called is not None:
-            called.attributes.add("noinline")
-        else:
-            kind = ir.FunctionType(ir.VoidType(), [POINTER] * len(arrays) + [LONG] * len(more))
-            called = new_function(self._builder.module, kind, "program")
-            set.add(called.attributes, "alignstack(64)")  # else vectors that it keeps there lie across cache lines
-            self._functions[function] = called
-            if self._functions.programs_apart:
-                called.attributes.add("noinline")
-            builder, data = ir.IRBuilder(called.append_basic_block()), dict(zip(names, called.args, strict=False))
-            translator = type(self)(builder, self._functions, frozenset())
-            if names == OF_MEMBERS:
-                LoopWriter(translator.call_by_name, builder, data, width, *called.args[-2:]).write(
-                    cut(program, scratch)
-                )
-            else:
-                writer = Writer(translator.call_by_name, builder, data, width)
-                writer.stride = called.args[-1]
-                writer.write(program)
-            translator.arrange_memory([[]])
-            translator.free_all_but([])
-            builder.ret_void()
+        called, module = self._functions.get(function), self._builder.module
+        kind = ir.FunctionType(ir.VoidType(), [POINTER] * len(arrays) + [LONG] * len(more))
+        if called is None and len(program.works) > MOST_WITHIN and not function.calls:
+            self._functions.apart[function.name] = function
+            called = module.globals.get(function.name) or ir.Function(module, kind, function.name)
+        elif called is None:
+            called = self._functions[function] = new_function(module, kind, "program")
+            called.attributes.add("noinline")  # within a loop it would take other last digits
+            self.write_program(function, called)
         self._builder.call(called, [*(array.pointer for array in arrays), *map(self.numbers.as_whole, more)])
+
+    def write_program(self, function: Any, target: ir.Function) -> None:
+        """Write a program's instructions as the body of a function."""
+        program, width, names, scratch = function.program
+        set.add(target.attributes, "alignstack(64)")  # else vectors that it keeps there lie across cache lines
+        builder, data = ir.IRBuilder(target.append_basic_block()), dict(zip(names, target.args, strict=False))
+        translator = type(self)(builder, self._functions, frozenset())
+        if names == OF_MEMBERS:
+            columns, size = target.args[-2:]
+            LoopWriter(translator.call_by_name, builder, data, width, columns, size).write(cut(program, scratch))
+        else:
+            writer = Writer(translator.call_by_name, builder, data, width)
+            writer.stride = target.args[-1]
+            writer.write(program)
+        translator.arrange_memory([[]])
+        translator.free_all_but([])
+        builder.ret_void()
 
     def _call_address(self, address: ir.Value, arguments: Sequence) -> None:
         self.has_loops, words = True, self._words_of(arguments)

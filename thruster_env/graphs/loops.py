@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
@@ -82,10 +83,8 @@ def common_code_of(*entries: Entry, unrolled: bool = True) -> Code | None:
 
     If there is none, it returns None after a warning: a user's function can neither be traced, translated, nor
     compiled by numba; or this system's libraries lack a function; or the package has a fault.
-    If there are several, programs may become part of the functions that call them.
     """
     module, names, functions = ir.Module(), list[str](), Functions()
-    functions.programs_apart = len(entries) == 1 or not any(entry.as_builtin for entry in entries)
     try:
         for entry in entries:
             name = entry.name or ("operate" if entry.as_builtin else "run")
@@ -96,6 +95,7 @@ def common_code_of(*entries: Entry, unrolled: bool = True) -> Code | None:
                 add_builtin(module, "call", target, count - 1 - len(entry.shapes[-1] or ()))
             names.append("call" if entry.as_builtin else name)
         libraries = [_library_of_normals()] if functions.draws else []
+        libraries += [_code_of_program(module.globals[name], work) for name, work in functions.apart.items()]
         symbols = functions.natives | {name: of_lapack(name) for name in LAPACK if name in module.globals}
         return code_of(module, *names, unrolled=unrolled, libraries=libraries, symbols=symbols)
     except OnlyPython as error:
@@ -126,6 +126,21 @@ def _library_of_normals() -> Code:
     builder.ret_void()
     set.add(target.attributes, WIDE)
     return code_of(module, FILL_NORMALS)
+
+
+_programs: WeakValueDictionary[str, Code] = WeakValueDictionary()
+
+
+def _code_of_program(declared: ir.Function, work: Any) -> Code:
+    """A program for all modules that call it."""
+    code = _programs.get(declared.name)
+    if code is None:
+        module = ir.Module()
+        target = ir.Function(module, declared.ftype, declared.name)
+        _Translator(ir.IRBuilder(), Functions(), frozenset()).write_program(work, target)
+        set.add(target.attributes, WIDE)
+        code = _programs[declared.name] = code_of(module, declared.name, unrolled=False)
+    return code
 
 
 def add_function(
@@ -294,18 +309,13 @@ class _Translator(Expressions):
     def add_body(self, function: types.FunctionType, arguments: Sequence) -> tuple[Any, list[int], list[set]]:
         """Add the body of a function for its arguments; return form, memory and leads of `Translated`."""
         self._function = self._functions.innermost = function
-        node = _definition(function.__code__)
+        node, assigned, self._written = _definition(function.__code__)
         self.wraps = (function.__module__ or "").partition(".")[0] not in OURS
         if len(arguments) != len(node.args.args):
             raise Untranslated(f"{function.__name__} with arguments by default, or too many")
         self._names = dict(zip((argument.arg for argument in node.args.args), arguments, strict=True))
-        counts = Counter(name for part in ast.walk(node) for name in _assigned(part))
-        counts.update(name for name in self._names if name in counts)
-        self._changing = {name for name, count in counts.items() if count > 1}
-        parts = (part for part in ast.walk(node) if isinstance(part, ast.Subscript))
-        stores = (part.value for part in parts if isinstance(part.ctx, ast.Store))
-        self._written = {part.id for part in stores if isinstance(part, ast.Name)}
-        for name in self._changing & set(self._names):
+        self._changing = {name for name, count in assigned.items() if count + (name in self._names) > 1}
+        for name in sorted(self._changing & set(self._names)):  # so that all processes write the same
             self._store(ast.Name(name, ast.Store()), self._names[name])
         entry, body = self._builder.block, self._builder.append_basic_block("body")
         self._builder.position_at_end(body)
@@ -502,16 +512,19 @@ class _Translator(Expressions):
 
 
 @cache
-def _definition(code: types.CodeType) -> ast.FunctionDef:
-    """The syntax tree of a function."""
+def _definition(code: types.CodeType) -> tuple[ast.FunctionDef, Counter[str], set[str]]:
+    """A function as a tree, how often it assigns to each name, and the arrays whose parts it assigns to."""
     try:
         node = ast.parse(textwrap.dedent(inspect.getsource(code))).body[0]
     except (OSError, SyntaxError):
         raise Untranslated(f"the source of {code.co_name} cannot be read") from None
-    parts = code.co_name, *code.co_varnames[: code.co_argcount]
-    if not isinstance(node, ast.FunctionDef) or (node.name, *(part.arg for part in node.args.args)) != parts:
+    names = code.co_name, *code.co_varnames[: code.co_argcount]
+    if not isinstance(node, ast.FunctionDef) or (node.name, *(part.arg for part in node.args.args)) != names:
         raise Untranslated(f"{code.co_name} is no plain function, or its file has changed")
-    return node
+    parts = [*ast.walk(node)]
+    stores = (part.value for part in parts if isinstance(part, ast.Subscript) and isinstance(part.ctx, ast.Store))
+    assigned = Counter(name for part in parts for name in _assigned(part))
+    return node, assigned, {part.id for part in stores if isinstance(part, ast.Name)}
 
 
 def _set_result(function: ir.Function, kind: ir.Type | None) -> None:

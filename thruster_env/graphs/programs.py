@@ -169,6 +169,7 @@ def callable_of(program: Program, width: int, arrays: Sequence[str] = ARRAYS, sc
     exec(f"def work({arguments}):\n    run('{digest}', {width}, {arguments})\n", names)
     work = names["work"]
     work.program = program, width, arrays, scratch  # of which `loops` makes instructions
+    work.name = f"program_{digest}_{len(arrays)}"
     work.calls = [CALLED[number.arguments[0]] for number in program.works if number.operation == "call"]
     return work
 
