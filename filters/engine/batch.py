@@ -316,7 +316,7 @@ def prepared(
         raise ValueError("noise must come with dt, the lengths of the steps, but got noise alone")
     unlike = [
         length
-        for length in np.unique(lengths).tolist()
+        for length in sorted({*lengths.tolist()})
         if not same_dt(length, lengths[0] if usual is None else usual)
     ]
     if not unlike and noise is None:

@@ -8,7 +8,6 @@ from math import isfinite, prod
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.ma import MaskedArray
 
 from filters.engine.belief import (
     Belief,
@@ -266,7 +265,7 @@ class Session:
     def predict(self, u=()) -> None:
         """Predict one step ahead under input u (p,); ValueError for one that is not finite numbers."""
         try:
-            if type(u) is MaskedArray or len(u) != self._p:
+            if hasattr(u, "filled") or len(u) != self._p:
                 raise TypeError
             self._u[:] = u
         except FLAWS:
@@ -279,7 +278,7 @@ class Session:
     def update(self, z) -> None:
         """Update with measurement z (m,); NaN marks a missing channel. ValueError for an infinite one."""
         try:
-            if type(z) is MaskedArray or len(z) != self._m:
+            if hasattr(z, "filled") or len(z) != self._m:
                 raise TypeError
             self._z[:] = z
         except FLAWS:
@@ -295,7 +294,7 @@ class Session:
         Raises ValueError, before anything changes, for an input that is not finite and an infinite measurement.
         """
         try:  # inlined `_set`: its call would take a tenth of the step
-            if type(z) is MaskedArray or type(u) is MaskedArray:  # masked numbers are not valid
+            if hasattr(z, "filled") or hasattr(u, "filled"):  # numbers that are masked are not valid
                 raise TypeError
             if len(z) != self._m or self._p and len(u) != self._p:  # NumPy would repeat a single number
                 raise TypeError

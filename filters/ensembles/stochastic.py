@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from statistics import NormalDist
 from typing import Any, ClassVar
 
 import numpy as np
@@ -433,6 +432,8 @@ class LocalisedByParts(LocalisedFilter, DeterministicUpdateFilter):
         if not self.by_parts:
             return {}
         taper = super().tapers.get("taper", np.ones((self.model.n, self.model.m)))
+        from statistics import NormalDist  # here, because it imports fractions and decimals
+
         tail = NormalDist().inv_cdf(1.0 / (self.ensemble_size + 1))
         return {"taper": np.where(taper > LEAST, taper, 0.0), "tail": tail}
 

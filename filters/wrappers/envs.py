@@ -13,7 +13,6 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
-from numpy.ma import MaskedArray
 
 from filters.engine.batch import Beliefs
 from filters.engine.belief import checked_actions
@@ -181,7 +180,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if "recorded_input" in info:
             u = info["recorded_input"].tolist()
         z = info.get("measurement")
-        if z is None or "measurement_valid" in info or type(z) is MaskedArray:
+        if z is None or "measurement_valid" in info or hasattr(z, "filled"):
             z = _measurement(observation, info)
         self._session.step(u, z)
         if self._split:

@@ -52,12 +52,12 @@ def as_floats(value) -> np.ndarray:
 
 
 def _unmasked(value):
-    if isinstance(value, np.ma.MaskedArray):
+    if hasattr(value, "filled"):  # a masked array, known by what it has, because numpy.ma takes a while to import
         if value.dtype.kind == "O":
             return value.filled(math.nan)
         return np.ma.asarray(value, dtype=np.float64).filled(np.nan) if value.dtype.kind in "biuf" else None
     if isinstance(value, (list, tuple)) and any(
-        isinstance(entry, (list, tuple, np.ma.MaskedArray)) for entry in value
+        isinstance(entry, (list, tuple)) or hasattr(entry, "filled") for entry in value
     ):
         return [_unmasked(entry) for entry in value]
     return value

@@ -368,7 +368,7 @@ def table_of(columns: Any, name: str) -> Table:
 
 
 def _unmasked(values: Any) -> np.ndarray:
-    return as_floats(values) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
+    return as_floats(values) if hasattr(values, "filled") else np.asarray(values)
 
 
 def _with_index(frame: Any) -> dict:
