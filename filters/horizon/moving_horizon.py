@@ -21,7 +21,7 @@ from filters.horizon.window import HUBER, LOSSES, kept_places, limits, scratch_p
 from filters.pages.kernels import anything_measured, nothing_to_summarise, page_kernels
 from thruster_env.core.checks import at_least, one_of, positive
 from thruster_env.model.quantities import Bound
-from thruster_env.model.shape import Functions, Shape, number_offsets
+from thruster_env.model.shape import Functions, Shape
 
 MOST_PASSES = 100  # besides `iterations`, until the right bounds hold
 HALVINGS = 6  # of a step that increases the cost, if bounds do not change
@@ -40,9 +40,9 @@ def horizon_kernels(
     Extras are the number of steps, arrival mean and P, and the steps. Scratch has the numbers of a step, then the
     results of each.
     """
-    n, m, inputs = shape.n, shape.m, shape.inputs
-    layout, step_layout, at = memory_offsets(n, m), kept_places(shape), scratch_places(shape)
-    end, width, square = step_layout.end, at.end, n * n
+    n, m, t, inputs = shape.n, shape.m, shape.t, shape.inputs
+    layout, step_layout, at = memory_offsets(n, m, t), kept_places(shape), scratch_places(shape)
+    end, width, square = step_layout.end, at.end, t * t
     acting, feed = layout.extras, shape.feed  # the input of the last step, if h takes it
     number = acting + feed
     arrival = number + 1
@@ -51,11 +51,11 @@ def horizon_kernels(
     mean, cov = layout.mean, layout.cov
     sigma_offset, horizon_offset, iterations_offset = (filter_offset(shape) + k for k in (1, 2, 3))
     numbers_end, constants = iterations_offset + 1, shape.constants
-    scratch, at_numbers = numbers_offset + numbers_end, number_offsets(n, m)
+    scratch, at_numbers = numbers_offset + numbers_end, shape.offsets
     q_offset, r_offset, constants_offset = at_numbers.q, at_numbers.r, at_numbers.constants
     substeps = at_numbers.substeps
     works = window_works(functions, shape, loss)
-    tell, centre, linearise, substep, disturb, move, correct, estimate, back_off, descend, find = works
+    tell, centre, linearise, substep, disturb, move, correct, estimate, back_off, descend, find, leave = works
     clip, hold_state, hold_disturbance, push_state, update_state_set, update_disturbance_set = limits(
         shape, bounds, limited
     )
@@ -127,17 +127,18 @@ def horizon_kernels(
                     wrong = update_disturbance_set(rows, step, numbers[sigma_offset], wrong, single)
                 descend(rows, step, numbers)
             else:
-                for i in range(n):
+                for i in range(t):
                     rows[at.after + i] = 0.0
             wrong = push_state(rows, step, wrong, single)
             estimate(rows, step, numbers)
             wrong = update_state_set(rows, step, wrong, single)
             for i in range(n):
                 step[step_layout.x + i] = rows[at.estimate + i]
+            for i in range(t):
                 step[step_layout.adjoint + i] = rows[at.before + i]
             step[step_layout.fresh] = 0.0
             clip(step, step_layout.x)
-            for i in range(n):
+            for i in range(n if has_bounds else 0):
                 rows[at.step + i] += step[step_layout.x + i] - rows[at.estimate + i]
         return wrong
 
@@ -166,13 +167,12 @@ def horizon_kernels(
     def leave_first(row, numbers, count):
         """Drop the first step: its prediction of the second becomes the arrival cost of that."""
         forwards(row, numbers, 2, True)
-        second, second_step = scratch + width + at.cov, steps + end
+        second = scratch + width
+        leave(row[second : second + 2 * width], row[steps + end : steps + 3 * end], numbers)
         for i in range(n):
-            expected = row[second_step + step_layout.x + i]
-            for k in range(n):
-                row[arrival + n + i * n + k] = row[second + i * n + k]
-                expected -= row[second + i * n + k] * row[second_step + step_layout.adjoint + k]
-            row[arrival + i] = expected
+            row[arrival + i] = row[second + at.estimate + i]
+        for i in range(square):
+            row[arrival + n + i] = row[second + at.updated_cov + i]
         for i in range(steps, steps + (count - 1) * end):
             row[i] = row[i + end]
         row[number] = count - 1.0
@@ -272,6 +272,7 @@ def horizon_kernels(
         extras=numbers_offset - acting,
         scratch=numbers_end + (room + 1) * width,
         acting=tuple(range(acting, number)),
+        turns=len(shape.turns),
     )
 
 
@@ -351,16 +352,23 @@ class MovingHorizonFilter(Filter):
         """Kernels for the model's functions; see `Filter.kernels`."""
         return horizon_kernels(
             self.kernel_model.functions,
-            self.kernel_model.shape,
+            self.kernel_model.any_shape if self.takes_rotations else self.kernel_model.shape,
             room=self._kernel_horizon,
             loss=self.loss,
             bounds=self.model.bounds,
             limited=self.disturbance_limit < math.inf,
         )
 
+    @property
+    def takes_rotations(self) -> bool:
+        """Whether it takes the rotations of its model: of states, without bounds; no direction steps back."""
+        model = self.kernel_model
+        free = not (model.bounds or model.measured_turns) and self.disturbance_limit == math.inf
+        return free and all(turn.kind != "direction" for turn in model.turns)
+
     def window(self, belief: Belief) -> np.ndarray:
         """The last estimates (at most L, n) of the states of the window, the oldest first."""
-        shape, n = self.kernel_model.shape, self.model.n
+        shape, n, t = self.kernel_model.any_shape, self.model.n, self.model.t
         layout, feed = kept_places(shape), shape.feed
-        steps = belief.extras[feed + 1 + n + n * n :].reshape(self._kernel_horizon + 1, layout.end)
+        steps = belief.extras[feed + 1 + n + t * t :].reshape(self._kernel_horizon + 1, layout.end)
         return steps[: int(belief.extras[feed]), layout.x : layout.x + n].copy()

@@ -6,7 +6,9 @@ They use deviations d_j = x_j - X_j from the estimate X of the window, about whi
     backwards:  l = g + (I - K H)' l,  g = H' S^-1 (z_j - h(X_j) - H d_j),  x_j = X_j + d_j + P_j l,
                 l = F_{j-1}' l
 
-with d_j and P_j before the update in the last line. The adjoint l, a vector, needs neither P^-1 nor Q^-1: both may
+with d_j and P_j before the update in the last line. Of states that turn, d_j lies in the tangent at X_j
+(`thruster_env.model.turns`): f(X_j) - X_{j+1} is the difference c there, F_j and Q are brought there by J(c), and
+x_j is X_j moved.  The adjoint l, a vector, needs neither P^-1 nor Q^-1: both may
 be singular. Components at a bound are conditioned on it, or released (`limits`).
 
 Source: Bryson, Frazier (1963), "Smoothing for linear and nonlinear dynamic systems".
@@ -38,6 +40,7 @@ from filters.algebra.operations import (
 )
 from filters.algebra.points import dot
 from filters.algebra.roots import careful
+from filters.algebra.tangents import differences, inverse_reset_slopes, move, reset, reset_back
 from filters.engine.belief import memory_offsets
 from filters.gaussian import extended
 from filters.pages.kernels import Stage, programs_of, stored
@@ -60,12 +63,12 @@ class Kept(NamedTuple):
     u: int  # (p,), from this step to the next one; at 0, as in `given` of other programs
     x: int  # (n,), X
     z: int  # (m,), infinite where missing: a belief must not be NaN
-    adjoint: int  # (n,), l before the update
+    adjoint: int  # (t,), l before the update
     fresh: int  # 1 until the step was part of a pass
-    sides: int  # (2 n,), which bounds hold the state and the disturbance after it: -1, 0 or 1
+    sides: int  # (2 t,), which bounds hold the state and the disturbance after it: -1, 0 or 1
     R: int  # (m, m), of z
     seen_by: int  # (c,), the model's constants at z
-    Q: int  # (n, n), from this step to the next one
+    Q: int  # (t, t), from this step to the next one
     moved_by: int  # (c,), constants of that motion
     substeps: int  # of it; zero before a second reading at the same time
     acting: int  # (p,), the input at z, if h takes it
@@ -75,45 +78,45 @@ class Kept(NamedTuple):
 class Scratch(NamedTuple):
     """Offsets of the results of a step, in scratch."""
 
-    d: int  # (n,), before the update
-    cov: int  # (n, n)
+    d: int  # (t,), before the update; at first the arrival's mean (n,)
+    cov: int  # (t, t)
     updated_d: int
     updated_cov: int
     z: int  # (m,), NaN where missing
     mean: int  # (n,), f(X)
-    slope: int  # (n, n), F
-    without: int  # (n, n), I - K H
-    pull: int  # (n,), g
-    after: int  # (n,), l after the update, then after the bounds
-    before: int  # (n,), l before the update
+    slope: int  # (t, t), F
+    without: int  # (t, t), I - K H
+    pull: int  # (t,), g
+    after: int  # (t,), l after the update, then after the bounds
+    before: int  # (t,), l before the update
     estimate: int  # (n,), the new X
-    step: int  # (n,), from the last X to the new one
+    step: int  # (t,), from the last X to the new one
     seen_cost: int  # of the measurement, and of the arrival in the first step
     moved_cost: int  # of the disturbance after this step
-    noise: int  # (n,), mean of the disturbance after this step
-    noise_cov: int  # (n, n), of it
-    disturbance: int  # (n,), estimate of it
-    spread: int  # (n,), its standard deviations
-    holds: int  # (2 n, n + 2), gain k, variance s and jump v of each bound that holds
+    noise: int  # (t,), mean of the disturbance after this step
+    noise_cov: int  # (t, t), of it
+    disturbance: int  # (t,), estimate of it
+    spread: int  # (t,), its standard deviations
+    holds: int  # (2 t, t + 2), gain k, variance s and jump v of each bound that holds
     end: int
 
 
 @cache
 def kept_places(shape: Shape) -> Kept:
     """Offsets of the numbers that a belief keeps of a step."""
-    n = shape.n
-    square, constants = n * n, shape.constants
-    of_step = shape.inputs, n, shape.m, n, 1, 2 * n, shape.m**2, constants, square, constants, 1, shape.feed
+    n, t = shape.n, shape.t
+    square, constants = t * t, shape.constants
+    of_step = shape.inputs, n, shape.m, t, 1, 2 * t, shape.m**2, constants, square, constants, 1, shape.feed
     return Kept(*starts_of(*of_step))
 
 
 @cache
 def scratch_places(shape: Shape) -> Scratch:
     """Offsets of the results of a step."""
-    n, m, square = shape.n, shape.m, shape.n * shape.n
+    n, m, t, square = shape.n, shape.m, shape.t, shape.t * shape.t
     return Scratch(
         *starts_of(
-            n, square, n, square, m, n, square, square, n, n, n, n, n, 1, 1, n, square, n, n, 2 * n * (n + 2)
+            n, square, t, square, m, n, square, square, t, t, t, n, t, 1, 1, t, square, t, t, 2 * t * (t + 2)
         )
     )
 
@@ -132,6 +135,7 @@ class Works(NamedTuple):
     back_off: Callable  # undo half of the last step
     descend: Callable  # l of this step, from that of the next one
     find: Callable  # the estimate of the disturbance after this step
+    leave: Callable  # the arrival's mean and P, in place of the estimate and the updated P, of the step before
 
 
 def tell(model, x, P, z):
@@ -185,52 +189,59 @@ def cost_of(v, cov):
 @lru_cache(maxsize=64)
 def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
     """The computations of the steps of a window, for a model's functions and sizes, and a loss."""
-    n, m = shape.n, shape.m
-    step_layout, at, row = kept_places(shape), scratch_places(shape), memory_offsets(n, m)
+    n, m, t = shape.n, shape.m, shape.t
+    step_layout, at, row = kept_places(shape), scratch_places(shape), memory_offsets(n, m, t)
     outputs = row.innovation, row.innovation_cov, row.log_likelihood
 
     def stages(memory: RowMemory, model: Equations) -> list[Stage]:
-        angles = model.state_angles
         x, fresh = memory.read("given", step_layout.x, n), memory.read("given", step_layout.fresh)
         next_x = memory.read("given", step_layout.end + step_layout.x, n)
 
-        def vector(offset):
-            return memory.read("rows", offset, n)
+        def vector(offset, size=t):
+            return memory.read("rows", offset, size)
 
         def square(offset, *, symmetric=False):
-            return memory.read("rows", offset, n, n, symmetric=symmetric)
+            return memory.read("rows", offset, t, t, symmetric=symmetric)
 
         d, P = vector(at.d), square(at.cov, symmetric=True)
         updated_d, updated_P = vector(at.updated_d), square(at.updated_cov, symmetric=True)
         z, after, before = memory.read("rows", at.z, m), vector(at.after), vector(at.before)
         next_before, noise = vector(at.end + at.before), vector(at.noise)
         noise_cov = square(at.noise_cov, symmetric=True)
-        mean, F, without = vector(at.mean), square(at.slope), square(at.without)
+        mean, F, without = vector(at.mean, n), square(at.slope), square(at.without)
         next_d, next_P = vector(at.end + at.d), square(at.end + at.cov, symmetric=True)
         adjoint = vector(at.pull) + without.T @ after
-        estimate, step, shift = vector(at.estimate), vector(at.step), d + P @ adjoint
-        half, jump, centred = step * 0.5, wrap(mean - next_x, angles), wrap(d - x, angles)
+        estimate, step, shift = vector(at.estimate, n), vector(at.step), d + P @ adjoint
+        half, jump, centred = step * 0.5, differences(model, mean, next_x), differences(model, vector(at.d, n), x)
+        arrival_P = reset_back(model, P, x, centred)
+        leaving = P @ memory.read("given", step_layout.adjoint, t) * -1.0
+        reached, reached_P = F @ updated_d + noise, sym(F @ updated_P @ F.T) + noise_cov
+        slopes = {}
+        if model.turns:  # from the tangent at f(X) to that at the next X
+            J = inverse_reset_slopes(next_x, jump, model.turns)
+            reached, reached_P, slopes = J @ reached, reset_back(model, reached_P, next_x, jump), {F: J @ F}
         model.extras = {ACTING: memory.read("rows", row.extras, shape.feed)}
         results = tell(model, memory.x, memory.P, memory.z)
         model.extras = {ACTING: memory.read("given", step_layout.acting, shape.feed)}
         return [
             stored(results, outputs),
-            stored((centred, cost_of(centred, P)), (d, at.seen_cost)),
+            stored((centred, arrival_P, cost_of(centred, arrival_P)), (d, P, at.seen_cost)),
             stored(represent_jacobian(model, x, P), (mean, F)),
             stored(propagate_jacobian(model, mean, F, memory.u), (mean, F)),
             stored((noise * 0.0, model.Q), (noise, noise_cov)),
             stored(
-                (F @ updated_d + jump + noise, sym(F @ updated_P @ F.T) + noise_cov, cost_of(jump, model.Q)),
-                (next_d, next_P, at.moved_cost),
+                (reached + jump, reached_P, cost_of(jump, model.Q), *slopes.values()),
+                (next_d, next_P, at.moved_cost, *slopes),
             ),
             stored(
                 correct(model, x, d, P, z, fresh, loss),
                 (updated_d, updated_P, without, vector(at.pull), at.seen_cost),
             ),
-            stored((adjoint, wrap(x + shift, angles), shift), (before, estimate, step)),
-            stored((wrap(x - half, angles), half), (estimate, step)),
+            stored((adjoint, move(model, x, shift), shift), (before, estimate, step)),
+            stored((move(model, x, half * -1.0), half), (estimate, step)),
             stored((F.T @ next_before,), (after,)),
             stored((noise + noise_cov @ next_before,), (vector(at.disturbance),)),
+            stored((move(model, x, leaving), reset(model, P, x, leaving)), (estimate, updated_P)),
         ]
 
     page = Page(extended.propagate, extended.add_process_noise, extended.update, own=OWN)
@@ -308,7 +319,7 @@ def limits(shape: Shape, bounds: tuple[Bound, ...], limited: bool) -> Limits:
     Source: Judice, Pires (1994), "A block principal pivoting algorithm for large-scale strictly monotone linear
     complementarity problems", Computers & Operations Research 21(5).
     """
-    n, step_layout, at = shape.n, kept_places(shape), scratch_places(shape)
+    n, step_layout, at = shape.t, kept_places(shape), scratch_places(shape)  # without rotations, if it has bounds
     low, high = [-math.inf] * n, [math.inf] * n
     for bound in bounds:
         low[bound.place], high[bound.place] = bound.low, bound.high

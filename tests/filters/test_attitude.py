@@ -30,7 +30,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import Rotation
 
 ENSEMBLES = "enkf", "etkf", "letkf", "ensrf", "denkf", "ienkf", "enkf-n"
-OTHERS = "pf", "apf", "rbpf", "imm", "mmae", "gsf"  # of particles, modes and parts
+OTHERS = "pf", "apf", "rbpf", "imm", "mmae", "gsf", "mhe"  # of particles, modes, parts and windows
 DT, GYRO, WALK, SENSOR, BIAS = 0.1, 2e-3, 2e-4, 0.05, 0.02
 GRAVITY, FIELD = (0.0, 0.0, 1.0), (0.0, 0.6, -0.8)
 TAKE_ROTATIONS = {  # each with parameters that make it another one, with others

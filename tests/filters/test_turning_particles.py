@@ -1,16 +1,18 @@
-"""Particles, modes and parts of a mixture that turn: about one axis they are those of an angle."""
+"""Particles, modes, parts of a mixture and windows that turn: about one axis they are those of an angle."""
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation as Turned
 
 import filters
+from tests.filters.test_attitude import SENSOR, advance, attitude_model, directions, simulated
 from tests.filters.test_measured_rotations import is_at, left_jacobian, tracked, tracker_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.model import rotations
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import Direction, Rotation, difference
+from thruster_env.model.turns import Direction, Rotation, difference, move
 
 DT = 0.1
 KINDS = [
@@ -27,25 +29,35 @@ KINDS = [
     ("imm", {"mode_filter": "ukf"}),
     ("mmae", {}),
     ("gsf", {"component": 2, "parts": 7}),
+    ("mhe", {"horizon": 3, "iterations": 4}),
+    ("mhe", {"horizon": 2, "loss": "student"}),
 ]
 
 
-def heading_model(turns, deviation=0.4):
-    """A heading, whose rate is the input less a bias, as a rotation that stays level or as three angles."""
+def heading_model(turns, name):
+    """A heading, whose rate is the input less a bias, as a rotation that stays level or as three angles.
+
+    It is measured as a rotation, for `mhe` as a vector in the axes of the body.
+    """
 
     def turn(x, u, c):
         return *rotations.product(x[:4], rotations.exponential((0.0, 0.0, (u[0] - x[4]) * DT))), x[4]
 
+    def observe(x, c):
+        if turns:
+            return rotations.to_body(x[:4], (1.0, 0.5, 0.0))
+        return np.cos(x[2]) + 0.5 * np.sin(x[2]), 0.5 * np.cos(x[2]) - np.sin(x[2]), 0.0 * x[2]
+
     exact = 1e-12**2
     return StateSpaceModel(
         transition=turn if turns else lambda x, u, c: (x[0], x[1], x[2] + (u[0] - x[3]) * DT, x[3]),
-        observe=(lambda x, c: x[:4]) if turns else lambda x, c: x[:3],
+        observe=observe if name == "mhe" else (lambda x, c: x[:4]) if turns else lambda x, c: x[:3],
         process_noise_cov=[0.0, 0.0, 0.05**2, 0.02**2],
-        measurement_noise_cov=[exact, exact, 0.2**2],
+        measurement_noise_cov=[0.2**2] * 3 if name == "mhe" else [exact, exact, 0.2**2],
         prior_mean=[1.0, 0.0, 0.0, 0.0, 0.1] if turns else [0.0, 0.0, 0.0, 0.1],
-        prior_cov=[0.0, 0.0, deviation**2, 0.1**2],
+        prior_cov=[0.0, 0.0, 0.4**2, 0.1**2],
         states=(Rotation("attitude"), "bias") if turns else ("x", "y", "heading", "bias"),
-        measurements=(Rotation("compass", "m"),) if turns else ("m_x", "m_y", "m_z"),
+        measurements=(Rotation("compass", "m"),) if turns and name != "mhe" else ("m_x", "m_y", "m_z"),
         inputs=1,
     )
 
@@ -65,10 +77,12 @@ def test_about_one_axis_a_rotation_is_an_angle(name, parameters):
     """With the same draws: means, covariances, innovations and likelihoods, of a state and a measurement."""
     inputs, z = headings()
     quaternions = np.array([rotations.exponential(row) for row in z])
+    if name == "mhe":
+        quaternions = z = np.stack([np.cos(z[:, 2]), -np.sin(z[:, 2]), 0.0 * z[:, 2]], axis=1)
     size = {"ensemble_size": 24} if name in ("pf", "apf", "rbpf") else {}
     turning, plain = (
         filters.run(
-            filters.make_filter(name, heading_model(turns), **parameters, **size),
+            filters.make_filter(name, heading_model(turns, name), **parameters, **size),
             keys=np.array([[3, 4]]),
             inputs=inputs[None],
             measurements=measured[None],
@@ -166,3 +180,39 @@ def test_parts_of_a_mixture_are_merged_in_the_tangent_at_their_mean(name):
         J[:3, :3] = np.linalg.inv(left_jacobian(-off[:3]))
         cov += weight * (J @ part @ J.T + np.outer(off, off))
     is_at(belief.mean, belief.cov, q, bias, cov)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_moving_horizon_has_the_most_probable_attitudes():
+    """Of four steps from 40 degrees: scipy's minimum of the cost; the side of the error does not matter."""
+    _, gyro, z = (part[0] for part in simulated(1, 6, 40.0))
+    model = attitude_model(degrees=40.0)
+    filter_ = filters.make_filter("mhe", model, loss="quadratic", iterations=12)
+    belief, _ = filter_.update(filter_.init(), z[0])
+    for k in range(3):
+        belief, _ = filter_.update(filter_.predict(belief, gyro[k]), z[k + 1])
+    roots = [np.sqrt(np.diag(cov)) for cov in (model.prior_cov, model.process_noise_cov)]
+
+    def residuals(d):
+        x = [np.array(move(state, step, model.turns)) for state, step in zip(window, d.reshape(4, 6), strict=True)]
+        parts = [np.array(difference(x[0], model.prior_mean, model.turns)) / roots[0]]
+        parts += [(z[k] - directions(x[k], ())) / SENSOR for k in range(4)]
+        ahead = (advance(x[k], gyro[k], model.constants) for k in range(3))
+        parts += [
+            np.array(difference(y, after, model.turns)) / roots[1] for y, after in zip(x[1:], ahead, strict=True)
+        ]
+        return np.concatenate(parts)
+
+    window = filter_.window(belief)
+    found = least_squares(residuals, np.zeros(24), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    assert np.abs(found.x).max() < 1e-6
+    np.testing.assert_allclose(belief.cov, np.linalg.inv(found.jac.T @ found.jac)[18:, 18:], atol=1e-6)
+    body, world = (
+        filters.run(
+            filters.make_filter("mhe", attitude_model(side, degrees=40.0), horizon=2, iterations=8),
+            inputs=gyro,
+            measurements=z,
+        )
+        for side in ("body", "world")
+    )
+    np.testing.assert_allclose(world.means, body.means, atol=1e-9)
