@@ -30,14 +30,20 @@ from thruster_env.model.shape import (
     Shape,
     constants_reader,
     for_any_input,
-    number_offsets,
     observation_slopes,
     padded,
     transition_slopes,
 )
 from thruster_env.model.simulate import noise_step, simulate, truth_steps
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import refuse_rotations
+from thruster_env.model.traced import called_function
+from thruster_env.model.turns import (
+    refuse_measured,
+    refuse_rotations,
+    slopes_of_stored,
+    slopes_of_tangent,
+    tangent_of,
+)
 
 if TYPE_CHECKING:
     from thruster_env.graphs.loops import Loops
@@ -220,7 +226,9 @@ def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int =
 
     which loses no digits where Q is small beside F P F'. Expectations are over truths of one sequence: with
     Jacobians pooled over different inputs, the result would not be a bound. It bounds squares of plain errors: of
-    a state that is an angle, `filters.bounds.wrapped_variances` of it bounds those of wrapped ones.
+    a state that is an angle, `filters.bounds.wrapped_variances` of it bounds those of wrapped ones. With rotations
+    F, H and P are of the tangent (t, t) at the truth, which leaves out its curvature: a bound of small errors, up
+    to some 20 degrees.
 
     Args:
         model: the model that draws the truth; Q must be positive definite.
@@ -270,18 +278,18 @@ def posterior_variances(
     inputs, keys = np.ascontiguousarray(inputs[rows], dtype=np.float64), np.ascontiguousarray(keys[rows])
     count, steps = inputs.shape[:2]
     most = max(MOST_BYTES // (8 * MATRICES * (steps + 1) * model.n**2), cores())
-    variances = np.empty((count, steps + 1, model.n))
+    variances = np.empty((count, steps + 1, model.t))
     parts = [slice(first, min(first + most, count)) for first in range(0, count, most)]
     for part in with_progress("posterior bound", parts, [len(inputs[part]) for part in parts]):
         variances[part] = np.einsum("bkii->bki", _posterior_bound(model, inputs[part], keys[part]))
-    return wrapped_variances(variances, model.shape.state_angles)
+    return wrapped_variances(variances, [quantity.angle for quantity in tangent_of(model)])
 
 
 def gathering_code(model: StateSpaceModel) -> tuple[Loops, str]:
     """What sums up Jacobians for the bound of a model, and a hash of all code that determines the bound."""
     functions = model.functions
     fingerprint = function_fingerprint(*(function for function in functions if function is not None))
-    return _gatherer(functions, model.shape, is_interpreting()), fingerprint + _sources_hash()
+    return _gatherer(functions, model.any_shape, is_interpreting()), fingerprint + _sources_hash()
 
 
 def sources_hash(*packages: str) -> str:
@@ -318,14 +326,15 @@ def _truth_keys(count: int, truths: int, seed: int) -> np.ndarray:
 
 def _posterior_bound(model: StateSpaceModel, inputs: np.ndarray, keys: np.ndarray) -> np.ndarray:
     """The bound of `posterior_bound` from the truths of these keys, by square roots S S' = P."""
+    refuse_measured(model, "a bound")
     if not has_bound(model.process_noise_cov):
         raise ValueError(f"the bound needs a positive definite Q, but got {model.process_noise_cov.tolist()}")
-    (count, steps, _), n = inputs.shape, model.n
+    (count, steps, _), n = inputs.shape, model.t
     f_mean, spread_of_f, information = (np.zeros((count, steps + 1, n, n)) for _ in range(3))
     q_inverse, r_inverse = _inverse(model.process_noise_cov), _inverse(model.measurement_noise_cov)
     weights, sums = (q_inverse.ravel(), r_inverse.ravel()), (f_mean, spread_of_f, information)
     fixed = np.ascontiguousarray(inputs), model.numbers, *weights, *sums
-    add, done = _gatherer(model.functions, model.shape, is_interpreting()), 0
+    add, done = _gatherer(model.functions, model.any_shape, is_interpreting()), 0
     # Some truths at a time, in the same order: Ctrl-C is heard in between.
     size = max(int(WORK_AT_ONCE / (max(count, 1) * (steps + 1) * n**3)), 1)
     parts = [np.ascontiguousarray(keys[:, first : first + size]) for first in range(0, keys.shape[1], size)]
@@ -378,20 +387,20 @@ def _square(root: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
-    n, m, transition = shape.n, shape.m, functions.transition
+    n, t, m, transition = shape.n, shape.t, shape.m, functions.transition
     transition_matrix = transition_slopes(functions, shape)
     observation_matrix = for_any_input(observation_slopes(functions, shape), shape, "x, scales")
-    (begin, _, _), disturb = truth_steps(functions, shape), noise_step(n, m)
+    (begin, _, _), disturb = truth_steps(functions, shape), noise_step(shape)
     state, store_state = vector_reader(n), vector_writer(n)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
-    scales = vector_reader(n, number_offsets(n, m).scales)
-    substeps, room = number_offsets(n, m).substeps, padded(max(n, m), GROUP)
-    times, identity = multiplier(n, n, n), matrix_reader(n, n)
-    read_weight_n, read_weight_m = matrix_reader(n, n), matrix_reader(m, m)
-    quadratic_n, quadratic_m = quadratic_form(n, n), quadratic_form(m, n)
-    accumulate = _into("out[b, k, {i}, {j}] += weight * a[{i}][{j}]", n)
-    move_mean = _into("out[b, k, {i}, {j}] += weight * (a[{i}][{j}] - out[b, k, {i}, {j}])", n)
-    less_mean = _from_mean(n, functions.transition_jacobian is None)
+    scales, substeps = vector_reader(n, shape.offsets.scales), shape.offsets.substeps
+    room, times, identity = padded(max(n, m), GROUP), multiplier(n, n, n), matrix_reader(n, n)
+    read_weight_n, read_weight_m = matrix_reader(t, t), matrix_reader(m, m)
+    quadratic_n, quadratic_m = quadratic_form(t, t), quadratic_form(m, t)
+    accumulate = _into("out[b, k, {i}, {j}] += weight * a[{i}][{j}]", t)
+    move_mean = _into("out[b, k, {i}, {j}] += weight * (a[{i}][{j}] - out[b, k, {i}, {j}])", t)
+    less_mean = _from_mean(t, functions.transition_jacobian is None)
+    columns, rows, tangent = _on_tangent(shape)
 
     def whole_step(x, u, numbers, c, eye):
         f = identity(eye)
@@ -414,24 +423,71 @@ def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
                 for i in range(u.shape[0]):
                     u[i] = 0.0
                 for k in range(f_mean.shape[1]):
-                    measured = quadratic_m(observation_matrix(state(x), s, control(u), c), weight_r)
+                    measured = quadratic_m(
+                        columns(observation_matrix(state(x), s, control(u), c), state(x)), weight_r
+                    )
                     accumulate(information, b, k, measured, 1.0)
                     if k == inputs.shape[1]:
                         break
                     for i in range(u.shape[0]):
                         u[i] = inputs[b, k, i]
                     f, predicted = whole_step(state(x), control(u), numbers, c, eye)
-                    apart = quadratic_n(less_mean(f, f_mean, b, k, state(x), s), weight_q)
+                    of_errors = rows(f, state(x), predicted)
+                    apart = quadratic_n(
+                        less_mean(of_errors, f_mean, b, k, tangent(state(x)), tangent(s)), weight_q
+                    )
                     accumulate(spread_of_f, b, k, apart, 1.0 - share)
-                    move_mean(f_mean, b, k, f, share)
+                    move_mean(f_mean, b, k, of_errors, share)
                     store_state(x, predicted)
                     disturb(x, draws, k + 1, key_0, key_1, numbers)
 
     from thruster_env.graphs.loops import Loops
 
-    matrices, weights = [(None, None, n, n)] * 3, ((n * n,), (m * m,))
+    matrices, weights = [(None, None, t, t)] * 3, ((t * t,), (m * m,))
     shapes = (None, None, 2), None, (None, None, None), (None,), *weights, *matrices, None, None
     return Loops(gather, shapes)
+
+
+def _same(x):
+    return x
+
+
+def _first_of_two(h, x):
+    return h
+
+
+def _first_of_three(f, x, y):
+    return f
+
+
+def _on_tangent(shape: Shape):
+    """Functions of H and x, of F, x and f(x), and of a vector (n,): these on the tangent, as P has it.
+
+    At the true states, so that errors of the body are in the axes of the truth; for small errors.
+    """
+    n, t, m, turns = shape.n, shape.t, shape.m, shape.turns
+    if not turns:
+        return _first_of_two, _first_of_three, _same
+
+    def stored(x, c):
+        return tuple(map(tuple, slopes_of_stored(x, turns)))
+
+    def back(x, c):
+        return tuple(map(tuple, slopes_of_tangent(x, turns)))
+
+    by_stored = called_function(stored, "x, c", (n, 0), 0, (n, t))
+    by_tangent = called_function(back, "x, c", (n, 0), 0, (t, n))
+    of_h, of_columns, of_rows = multiplier(m, n, t), multiplier(n, n, t), multiplier(t, n, t)
+    numbers = np.delete(np.arange(n), [turn.stored for turn in turns]).tolist()
+    source = Source("tangent", "x", result=(t,), x=(n,))
+
+    def columns(h, x):
+        return of_h(h, by_stored(x, ()))
+
+    def rows(f, x, y):
+        return of_rows(by_tangent(y, ()), of_columns(f, by_stored(x, ())))
+
+    return columns, rows, source.function(source.vector(t, lambda i: f"x[{numbers[i]}]"))
 
 
 def _into(line: str, n: int):

@@ -188,16 +188,6 @@ def _measure(x, c):
     return force[0], force[1], force[2] + x[BIAS], *field
 
 
-def _roll(x, c):
-    below = rotations.matrix(x[:4])[2]
-    return np.arctan2(below[1], below[2])
-
-
-def _pitch(x, c):
-    below = rotations.matrix(x[:4])[2]
-    return np.arctan2(-below[0], np.sqrt(below[1] * below[1] + below[2] * below[2]))
-
-
 def heave(
     dt: float = 0.02,
     significant_height: float = 1.5,
@@ -269,8 +259,4 @@ def heave(
         ),
         input_quantities=GYROSCOPE,
         measurements=MEASURED,
-        outputs={
-            "roll": (Quantity("roll", "roll", "rad"), _roll),
-            "pitch": (Quantity("pitch", "pitch", "rad"), _pitch),
-        },
     )

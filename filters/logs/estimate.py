@@ -17,6 +17,7 @@ from filters.live import Live
 from filters.smoothers import smoothed_rows
 from filters.starts import FirstRestart, Restarts, begun_at, first_measured
 from filters.wrappers.arguments import filter_for
+from thruster_env.core.angles import difference
 from thruster_env.core.checks import at_least
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.model_env import ReplayEnv
@@ -98,12 +99,13 @@ class LogEstimate(NamedTuple):
     def output(self, symbol: str) -> tuple[np.ndarray, np.ndarray]:
         """An output of the model at the estimates, (K + 1,), and its standard deviation, linearised."""
         stds, here = self.stds, self.model.output(symbol, self.means)
+        angle = self.model.outputs[symbol].quantity.angle
         slopes = np.zeros_like(self.means)
         for i in range(self.means.shape[1]):
             step = np.zeros_like(self.means)
             step[:, i] = np.where(stds[:, i] > 0, STEP * stds[:, i], 1.0)
             ends = [self.model.output(symbol, self.means + sign * step) for sign in (1, -1)]
-            slopes[:, i] = (ends[0] - ends[1]) / (2 * step[:, i])
+            slopes[:, i] = difference(ends[0][:, None], ends[1][:, None], (angle,))[:, 0] / (2 * step[:, i])
         return here, np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", slopes, self.covs, slopes), 0.0))
 
 

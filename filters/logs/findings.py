@@ -39,6 +39,8 @@ from thruster_env.core.sources import as_value, is_array
 from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.logs.columns import OUTPUT, STATE, plain, suffix
 from thruster_env.logs.findings import GAP, OUTLIER, SPOILING, sentences
+from thruster_env.model import rotations
+from thruster_env.model.euler import EulerAngle
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.simulate import inputs_until
 
@@ -112,8 +114,10 @@ def findings(estimate: LogEstimate, skip: int | None = None) -> LogFindings:
         white = whiteness_of(e[None], present[None]) if len(e) > LAGS else None
     predictions = [_residual(quantity, -innovations[:, j]) for j, quantity in enumerate(log.measured)]
     references = [
-        _residual(log.referred[key], reference_errors(estimate, key)[first:]) for key in compared(estimate)
+        _residual(*_in_degrees(quantity, estimate, reference_errors(estimate, key)[first:]))
+        for key, (quantity, _) in compared(estimate).items()
     ]
+    references += [_residual(quantity, errors[first:]) for quantity, errors in _turned(estimate)]
     return LogFindings(
         first,
         int(measured.sum()),
@@ -126,15 +130,58 @@ def findings(estimate: LogEstimate, skip: int | None = None) -> LogFindings:
     )
 
 
-def compared(estimate: LogEstimate) -> list[str]:
-    """The reference channels of a log that the filter's model has as a state or as an output."""
-    states, outputs = {state.symbol for state in estimate.model.states}, set(estimate.model.outputs)
+def compared(estimate: LogEstimate) -> dict[str, tuple[Quantity, np.ndarray]]:
+    """The references of a log (K + 1,) that the filter's model has as a state or an output, by channel.
+
+    A quaternion is compared by its roll, pitch and yaw, since q and -q are the same attitude.
+    """
+    log, model = estimate.log, estimate.model
+    states, outputs = {state.symbol for state in model.states}, set(model.outputs)
     known = {STATE: states}
-    return [
-        key
-        for key in estimate.log.references
+    references = {
+        key: (log.referred[key], values)
+        for key, values in log.references.items()
         if key.partition(":")[2] in known.get(key.partition(":")[0], outputs)
-    ]
+    }
+    for _, keys, q in _quaternions(estimate):
+        for key in keys:
+            del references[key]
+        at = next(i for i, state in enumerate(model.states) if f"{STATE}:{state.symbol}" == keys[0])
+        for symbol, output in model.outputs.items():
+            if isinstance(output.function, EulerAngle) and output.function.stored == at:
+                values = rotations.euler(q)[output.function.axis]
+                references[f"{OUTPUT}:{symbol}"] = output.quantity, values
+    return references
+
+
+def _quaternions(estimate: LogEstimate) -> list[tuple[Quantity, list[str], list[np.ndarray]]]:
+    """The angle of each rotation whose reference a log has, the channels and the numbers of this (K + 1,)."""
+    model, log, result = estimate.model, estimate.log, []
+    for turn in model.turns:
+        symbols = [state.symbol for state in model.states[turn.quaternion]]
+        keys = [f"{STATE}:{symbol}" for symbol in symbols]
+        if turn.kind != "direction" and all(key in log.references for key in keys):
+            quantity = Quantity(f"{turn.name} angle", f"{symbols[0].rpartition('_')[0]}_angle", "deg")
+            result.append((quantity, keys, [log.references[key] for key in keys]))
+    return result
+
+
+def _turned(estimate: LogEstimate) -> list[tuple[Quantity, np.ndarray]]:
+    """The angle [deg] between estimate and reference (K + 1,) of each rotation that the log has."""
+    angles = []
+    for quantity, keys, q in _quaternions(estimate):
+        back = rotations.inverse([estimated(estimate, key)[0] for key in keys])
+        apart = np.stack(rotations.logarithm(rotations.product(back, q)))
+        angles.append((quantity, np.rad2deg(np.sqrt((apart**2).sum(axis=0)))))
+    return angles
+
+
+def _in_degrees(quantity: Quantity, estimate: LogEstimate, values: Any) -> tuple[Quantity, Any]:
+    """An output's quantity and values, those of roll, pitch and yaw of a rotation in degrees."""
+    output = estimate.model.outputs.get(quantity.symbol)
+    if output is None or not isinstance(output.function, EulerAngle):
+        return quantity, values
+    return quantity._replace(unit="deg"), np.rad2deg(values)
 
 
 def estimated(estimate: LogEstimate, channel: str) -> tuple[np.ndarray, np.ndarray]:
@@ -148,8 +195,8 @@ def estimated(estimate: LogEstimate, channel: str) -> tuple[np.ndarray, np.ndarr
 
 def reference_errors(estimate: LogEstimate, channel: str) -> np.ndarray:
     """Estimate less reference, (K + 1,), angles the short way round; NaN where the reference has no sample."""
-    values, reference = estimated(estimate, channel)[0], estimate.log.references[channel]
-    return difference(values[:, None], reference[:, None], (estimate.log.referred[channel].angle,))[:, 0]
+    values, (quantity, reference) = estimated(estimate, channel)[0], compared(estimate)[channel]
+    return difference(values[:, None], reference[:, None], (quantity.angle,))[:, 0]
 
 
 def _residual(quantity: Quantity, errors: np.ndarray) -> Residual:
@@ -342,13 +389,14 @@ def columns_of(estimate: LogEstimate, alarms: LogAlarms | None = None) -> dict[s
         columns[header_of("input", quantity)] = values
     for quantity, values in zip(log.measured, log.measurements.T, strict=True):
         columns[header_of("measured", quantity)] = values
-    for key in compared(estimate):
-        columns[header_of("reference", log.referred[key])] = log.references[key]
+    for quantity, values in compared(estimate).values():
+        named, values = _in_degrees(quantity, estimate, values)
+        columns[header_of("reference", named)] = values
     for quantity, mean, std in zip(model.states, estimate.means.T, estimate.stds.T, strict=True):
         columns[header_of("", quantity)], columns[header_of("std", quantity)] = mean, std
     for symbol, output in model.outputs.items():
-        named = output.quantity._replace(symbol=symbol)
-        columns[header_of("", named)], columns[header_of("std", named)] = estimate.output(symbol)
+        named, values = _in_degrees(output.quantity._replace(symbol=symbol), estimate, estimate.output(symbol))
+        columns[header_of("", named)], columns[header_of("std", named)] = values
     deviations = np.sqrt(np.maximum(np.einsum("kii->ki", estimate.innovation_covs), 0.0))
     for quantity, values, std in zip(log.measured, estimate.innovations.T, deviations.T, strict=True):
         columns[header_of("innovation", quantity)], columns[header_of("innovation_std", quantity)] = values, std
@@ -425,7 +473,10 @@ def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: 
     values = [f"{STATE}:{quantity.symbol}" for quantity in model.states] + [
         f"{OUTPUT}:{symbol}" for symbol in model.outputs
     ]
-    plotted = sorted(values, key=lambda key: key not in references)[:MOST_PANELS]
+    turned = {
+        f"{STATE}:{state.symbol}" for turn in model.turns for state in model.states[turn.quaternion]
+    }  # of which roll, pitch and yaw say more
+    plotted = sorted(values, key=lambda key: (key not in references, key in turned))[:MOST_PANELS]
     plotted = [key for key in values if key in plotted] if states else []
     heights = [TALL] * len(plotted) + [LOW if plotted else TALL] * len(estimate.log.measured)
     figure = new_figure((WIDTH, sum(heights) + ROOM))
@@ -436,20 +487,21 @@ def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: 
     labels |= {f"{OUTPUT}:{symbol}": output.quantity for symbol, output in model.outputs.items()}
     for axis, key in zip(axes, plotted, strict=False):
         mean, std = estimated(estimate, key)
-        line = estimate.log.references[key] if key in references else mean
+        line = references[key][1] if key in references else mean
         line = wrapped(line) if labels[key].angle else line
-        _limit(axis, mean, std, line)
+        label, scale = _in_degrees(labels[key], estimate, 1.0)
+        _limit(axis, scale * mean, scale * std, scale * line)
         breaks = with_breaks if labels[key].angle else lambda *lines: lines
         if key in references:
-            axis.plot(*breaks(times, line), label="reference, not seen", **TRUTH)
+            line_times, line = breaks(times, line)
+            axis.plot(line_times, scale * line, label="reference, not seen", **TRUTH)
         for measured in _measurements_of(estimate, mean):
-            axis.scatter(times, wrapped(measured) if labels[key].angle else measured, **DOTS)
+            axis.scatter(times, scale * (wrapped(measured) if labels[key].angle else measured), **DOTS)
         own_times, mean, std = breaks(times, mean, std)
+        mean, std, what = scale * mean, scale * std, "smoother" if estimate.smoothed else "estimate"
         _band(axis, own_times, mean, std, colour)
-        axis.plot(
-            own_times, mean, color=colour, linewidth=1.0, label="smoother" if estimate.smoothed else "estimate"
-        )
-        axis.set_ylabel(labels[key].plot_label.replace(" $", "\n$"))
+        axis.plot(own_times, mean, color=colour, linewidth=1.0, label=what)
+        axis.set_ylabel(label.plot_label.replace(" $", "\n$"))
     for j, (axis, quantity) in enumerate(zip(axes[len(plotted) :], estimate.log.measured, strict=True)):
         std = np.sqrt(np.maximum(estimate.innovation_covs[:, j, j], 0.0))
         _band(axis, times, np.zeros_like(std), std, colour)

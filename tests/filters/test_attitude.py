@@ -13,7 +13,7 @@ from scipy.linalg import sqrtm
 from scipy.spatial.transform import Rotation as Turned
 
 import filters
-from filters.bounds import path_bound, posterior_bound
+from filters.bounds import path_bound
 from filters.c.project import c_filter, write_filter, write_project
 from filters.consistency.report import consistency_report
 from filters.estimators.foreign import Estimator, ForeignFilter
@@ -22,10 +22,8 @@ from filters.sensitivity import ModelSlopes, sensitivity, state_score
 from filters.starts import begun_at
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
-from thruster_env.env.model_env import ModelEnv
 from thruster_env.model import rotations
 from thruster_env.model.quantities import Quantity
-from thruster_env.model.simulate import simulate
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import Rotation
 
@@ -543,10 +541,7 @@ def test_every_other_path_refuses_them():
         lambda: ForeignFilter(model=model, estimator=Estimator()),
         lambda: filters.torch(filter_),
         lambda: write_project(filter_, "a folder"),
-        lambda: posterior_bound(model, data["inputs"][None]),
         lambda: path_bound(model, data["inputs"][None]),
-        lambda: simulate(model, np.zeros((1, 2)), data["inputs"][None]),
-        lambda: ModelEnv(model),
         lambda: filters.linearize(model, model.prior_mean, np.zeros(3)),
         lambda: filters.augmented_model(model, {0: filters.Unknown(0.1)}),
         lambda: filters.transformed_model(model, {"b_x": (-1.0, 1.0)}),

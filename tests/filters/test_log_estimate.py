@@ -62,7 +62,7 @@ def test_the_findings_are_those_of_the_rows_that_count(log):
     assert told.log_likelihood == pytest.approx(expected, rel=1e-9)
     (ahead,) = told.predictions
     assert ahead.rmse == pytest.approx(np.sqrt((v**2).mean())) and ahead.bias == pytest.approx(-v.mean())
-    assert compared(found) == ["state:n", "output:P"]  # the model knows of no other
+    assert list(compared(found)) == ["state:n", "output:P"]  # the model knows of no other
     state, of_power = told.references
     errors = found.means[late, 0] - log.references["state:n"][late]
     assert (state.rmse, state.bias) == pytest.approx((np.sqrt((errors**2).mean()), errors.mean()))

@@ -298,9 +298,7 @@ def angled_state(x):
 
     At theta = +-90 deg, roll and yaw are not determined.
     """
-    ahead, starboard, below = rotations.matrix(x[6:10])
-    theta = np.arctan2(-below[0], np.sqrt(below[1] * below[1] + below[2] * below[2]))
-    return (*x[:6], np.arctan2(below[1], below[2]), theta, np.arctan2(starboard[0], ahead[0]), *x[10:])
+    return (*x[:6], *rotations.euler(x[6:10]), *x[10:])
 
 
 rotating_substep = runge_kutta_munthe_kaas(rotating_rates, ROTATING)

@@ -38,6 +38,7 @@ from thruster_env.effects.sensors import SENSOR_EFFECTS, Reading
 from thruster_env.env.copies import Page, clipped, correlated, root_of
 from thruster_env.env.env import PlantEnv, PlantVectorEnv
 from thruster_env.env.plant_data import some_numbers
+from thruster_env.graphs.tracing import traced
 from thruster_env.graphs.values import traceable
 from thruster_env.logs.log import Log, seen_by
 from thruster_env.logs.read import read_log
@@ -46,6 +47,7 @@ from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import Functions, Shape, constants_are_array
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.traced import TracedFunction, traced_function
+from thruster_env.model.turns import move, refuse_measured
 
 DISTURBANCES = Registry(
     "disturbances",
@@ -126,7 +128,7 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
     n, m = shape.n, shape.m
     of_f, of_h = _parts(functions, shape)
     f, h, call_f, call_h = _traced(*of_f), _traced(*of_h), _called(*of_f), _called(*of_h)
-    act = chain_runner(dict(kinds))
+    act, advance = chain_runner(dict(kinds)), traced(move) if shape.turns else move
 
     def evaluated(function: TracedFunction | None, call: Callable, count: int, p: Any, *vectors) -> tuple:
         if function is None:
@@ -156,8 +158,7 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
         return (x, memories), report
 
     def begin(p: Parameters, t: Moment) -> tuple[Any, dict]:
-        noise = correlated(p.prior_root, t.draws.normals(INITIAL, n))
-        x = tuple(mean + w for mean, w in zip(p.prior_mean, noise, strict=True))
+        x = tuple(advance(p.prior_mean, correlated(p.prior_root, t.draws.normals(INITIAL, shape.t)), shape.turns))
         u, memories = disturbed(p, (0.0,) * shape.inputs, None, t)
         return observed(p, x, u, u, None, memories, t)
 
@@ -170,8 +171,8 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
         def body(x: tuple, inputs: tuple) -> tuple:
             return evaluated(f, call_f, n, p, x, inputs)
 
-        noise = correlated(p.q_root, t.draws.normals(PROCESS, n))
-        x = tuple(a + w for a, w in zip(t.repeat(substeps, body, x, v), noise, strict=True))
+        noise = correlated(p.q_root, t.draws.normals(PROCESS, shape.t))
+        x = tuple(advance(t.repeat(substeps, body, x, v), noise, shape.turns))
         return observed(p, x, u, v, effects, memories, t)
 
     return Page(begin, step, shape.inputs)
@@ -187,12 +188,13 @@ def _parts(functions: Functions, shape: Shape) -> tuple[Part, Part]:
 def page_of(plant: ModelPlant, task: ModelTask) -> tuple[Page, Parameters]:
     """The page of a model with a task, and its parameters."""
     truth, context = plant.truth, Context(plant.dt)
+    refuse_measured(truth, "ModelEnv")
     signals = [plant.disturbances.get(quantity.symbol, ()) for quantity in truth.input_quantities]
     effects = [plant.sensors.get(quantity.symbol, ()) for quantity in truth.measurements]
     chains = {f"input {i}": chain_of(chain, context, i * SPACING) for i, chain in enumerate(signals)}
     first = len(signals)
     chains |= {f"sensor {i}": chain_of(chain, context, (first + i) * SPACING) for i, chain in enumerate(effects)}
-    is_traced = all(_traced(*part) for part in _parts(truth.functions, truth.shape))
+    is_traced = all(_traced(*part) for part in _parts(truth.functions, truth.any_shape))
     parameters = Parameters(
         plant.dt,
         tuple(truth.constants),
@@ -206,7 +208,7 @@ def page_of(plant: ModelPlant, task: ModelTask) -> tuple[Page, Parameters]:
         {name: parameters for name, (_, parameters) in chains.items()},
     )
     kinds = tuple((name, kinds) for name, (kinds, _) in chains.items())
-    return model_page(truth.functions, truth.shape, truth.substeps, kinds, task), parameters
+    return model_page(truth.functions, truth.any_shape, truth.substeps, kinds, task), parameters
 
 
 class ModelEnv(PlantEnv):

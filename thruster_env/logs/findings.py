@@ -24,7 +24,7 @@ GAP, MISSING, MOVED, DROPPED, DOUBLED = "gap", "missing rows", "moved", "dropped
 STUCK, SATURATED, OUTLIER = "stuck", "saturated", "outlier"
 DAMAGED = "damaged"  # the file: of its messages some are not read
 CLOCK, OUTSIDE, STALE = "clock", "outside", "no input"
-MISALIGNED = "axes or units"
+MISALIGNED, QUATERNION = "axes or units", "quaternion"
 SPOILING = (GAP, STALE, STUCK, SATURATED, OUTLIER)  # what moves estimates
 OUTLIERS = ("kept", "missing")  # whether a study takes them as measurements or leaves them out
 LEVEL = 1e-4
@@ -71,7 +71,7 @@ class Finding:
 
     Attributes:
         kind: "damaged", "clock", "outside", "no input", "gap", "missing rows", "moved", "dropped", "doubled",
-            "stuck", "saturated", "outlier" or "axes or units".
+            "stuck", "saturated", "outlier", "axes or units" or "quaternion".
         channel: such as "measurement:thrust"; empty for all of a row.
         first: row of the log where it begins; 0 if it is everywhere.
         last: row where it ends, included.

@@ -166,10 +166,17 @@ class Log:
         return (*inputs, *(f"{MEASUREMENT}:{quantity.symbol}" for quantity in self.measured), *self.references)
 
     def true_states(self, model: StateSpaceModel) -> np.ndarray | None:
-        """The states of a model, (K + 1, n), NaN in rows without one; None where no row has all."""
+        """The states of a model, (K + 1, n), NaN in rows without one; None where no row has all.
+
+        Of a model with rotations as many of its first states as there are: those of its quaternion, at least.
+        """
         columns = [self.references.get(f"{STATE}:{state.symbol}") for state in model.states]
-        present = [column for column in columns if column is not None]
-        if len(present) < len(columns):
+        count = next((i for i, column in enumerate(columns) if column is None), len(columns))
+        if count < len(columns):
+            ends = {turn.stored + turn.size + 1 for turn in model.turns}
+            count = max((end for end in ends if end <= count), default=0)
+        present = [column for column in columns[:count] if column is not None]
+        if not present:
             return None
         states = np.column_stack(present)
         known = ~np.isnan(states).any(axis=1)

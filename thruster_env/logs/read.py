@@ -12,6 +12,7 @@ import numpy as np
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import finite, listed, one_of, positive, short_repr
 from thruster_env.core.files import read_toml
+from thruster_env.logs import quaternions
 from thruster_env.logs.columns import (
     INPUT,
     MEASUREMENT,
@@ -223,6 +224,8 @@ def read_log(
         column_of = find_columns(
             wanted, table.names, description.columns, description.units, table.file, description.dt is None
         )
+        if model.turns:
+            column_of = column_of | quaternions.named_columns(model, table.names, column_of)
     file = table.file
     of_file, start, assumption = _grid(table, column_of.get(TIME), description.dt, file, grid)
     dt = of_file.dt
@@ -230,12 +233,16 @@ def read_log(
     common = {offsets.get(channel.key, 0.0) for channel in wanted if channel.key in column_of}
     if len(common) == 1 and any(common) and not model.input_quantities:
         start, offsets = start - common.pop(), {}  # one clock for all: times move, and no sample is interpolated
-    samples, source, parts = {}, {}, {}
+    source, parts, turned = {}, {}, list[Remark]()
     rows, dropped = np.zeros(len(of_file.times), bool), []
-    for channel in wanted:
-        if channel.key not in column_of:
-            continue
-        series, present = _series(table, column_of[channel.key], channel, of_file)
+    in_file = [channel for channel in wanted if channel.key in column_of]
+    read = {channel.key: _series(table, column_of[channel.key], channel, of_file) for channel in in_file}
+    samples = {key: series for key, (series, _) in read.items()}
+    if model.turns:
+        samples, turned = quaternions.repaired(model, samples)
+        turned += quaternions.remark_on_numbers(model, table.names, column_of)
+    for channel in in_file:
+        series, present = samples[channel.key], read[channel.key][1]
         if until and channel.kind == INPUT:  # a sample acts since the one before
             values = series.values[-len(series.values) + 1 :]
             if act == "between" and len(series.values) > 1:
@@ -272,6 +279,7 @@ def read_log(
     remarks = (
         *([Remark(CLOCK, "", assumption)] if assumption else []),
         *table.remarks,
+        *turned,
         *stale_inputs(driven, end, dt, start),
     )
     referring = [channel for channel in wanted if channel.kind not in (INPUT, MEASUREMENT)]

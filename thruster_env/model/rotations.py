@@ -70,6 +70,15 @@ def to_body(q: Any, v: Any) -> Vector:
     return to_world(inverse(q), v)
 
 
+def euler(q: Any) -> Vector:
+    """Roll, pitch and yaw [rad] of a rotation: yaw about z, then pitch about y, then roll about x of the body.
+
+    At a pitch of 90 degrees roll and yaw are not determined.
+    """
+    (ahead, _, _), (starboard, _, _), (x, y, z) = matrix(q)
+    return np.arctan2(y, z), np.arctan2(-x, np.sqrt(y * y + z * z)), np.arctan2(starboard, ahead)
+
+
 def exponential(d: Any) -> Quaternion:
     """The rotation by the angle |d| [rad] about d: (cos(t/2), sin(t/2)/t d), t = |d|."""
     x, y, z = d

@@ -12,8 +12,10 @@ from thruster_env.core.checks import as_floats
 from thruster_env.core.compiled import instead_of, is_interpreting
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.core.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
-from thruster_env.model.shape import Functions, Shape, constants_reader, for_any_input, number_offsets, padded
+from thruster_env.model.shape import Functions, Shape, constants_reader, for_any_input, padded
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.traced import called_function
+from thruster_env.model.turns import move, refuse_measured
 
 
 def inputs_until(inputs: np.ndarray) -> np.ndarray:
@@ -41,15 +43,39 @@ def add_correlated(out, numbers, root, count, draws):
 
 
 @cache
-def noise_step(n: int, m: int):
-    """Function disturb(x, draws, step, key, numbers), which adds a step's process noise to an array x (n,)."""
-    q_root = number_offsets(n, m).q_root
+def noise_step(shape: Shape):
+    """Function disturb(x, draws, step, key, numbers), which moves an array x (n,) by a step's process noise."""
+    t, q_root, add = shape.t, shape.offsets.q_root, _noise_adder(shape)
 
     def disturb(x, draws, step, key_0, key_1, numbers):
-        fill_normals(draws, n, step, PROCESS, key_0, key_1)
-        add_correlated(x, numbers, q_root, n, draws)
+        fill_normals(draws, t, step, PROCESS, key_0, key_1)
+        add(x, numbers, q_root, draws)
 
     return disturb
+
+
+def _noise_adder(shape: Shape):
+    """Function add(x, numbers, root, draws): x moved by L draws, with L (t, t) by rows at numbers[root]."""
+    n, t, turns = shape.n, shape.t, shape.turns
+    if not turns:
+
+        def add(x, numbers, root, draws):
+            add_correlated(x, numbers, root, n, draws)
+
+        return add
+
+    def moved(x, d, c):
+        return tuple(move(x, d, turns))
+
+    function = called_function(moved, "x, u, c", (n, t, 0), 0, (n,))
+    state, store_state, error = vector_reader(n), vector_writer(n), vector_reader(t)
+
+    def add_on_tangent(x, numbers, root, draws):
+        d = np.zeros(t)
+        add_correlated(d, numbers, root, t, draws)
+        store_state(x, function(state(x), error(d), ()))
+
+    return add_on_tangent
 
 
 @lru_cache(maxsize=64)
@@ -58,19 +84,19 @@ def truth_steps(functions: Functions, shape: Shape):
 
     They work on arrays x (n,), u (inputs,), z (m,), draws with room for GROUP multiples, key (2,).
     """
-    n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
-    source = number_offsets(n, m)
+    n, t, m, transition, observe = shape.n, shape.t, shape.m, functions.transition, functions.observe
+    source, add_noise = shape.offsets, _noise_adder(shape)
     prior_mean, prior_root, substeps = source.prior_mean, source.prior_root, source.substeps
-    r_root, disturb = source.r_root, noise_step(n, m)
+    r_root, disturb = source.r_root, noise_step(shape)
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
     look = for_any_input(observe, shape)
 
     def begin(x, draws, key_0, key_1, numbers):
-        fill_normals(draws, n, 0, INITIAL, key_0, key_1)
+        fill_normals(draws, t, 0, INITIAL, key_0, key_1)
         for i in range(n):
             x[i] = numbers[prior_mean + i]
-        add_correlated(x, numbers, prior_root, n, draws)
+        add_noise(x, numbers, prior_root, draws)
 
     def advance(x, u, draws, step, key_0, key_1, numbers):
         v, c = control(u), constants(numbers)
@@ -88,7 +114,8 @@ def truth_steps(functions: Functions, shape: Shape):
 
 def truth_steps_of(model: StateSpaceModel):
     """`truth_steps` for a model."""
-    return truth_steps(model.functions, model.shape)
+    refuse_measured(model, "a simulation")
+    return truth_steps(model.functions, model.any_shape)
 
 
 @lru_cache(maxsize=64)
@@ -144,6 +171,7 @@ def simulate(model: StateSpaceModel, keys: np.ndarray, inputs: np.ndarray) -> Tr
     If h takes the input, z_{k+1} = h(x_{k+1}, u_k) + v_{k+1} and z_0 = h(x_0, 0) + v_0.
 
     The same keys give the same noise as in the plant, so that an exact model gives the plant's trajectories.
+    Rotations, directions and poses move by w on their tangent, as `thruster_env.model.turns` has it.
     Angles are not wrapped: filters and errors (`thruster_env.core.angles.difference`) wrap them.
 
     Args:

@@ -23,6 +23,7 @@ from thruster_env.core.equal_functions import first_equal
 from thruster_env.core.modules import error_line
 from thruster_env.core.sources import as_value, is_array
 from thruster_env.graphs.python_floats import with_floats
+from thruster_env.model.euler import euler_outputs
 from thruster_env.model.quantities import (
     Positions,
     Quantities,
@@ -163,7 +164,7 @@ class StateSpaceModel:
         checked["states"] = quantities("states", states, n, "x", "prior_mean")
         checked["input_quantities"] = quantities("input_quantities", u, checked["inputs"], "u", "inputs, or b,")
         checked["measurements"] = quantities("measurements", measurements, channels, "z", "measurement_noise_cov")
-        checked["outputs"] = outputs(self.outputs)
+        checked["outputs"] = euler_outputs(turns, checked["states"]) | outputs(self.outputs)
         if self.positions is not None:
             checked["positions"] = Positions(*self.positions).checked(n, channels)
         checked["bounds"] = checked_bounds(self.bounds, checked["states"], turns)

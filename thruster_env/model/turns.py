@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from thruster_env.core import angles
 from thruster_env.core.checks import short_repr
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.model import directions, poses, rotations
@@ -204,7 +205,7 @@ def refuse_rotations(model: Any) -> None:
         raise ValueError(
             f"{what} must be numbers and angles here, but {names} {'is' if len(turns) == 1 else 'are'} of "
             f"{kinds}: 'ekf', 'iekf', 'ukf', 'ckf', their kin, 'enkf', 'pf' and 'imm' take these, in filters.run, "
-            "sessions, C and EstimateState around an env of your own; problems, ModelEnv and tensors do not"
+            "sessions, C, EstimateState and problems; tensors do not"
         )
 
 
@@ -275,13 +276,52 @@ def stored_covs(means: np.ndarray, covs: np.ndarray, turns: Sequence[Turn]) -> n
     return slopes @ covs @ np.swapaxes(slopes, -1, -2)
 
 
+def leading(turns: Sequence[Turn], known: int) -> tuple[Turn, ...]:
+    """The parts among the first `known` stored numbers of a state; ValueError if these end within a part."""
+    first = tuple(turn for turn in turns if turn.stored < known)
+    if first and first[-1].stored + first[-1].size + 1 > known:
+        raise ValueError(f"{first[-1].name!r} must be known with all its numbers, but {known} states are known")
+    return first
+
+
+def tangent_of(model: Any, known: int | None = None) -> tuple[Quantity, ...]:
+    """The quantities of an error of a model's state, or of its first `known` stored numbers."""
+    states = model.states[:known]
+    return tuple(error_quantities(states, leading(model.turns, len(states))))
+
+
+def errors_of(model: Any, means: np.ndarray, states: np.ndarray) -> np.ndarray:
+    """Errors (..., t) of means (..., n) in their tangent: means - states, angles wrapped, and e of rotations.
+
+        states = move(means, -e), so that P at the means is the covariance of e
+
+    Args:
+        model: the `StateSpaceModel` of the means.
+        means: of all its states.
+        states: the true ones (..., k), the first k of these.
+    """
+    known = states.shape[-1]
+    means, turns = means[..., :known], leading(model.turns, known)
+    if not turns:
+        return angles.difference(means, states, model.any_shape.state_angles[:known])
+    x, y = (np.moveaxis(values, -1, 0) for values in np.broadcast_arrays(states, means))
+    errors = -np.stack([np.asarray(part) for part in difference(x, y, turns)], axis=-1)
+    return angles.wrapped_where(errors, [quantity.angle for quantity in tangent_of(model, known)])
+
+
+def rotation_angles(errors: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
+    """The angle [rad] of the error of each rotation, pose or direction, (turns, ...) of errors (..., t)."""
+    parts = [slice(turn.tangent, turn.tangent + min(turn.size, 3)) for turn in turns]
+    return np.array([np.sqrt((errors[..., part] ** 2).sum(axis=-1)) for part in parts])
+
+
 # The steps, on sequences of components: floats, arrays of them, or numbers that are traced.
 
 
 def move(x: Any, d: Any, turns: Sequence[Turn]) -> list:
     """The state x (n) moved by d (t) of its tangent."""
     result: list[Any] = []
-    for turn, i, j in _parts(len(x), turns):
+    for turn, i, j in parts_of(len(x), turns):
         if turn is None:
             result.append(x[i] + d[j])
         elif turn.kind == "direction":
@@ -295,7 +335,7 @@ def move(x: Any, d: Any, turns: Sequence[Turn]) -> list:
 def difference(x: Any, y: Any, turns: Sequence[Turn]) -> list:
     """The d (t) of the tangent at y with move(y, d) = x, of states x and y (n)."""
     result: list[Any] = []
-    for turn, i, _ in _parts(len(x), turns):
+    for turn, i, _ in parts_of(len(x), turns):
         if turn is None:
             result.append(x[i] - y[i])
         elif turn.kind == "direction":
@@ -310,7 +350,7 @@ def difference(x: Any, y: Any, turns: Sequence[Turn]) -> list:
 def unit(x: Any, turns: Sequence[Turn]) -> list:
     """The state x (n) with quaternions and directions of length 1."""
     result: list[Any] = []
-    for turn, i, _ in _parts(len(x), turns):
+    for turn, i, _ in parts_of(len(x), turns):
         result += [x[i]] if turn is None else _unit(turn, turn.of_state(x))
     return result
 
@@ -322,7 +362,7 @@ def innovation(z: Any, y: Any, turns: Sequence[Turn]) -> list:
     filter is to take such a part for a missing one.
     """
     d, result = difference(unit(z, turns), y, turns), []
-    for turn, i, j in _parts(len(z), turns):
+    for turn, i, j in parts_of(len(z), turns):
         known = _known(z, turn, i)
         for component in d[j : j + (1 if turn is None else turn.size)]:
             result.append(np.where(known, np.where(component == component, component, np.inf), np.nan))
@@ -332,7 +372,7 @@ def innovation(z: Any, y: Any, turns: Sequence[Turn]) -> list:
 def completed(z: Any, y: Any, turns: Sequence[Turn]) -> list:
     """The measurement z with the numbers of y in each part that misses one."""
     result: list[Any] = []
-    for turn, i, _ in _parts(len(z), turns):
+    for turn, i, _ in parts_of(len(z), turns):
         part = slice(i, i + (1 if turn is None else turn.size + 1))
         known, parts = _known(z, turn, i), zip(unit(z, turns)[part], y[part], strict=True)
         result += [np.where(known, measured, other) for measured, other in parts]
@@ -365,7 +405,7 @@ def _unit(turn: Turn, part: tuple) -> tuple:
     return directions.unit(part) if turn.kind == "direction" else (*rotations.normalised(part[:4]), *part[4:])
 
 
-def _parts(n: int, turns: Sequence[Turn]) -> list[tuple[Turn | None, int, int]]:
+def parts_of(n: int, turns: Sequence[Turn]) -> list[tuple[Turn | None, int, int]]:
     """The parts of a state in their order, None for numbers, with offsets among the stored and in the tangent."""
     by_offset, result, i, j = {turn.stored: turn for turn in turns}, [], 0, 0
     while i < n:
@@ -377,7 +417,7 @@ def _parts(n: int, turns: Sequence[Turn]) -> list[tuple[Turn | None, int, int]]:
 
 def slopes_of_stored(x: Any, turns: Sequence[Turn]) -> list[list]:
     """The derivative of move(x, d) at d = 0, (n, t): of a rotation q (0, e_i)/2 or (0, e_i) q/2."""
-    return _by_parts(len(x), turns, (1, 0), lambda turn: _stored_slopes(turn, turn.of_state(x)))
+    return _byparts_of(len(x), turns, (1, 0), lambda turn: _stored_slopes(turn, turn.of_state(x)))
 
 
 def _stored_slopes(turn: Turn, x: tuple) -> list[list]:
@@ -395,7 +435,7 @@ def _stored_slopes(turn: Turn, x: tuple) -> list[list]:
 
 def slopes_of_tangent(y: Any, turns: Sequence[Turn]) -> list[list]:
     """The derivative of difference(x, y) by x at x = y, (t, n); a unit vector of y need not have length 1."""
-    return _by_parts(len(y), turns, (0, 1), lambda turn: _tangent_slopes(turn, turn.of_state(y)))
+    return _byparts_of(len(y), turns, (0, 1), lambda turn: _tangent_slopes(turn, turn.of_state(y)))
 
 
 def _tangent_slopes(turn: Turn, y: tuple) -> list[list]:
@@ -439,23 +479,23 @@ def _negative(rows: Any) -> list[list]:
     return [[-x for x in row] for row in rows]
 
 
-def _by_parts(n: int, turns: Sequence[Turn], more: tuple[int, int], of_turn: Callable) -> list[list]:
+def _byparts_of(n: int, turns: Sequence[Turn], more: tuple[int, int], of_turn: Callable) -> list[list]:
     """A matrix with 1 for numbers and a block for each turn; sides with `more` are as long as the stored state."""
     sides = [n if stored else n - len(turns) for stored in more]
     result = [[0.0] * sides[1] for _ in range(sides[0])]
-    for turn, i, j in _parts(n, turns):
+    for turn, i, j in parts_of(n, turns):
         _put(result, i if more[0] else j, i if more[1] else j, [[1.0]] if turn is None else of_turn(turn))
     return result
 
 
 def reset_slopes(x: Any, d: Any, turns: Sequence[Turn]) -> list[list]:
     """G = d difference(move(x, d + e), move(x, d))/de at e = 0, (t, t): J_r(d) or J_l(d), 1 for numbers."""
-    return _by_parts(len(x), turns, (0, 0), lambda turn: _reset(turn, x, d, poses.left_jacobian))
+    return _byparts_of(len(x), turns, (0, 0), lambda turn: _reset(turn, x, d, poses.left_jacobian))
 
 
 def inverse_reset_slopes(x: Any, d: Any, turns: Sequence[Turn]) -> list[list]:
     """The inverse of `reset_slopes`, (t, t)."""
-    return _by_parts(len(x), turns, (0, 0), lambda turn: _reset(turn, x, d, poses.inverse_left_jacobian))
+    return _byparts_of(len(x), turns, (0, 0), lambda turn: _reset(turn, x, d, poses.inverse_left_jacobian))
 
 
 def _reset(turn: Turn, x: Any, d: Any, jacobian: Callable) -> list[list]:

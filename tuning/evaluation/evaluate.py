@@ -28,8 +28,8 @@ from filters.ensembles.square_root import record_members
 from filters.filter import Filter
 from filters.starts import Restarts, restarts_of
 from thruster_env.model.quantities import Quantity
-from thruster_env.model.turns import stored_covs
-from tuning.evaluation.runs import RunMetrics, metrics_of_all
+from thruster_env.model.turns import errors_of, tangent_of
+from tuning.evaluation.runs import RunMetrics, metrics_of_all, outputs_of
 from tuning.problems.data import Data, estimates_in_parts
 
 if TYPE_CHECKING:
@@ -112,7 +112,9 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     Raises:
         ValueError: if the scale is not positive, or not one number for each state.
     """
-    counted = None if data.states is None else _checked(scale, data.states.shape[-1])
+    counted = None
+    if data.states is not None:
+        counted = _checked(scale, len(tangent_of(filter_.model, data.states.shape[-1])))
     runs = metrics_of_all(filter_, data, scale=counted)
     return with_restarts(compute_metrics(filter_, runs, data, scale), filter_, runs, data)
 
@@ -202,9 +204,10 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
     """The fields of an `Evaluation` that need the truth; NaN without it."""
     mean_squares, nees, start_up = runs.mean_squares, runs.nees, runs.start_up_squares
     if data.states is None or mean_squares is None or nees is None or start_up is None:
-        n = filter_.model.n if scale is None else len(scale)
+        states = tangent_of(filter_.model)[: None if scale is None else len(scale)]
+        n = len(states)
         return {
-            "states": filter_.model.states[:n],
+            "states": states,
             "outputs": {},
             "rmse": (NOTHING,) * n,
             "start_up_rmse": np.full(n, np.nan),
@@ -216,7 +219,8 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
             "scale": np.full(n, np.nan),
             "state_nees": np.full(n, np.nan),
         }
-    n, scale, weights = data.states.shape[-1], _checked(scale, data.states.shape[-1]), runs.weights
+    states = tangent_of(filter_.model, data.states.shape[-1])
+    scale, weights, of_outputs = _checked(scale, len(states)), runs.weights, outputs_of(filter_.model)
     score_interval = without_interval(score(mean_squares, scale, weights))
     if intervals:
         score_interval = interval(
@@ -225,8 +229,8 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
     squares_of = runs.output_mean_squares.items()
     outputs = {symbol: rmse_intervals(squares, intervals, weights)[0] for symbol, squares in squares_of}
     return {
-        "states": filter_.model.states[:n],
-        "outputs": {symbol: filter_.model.outputs[symbol].quantity for symbol in outputs},
+        "states": states,
+        "outputs": {symbol: of_outputs[symbol] for symbol in outputs},
         "rmse": rmse_intervals(mean_squares, intervals, weights),
         "start_up_rmse": np.sqrt(start_up.mean(axis=(0, 1)) if data.counted is None else _mean_there(start_up)),
         "score": score_interval,
@@ -268,24 +272,29 @@ def check_consistency(filter_: Filter, data: Data, dt: float | None = None) -> C
     model, members, first = filter_.model, None, data.first_scored
     observed, states = data.seen, None if data.states is None else data.known_states
     n = model.n if data.states is None else data.states.shape[-1]
-    if filter_.size and data.states is not None:
+    quantities = tangent_of(model, n)
+    if filter_.size and data.states is not None and not model.turns:
         first_runs = (
             part[:MEMBER_RUNS] for part in (observed.filter_keys, observed.inputs, observed.measurements)
         )
         members = record_members(filter_, *first_runs, first=first, every=MEMBER_STEPS)
-    angles = model.any_shape.state_angles[:n]
+    angles = () if model.turns else model.any_shape.state_angles[:n]
     parts, blown = [], ""
     for runs, estimates in estimates_in_parts(filter_, data):
         blown = blown or blow_up(filter_, estimates, runs, dt)
-        covs = stored_covs(estimates.means, estimates.covs, model.turns)
-        of_plant = estimates._replace(means=estimates.means[..., :n], covs=covs[..., :n, :n])
-        parts.append(findings(of_plant, runs.states, runs.measurements, first, angles, runs.counted))
+        of_plant = estimates._replace(means=estimates.means[..., :n], covs=estimates.covs[..., :n, :n])
+        truth, t = runs.states, len(quantities)
+        if model.turns:  # errors on the tangent, and a truth of zero
+            means = estimates.means[..., :t] if truth is None else errors_of(model, estimates.means, truth)
+            of_plant = estimates._replace(means=means, covs=estimates.covs[..., :t, :t])
+            truth = None if truth is None else np.zeros(means.shape)
+        parts.append(findings(of_plant, truth, runs.measurements, first, angles, runs.counted))
     report = report_of(
         joined(parts),
         states,
         members=members,
         first_step=first,
-        names=[state.short_label for state in model.states[:n]],
+        names=[quantity.short_label for quantity in quantities],
         angles=angles,
         channels=[channel.label for channel in model.measurements],
     )

@@ -24,6 +24,7 @@ from thruster_env.core.checks import with_progress
 from thruster_env.core.parallel import IN_PROCESS, TaskMap
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import tangent_of
 from tuning.evaluation.baselines import (
     BY_IMPORTANCE,
     GIVEN,
@@ -44,6 +45,7 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.evaluate import NOTHING, Evaluation, evaluate, likelihood_gain, score_ratio
 from tuning.evaluation.residuals import UnevenNis, uneven_nis
+from tuning.evaluation.runs import outputs_of
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.check import data_of
 from tuning.problems.data import Data
@@ -229,12 +231,10 @@ def summarised(
     """
     model = problem.model()
     rmse = tuple(map(as_interval, data["rmse"]))
-    outputs = {
-        symbol: output.quantity for symbol, output in model.outputs.items() if _key(output.quantity) in data
-    }
+    outputs = {symbol: quantity for symbol, quantity in outputs_of(model).items() if _key(quantity) in data}
     likelihood = _number(data["log_likelihood"])
     return Evaluation(
-        states=model.states[: len(rmse)],
+        states=tangent_of(model)[: len(rmse)],
         outputs=outputs,
         rmse=rmse,
         start_up_rmse=np.array([_number(part) for part in data["start_up_rmse"]]),

@@ -18,8 +18,9 @@ from thruster_env.core.angles import difference
 from thruster_env.core.checks import correlation_flaws
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.sources import vector_reader, vector_writer
-from thruster_env.model.shape import Functions, Shape, constants_reader, for_any_input, number_offsets
+from thruster_env.model.shape import Functions, Shape, constants_reader, for_any_input
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import errors_of, tangent_of
 from tuning.problems.assumed import within
 from tuning.problems.check import data_of
 from tuning.problems.data import Data, estimates_in_parts
@@ -225,7 +226,7 @@ class Estimated(NamedTuple):
 def residuals(model: StateSpaceModel, data: Data) -> Residuals:
     """Residuals of a model on runs with known true states, scored steps only.
 
-    w_k = x_{k+1} - f(x_k, u_k),   v_k = z_k - h(x_k);  angles wrapped
+    w_k = x_{k+1} - f(x_k, u_k),   v_k = z_k - h(x_k);  angles wrapped, rotations on their tangent
 
     Args:
         model: with as many states as are known.
@@ -234,9 +235,9 @@ def residuals(model: StateSpaceModel, data: Data) -> Residuals:
     states = np.ascontiguousarray(data.known_states[:, data.late])
     inputs = np.ascontiguousarray(data.inputs[:, data.late], dtype=np.float64)
     expected, outputs = predicted(model, states, inputs)
-    shape, measured = model.shape, data.late_scored(data.measurements)
-    process = difference(states[:, 1:], expected, shape.state_angles)
-    measurement = difference(measured, outputs, shape.measurement_angles)
+    measured = data.late_scored(data.measurements)
+    process = -errors_of(model, expected, states[:, 1:])
+    measurement = difference(measured, outputs, model.any_shape.measurement_angles)
     complete = [np.isfinite(rows).all(axis=-1) for rows in (process, measurement)]
     both = [mask[:, :-1] & mask[:, 1:] for mask in complete]
     pairs = [
@@ -249,7 +250,7 @@ def predicted(model: StateSpaceModel, states: np.ndarray, inputs: np.ndarray) ->
     """F along states (B, T, n) and inputs (B, T - 1, p), (B, T - 1, n), and h, (B, T, m)."""
     states, inputs = (np.ascontiguousarray(rows, dtype=np.float64) for rows in (states, inputs))
     expected, outputs = np.empty(states[:, 1:].shape), np.empty((*states.shape[:2], model.m))
-    steps = _steps(model.functions, model.shape, is_interpreting())
+    steps = _steps(model.functions, model.any_shape, is_interpreting())
     steps(states, inputs, model.numbers, expected, outputs)
     return expected, outputs
 
@@ -278,19 +279,25 @@ def estimated_from(model: StateSpaceModel, data: Data) -> Estimated:
         if len(rows) < FEWEST_PAIRS * rows.shape[1]:
             return Estimated(reason=f"there are too few steps at which all {what} are known")
     q, r = (np.atleast_2d(np.cov(rows, rowvar=False)) for rows in model_residuals[:2])
-    if (np.sqrt(np.diag(q)) <= ROUNDING * np.nanmax(np.abs(data.known_states), axis=(0, 1))).all():
+    if (np.sqrt(np.diag(q)) <= _rounding(model, data)).all():
         q = np.zeros_like(q)
     if not _is_regular(r):
         return Estimated(reason="the measurements have no noise")
     mean_w, mean_v = (rows.mean(axis=0) for rows in model_residuals[:2])
     names = (
-        [f"w of {state.symbol}" for state in model.states],
+        [f"w of {state.symbol}" for state in tangent_of(model)],
         [f"v of {channel.symbol}" for channel in model.measurements],
     )
     w, v = (heavy_tails(*pair) for pair in zip(model_residuals[:2], names, strict=True))
     of_w, of_v = (_correlation(rows) for rows in model_residuals[2:])
     tails = {**(w if q.any() else {}), **v}
     return Estimated(q, r, mean_w, mean_v, of_w, of_v, tails=tails)
+
+
+def _rounding(model: StateSpaceModel, data: Data) -> np.ndarray:
+    """What is rounding in each component (t,) of an error of the true states."""
+    largest = np.nanmax(np.abs(data.known_states), axis=(0, 1))
+    return ROUNDING * np.delete(largest, [turn.stored for turn in model.turns])
 
 
 @lru_cache(maxsize=16)
@@ -311,9 +318,9 @@ def model_error(problem: Problem, seed: int = 0) -> str:
     if data.states is None or data.known_states.shape[-1] != model.n:
         return ""
     model_residuals = residuals(model, data)
-    rounding = ROUNDING * np.nanmax(np.abs(data.known_states), axis=(0, 1))
+    rounding = _rounding(model, data)
     errors = _errors(
-        model.states,
+        tangent_of(model),
         np.diag(model.process_noise_cov),
         model_residuals.process,
         model_residuals.process_pairs,
@@ -364,7 +371,7 @@ def _is_regular(cov: np.ndarray) -> bool:
 def _steps(functions: Functions, shape: Shape, interpreting: bool):
     """The function steps(states, inputs, numbers, expected, outputs) that evaluates f and h along true states."""
     n, m, transition, observe = shape.n, shape.m, functions.transition, for_any_input(functions.observe, shape)
-    substeps = number_offsets(n, m).substeps
+    substeps = shape.offsets.substeps
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
 

@@ -11,7 +11,11 @@ import numpy as np
 from filters.consistency.nees import normalized_squares, sums_of_squares, whitened
 from filters.engine.batch import Estimates
 from filters.filter import Filter
-from thruster_env.core.angles import difference, is_angle
+from thruster_env.core.angles import difference
+from thruster_env.model.euler import EulerAngle
+from thruster_env.model.quantities import Quantity
+from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import errors_of, leading, rotation_angles
 from tuning.problems.data import FIRST_SCORED_STEP, Data, estimates_in_parts, where_true
 
 LEAST = -1e6  # log score of a step whose covariance is singular or not finite
@@ -30,17 +34,16 @@ def log_scores_of(
         filter_: the filter of the estimates.
         estimates: of all steps.
         data: of the same runs.
-        scale: (n,), infinite for states that are not scored; None without truth.
+        scale: (n,), of rotations (t,), infinite for states that are not scored; None without truth.
 
     Source: Gneiting, Raftery (2007), "Strictly proper scoring rules, prediction, and estimation", JASA 102(477).
     """
     if data.states is None or scale is None or not filter_.has_covariance:
         return np.full(data.measurements[:, data.late].shape[:2], np.nan)
     indices, late = np.flatnonzero(np.isfinite(scale)), data.late
-    angles = [is_angle(index, filter_.model.shape.state_angles) for index in indices.tolist()]
     covs = estimates.covs[:, late][..., indices[:, None], indices]
     with np.errstate(all="ignore"):
-        errors = difference(estimates.means[:, late][..., indices], data.states[:, late][..., indices], angles)
+        errors = errors_of(filter_.model, estimates.means[:, late], data.states[:, late])[..., indices]
         logarithms, squares = np.linalg.slogdet(covs)[1], sums_of_squares(whitened(errors, covs))
         scores = -0.5 * (len(indices) * math.log(2.0 * math.pi) + logarithms + squares)
     scores = np.where(np.isfinite(scores), np.maximum(scores, LEAST), LEAST)
@@ -151,11 +154,9 @@ def _concatenated(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
 def state_errors(filter_: Filter, estimates: Estimates, data: Data) -> np.ndarray:
     """Errors (B, K + 1, n) of the plant's n states, with angles wrapped; needs data with truth.
 
-    They are NaN at steps that are not scored.
+    Those of rotations are on their tangent, as P is. They are NaN at steps that are not scored.
     """
-    states = data.known_states
-    n = states.shape[-1]
-    return difference(estimates.means[..., :n], states, filter_.model.shape.state_angles[:n])
+    return errors_of(filter_.model, estimates.means, data.known_states)
 
 
 def _against_truth(filter_: Filter, estimates: Estimates, data: Data, wanted: bool) -> dict:
@@ -209,18 +210,39 @@ def _means_over_steps(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.swapaxes(values, 0, 1)).mean(axis=0)
 
 
+def outputs_of(model: StateSpaceModel, known: int | None = None) -> dict[str, Quantity]:
+    """A model's outputs by symbol, and the angle of the error [deg] of each rotation among the known states."""
+    outputs = {
+        symbol: output.quantity
+        for symbol, output in model.outputs.items()
+        if not isinstance(output.function, EulerAngle)  # which jump where the pitch is 90 degrees
+    }
+    for turn in leading(model.turns, model.n if known is None else known):
+        symbol = f"{model.states[turn.stored].symbol.rpartition('_')[0]}_angle"
+        outputs[symbol] = Quantity(f"{turn.name} angle", symbol, "deg")
+    return outputs
+
+
 def _output_mean_squares(filter_: Filter, estimates: Estimates, data: Data) -> dict[str, np.ndarray]:
-    """Mean square errors of each derived output that both the truth and the filter's model have."""
-    late, mean_squares = data.late, {}
+    """Mean square errors of each output that both the truth and the filter's model have, and of rotations."""
+    late, model, mean_squares = data.late, filter_.model, dict[str, np.ndarray]()
+
+    def mean_of(squares: np.ndarray) -> np.ndarray:
+        return squares.mean(axis=1, keepdims=True) if data.counted is None else _means(data, squares[..., None])
+
+    known = 0 if data.states is None else data.states.shape[-1]
+    if data.states is not None and (turns := leading(model.turns, known)):
+        errors = np.rad2deg(
+            rotation_angles(errors_of(model, estimates.means[:, late], data.states[:, late]), turns)
+        )
+        symbols = list(outputs_of(model, known))[-len(turns) :]
+        mean_squares |= {symbol: mean_of(part**2) for symbol, part in zip(symbols, errors, strict=True)}
     for symbol, truth in (data.outputs or {}).items():
-        if symbol not in filter_.model.outputs:
+        if symbol not in outputs_of(model):
             continue
         with np.errstate(all="ignore"):  # finite estimates that are far off may have an infinite output
             values = filter_.model.output(symbol, estimates.means[:, late])
         values, angle = np.clip(values, -FARTHEST, FARTHEST), filter_.model.outputs[symbol].quantity.angle
         errors = difference(values[..., None], truth[:, late, None], (angle,))[..., 0]
-        squares = errors**2
-        mean_squares[symbol] = (
-            squares.mean(axis=1, keepdims=True) if data.counted is None else _means(data, squares[..., None])
-        )
+        mean_squares[symbol] = mean_of(errors**2)
     return mean_squares

@@ -313,7 +313,7 @@ def _choice(content: Mapping, problem: Problem) -> Choice:
         chosen = chosen if len(chosen) == len(names) else {}
         chosen |= {
             name: _noise(name, entry["model"][name], size, positive_definite=name == "measurement_noise_cov")
-            for name, size in zip(NOISE, (model.n, model.m), strict=True)
+            for name, size in zip(NOISE, (model.t, model.m), strict=True)
         }
     if PRIOR in entry["model"]:
         chosen[PRIOR] = positive(PRIOR, entry["model"][PRIOR])

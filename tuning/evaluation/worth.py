@@ -128,7 +128,7 @@ def _memory_warning(evaluation: Evaluation, problem: Problem, forget: float | No
         return []
     run = f"{_run_in_words(problem)} ({_times([constants.length], problem)})"
     if constants.is_slow:
-        state, oracle = problem.model().states[constants.slowest].short_label.split(" [")[0], ""
+        state, oracle = problem.errors[constants.slowest].short_label.split(" [")[0], ""
         if constants.oracle is not None:
             oracle = f" With the plant's own Q and R it is {_times(constants.oracle[:1], problem)}."
         return [
@@ -193,7 +193,7 @@ def memory_sentence(evaluation: Evaluation, problem: Problem) -> str:
     constants = evaluation.time_constants
     if constants is None or not constants.steps:
         return "Time constants of the gain: -."
-    states = problem.model().states
+    states = problem.errors
     longest, more = constants.steps[:MOST_TIMES], len(constants.steps) - MOST_TIMES
     rest = f" and {more} shorter ones" if more > 0 else ""
     slowest = states[constants.slowest].symbol

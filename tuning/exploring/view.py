@@ -405,7 +405,7 @@ def knobs_of(name: str, problem: Problem, marks: Mapping[str, Mapping[str, float
 def _called(parameter: Parameter, problem: Problem) -> tuple[str, str]:
     position, quantities = parameter.place, problem.quantities
     if isinstance(position, ProcessVariance):
-        return f"Q of the {quantities.states[position.index].name}", "Q"
+        return f"Q of the {problem.errors[position.index].name}", "Q"
     if isinstance(position, MeasurementVariance):
         return f"R of the {quantities.measurements[position.index].name}", "R"
     if isinstance(position, Correlation):

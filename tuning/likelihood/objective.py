@@ -22,6 +22,7 @@ from filters.starts import Starts, as_the_prior_says
 from thruster_env.core.checks import one_of
 from thruster_env.core.sources import is_array
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import Turn, leading, stored_of
 from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.ascent import Evaluation
 from tuning.problems.data import Data
@@ -92,6 +93,7 @@ class Part:
     Attributes:
         coordinates: of the parameters.
         states: number of states of the models.
+        turns: rotations among these.
         data: `Data`, or what `data_at` makes these of.
         untuned: the parameters before, (p,).
         rough: indices of the parameters without sensitivities, which move the data or functions of the model.
@@ -102,6 +104,7 @@ class Part:
 
     coordinates: Coordinates
     states: int
+    turns: tuple[Turn, ...] = ()
     data: Any
     untuned: np.ndarray
     rough: tuple[int, ...] = ()
@@ -424,16 +427,18 @@ class Objective:
         if data.states is None or part.scale is None:
             raise ValueError(f"objective must be {LIKELIHOOD!r} without true states, but got {self.objective!r}")
         scale = np.asarray(part.scale, dtype=np.float64)
-        known = np.where(data.scored[..., None] & np.isfinite(scale), data.states, np.nan)
-        states, weights = np.full((*known.shape[:2], part.states), np.nan), np.zeros(part.states)
-        states[..., : len(scale)] = known
+        known = data.states.shape[-1]
+        counts = np.array(stored_of(np.isfinite(scale).tolist(), leading(part.turns, known), True))
+        states = np.full((*data.states.shape[:2], part.states), np.nan)
+        weights = np.zeros(part.states - len(part.turns))
+        states[..., :known] = np.where(data.scored[..., None] & counts, data.states, np.nan)
         weights[: len(scale)] = 1.0 / np.square(scale)
         return Truth(states, weights)
 
     def _of_score(self, point: np.ndarray, part: Part, data: Data) -> np.ndarray:
         """The weights of squares that give the score, (n,), from the filter's mean square errors."""
         metrics = metrics_of_all(part.filter_at(point), data, nees=False, outputs=False)
-        scale, weights = np.asarray(part.scale, dtype=np.float64), np.zeros(part.states)
+        scale, weights = np.asarray(part.scale, dtype=np.float64), np.zeros(part.states - len(part.turns))
         deviations = np.sqrt(pooled_mean(np.asarray(metrics.mean_squares), metrics.weights))
         with np.errstate(divide="ignore"):
             weights[: len(scale)] = 1.0 / (np.isfinite(scale).sum() * scale * deviations)

@@ -464,7 +464,8 @@ class Family(Part):
         if any(parameter.tied or parameter.held for parameter in parameters):
             self._choice = choice = obeying(choice, parameters)
         self.used = make_filter(choice.name, self.model_of(choice), **choice.numbers)
-        self._base, self._noise, self.states = self.used.model, None, self.used.model.n
+        self._base, self._noise = self.used.model, None
+        self.states, self.turns = self._base.n, self._base.turns
         settings = [((parameter.place, 1.0), *parameter.tied) for parameter in parameters]  # by each parameter
         kinds = ProcessVariance, MeasurementVariance, Correlation
         if all(isinstance(position, kinds) for positions in settings for position, _ in positions):

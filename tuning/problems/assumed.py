@@ -28,7 +28,7 @@ from thruster_env.core.angles import on_one_branch
 from thruster_env.core.checks import at_least, one_of, positive, short_repr
 from thruster_env.core.modules import error_line
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import refuse_measured
+from thruster_env.model.turns import errors_of, leading, move, refuse_measured
 from tuning.problems.check import DIGEST_RUNS, check_data, digest_of, numbers_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step
 from tuning.problems.problem import GIVEN, SPREAD, Parameter, Problem
@@ -36,6 +36,7 @@ from tuning.problems.problem import GIVEN, SPREAD, Parameter, Problem
 RANGE_SEEDS = range(8)  # seeds whose runs determine each state's range, unless the model has it
 RANGE_FRACTION = 0.01  # standard deviation of the rule of thumb's Q, as a fraction of each state's range
 MOST_STEPS = 1_000_000
+MEAN_STEPS = 8  # towards a mean rotation
 
 # Constants to estimate, in the name of a problem.
 NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -225,10 +226,12 @@ class AssumedProblem(Problem):
         model = self.model()
         deviations = np.sqrt(np.diag(model.process_noise_cov))
         if model.state_low is not None and model.state_high is not None:
-            deviations = RANGE_FRACTION * (model.state_high - model.state_low)
+            ranges = np.delete(model.state_high - model.state_low, [turn.stored for turn in model.turns])
+            deviations = RANGE_FRACTION * ranges
         elif (data := self.data(self.range_seeds)).states is not None:
             states = data.counted_rows(data.states)
-            deviations[: states.shape[-1]] = RANGE_FRACTION * np.ptp(rows_of(states, model), axis=0)
+            ranges = np.ptp(rows_of(states, model), axis=0)
+            deviations[: len(ranges)] = RANGE_FRACTION * ranges
         variances = tuple(float(v) for v in deviations**2)
         return {"process_noise_cov": variances, "measurement_noise_cov": as_argument(model.measurement_noise_cov)}
 
@@ -255,9 +258,19 @@ def _data(problem: AssumedProblem, seeds: tuple[int, ...]) -> Data:
 
 
 def rows_of(states: np.ndarray, model: StateSpaceModel) -> np.ndarray:
-    """True states of all runs and steps, one a row, angles on the branch of their circular mean."""
+    """True states of all runs and steps, one a row, angles on the branch of their circular mean.
+
+    Of a model with rotations these are differences (N, t) from the mean state.
+    """
     rows = states.reshape(-1, states.shape[-1])
-    return on_one_branch(rows, model.shape.state_angles[: rows.shape[1]])
+    turns, angles = leading(model.turns, rows.shape[1]), model.any_shape.state_angles[: rows.shape[1]]
+    if not turns:
+        return on_one_branch(rows, angles)
+    mean = rows[0]
+    for _ in range(MEAN_STEPS):
+        apart = -errors_of(model, mean, rows)
+        mean = np.array(move(mean, apart.mean(axis=0), turns))
+    return apart
 
 
 def as_argument(cov: np.ndarray):

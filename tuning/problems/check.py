@@ -30,6 +30,7 @@ from thruster_env.core.sources import as_value
 from thruster_env.model.quantities import Quantities, Quantity
 from thruster_env.model.simulate import seconds_as_python
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import tangent_of
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 
@@ -201,9 +202,10 @@ def _check_scale(problem: Problem, data: Data, name: str) -> None:
             raise ValueError(f"problem {name} must have a scale if, and only if, its data have a truth")
         return
     scale = np.asarray(problem.scale, dtype=np.float64)
-    if scale.shape != data.states.shape[-1:] or not (scale > 0).all() or not np.isfinite(scale).any():
+    count = len(tangent_of(problem.model(), data.states.shape[-1]))
+    if scale.shape != (count,) or not (scale > 0).all() or not np.isfinite(scale).any():
         raise ValueError(
-            f"scale of problem {name} must be {data.states.shape[-1]} positive numbers, infinite for states "
+            f"scale of problem {name} must be {count} positive numbers, infinite for states "
             f"that are not scored, but got {short_repr(problem.scale)}"
         )
 

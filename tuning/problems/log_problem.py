@@ -176,7 +176,6 @@ class LogProblem(AssumedProblem):
         for log in self.logs:
             check_quantities("input", log.input_quantities, model.input_quantities, f"log {log.name}", "the model")
             check_quantities("measurement", log.measured, model.measurements, f"log {log.name}", "the model")
-        truth = truth and not model.turns
         by_log = [log.true_states(model) if truth else None for log in self.logs]
         known = [states for states in by_log if states is not None]
         self._states = known if len(known) == len(by_log) else None
@@ -333,7 +332,8 @@ class LogProblem(AssumedProblem):
         if self._states is None:
             return data
         states = padded([self._states[run][part] for run, part in slices], rows)
-        outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
+        is_full = states.shape[-1] == model.n
+        outputs = {symbol: model.output(symbol, states) for symbol in model.outputs} if is_full else {}
         counted = only(counted, ~np.isnan(states).any(axis=-1))
         return data._replace(states=states, outputs=outputs, counted=counted)
 

@@ -26,11 +26,18 @@ from thruster_env.logs.columns import STATE
 from thruster_env.logs.log import Log
 from thruster_env.model.simulate import simulate
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import errors_of, leading, tangent_of
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
 from tuning.problems.check import check_quantities
-from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step, estimates_in_parts
+from tuning.problems.data import (
+    FIRST_SCORED_STEP,
+    Data,
+    begun_if_unknown,
+    checked_first_scored_step,
+    estimates_in_parts,
+)
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.problem import BOUND, OPEN_LOOP, Parameter
+from tuning.problems.problem import BOUND, BOUND_OF_ROTATIONS, OPEN_LOOP, Parameter
 from tuning.problems.scenario import Excitation, excitation_of
 
 if TYPE_CHECKING:
@@ -66,7 +73,7 @@ def average_bound(model: StateSpaceModel, data: Data, truths: int = 100) -> np.n
             variances, sequences = np.repeat(variances, len(inputs), axis=0), np.arange(len(inputs))
         return np.sqrt(data._replace(counted=data.counted[sequences]).pooled(variances))
 
-    return cached_numbers("bound", model.n, follows_from, code, compute)
+    return cached_numbers("bound", model.t, follows_from, code, compute)
 
 
 def cached_numbers(name: str, count: int, follows_from: bytes, code: Loops, compute: Callable) -> np.ndarray:
@@ -195,6 +202,12 @@ class ModelProblem(AssumedProblem):
         shared = [indices[state.symbol] for state in model.states if state.symbol in indices]
         pair = model.states[: len(shared)], tuple(self.truth.states[i] for i in shared)
         check_quantities("states", *pair, "the assumed model", "the truth")
+        turns = [leading(of.turns, len(shared)) for of in (model, self.truth)]
+        if turns[0] != turns[1] or (any(turns) and shared != list(range(len(shared)))):
+            raise ValueError(
+                "states of the assumed model must begin with those of the truth, with the same rotations, but got "
+                f"{', '.join(state.symbol for state in model.states)}"
+            )
         return shared
 
     def make(self, seeds: tuple[int, ...]) -> Data:
@@ -207,13 +220,15 @@ class ModelProblem(AssumedProblem):
             if symbol in self.model().outputs
         }
         states = np.ascontiguousarray(truth.states[..., self._shared])
-        return Data(seeds, inputs, truth.measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
+        data = Data(seeds, inputs, truth.measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
+        return begun_if_unknown(self.model(), data)
 
     def bound(self, data: Data) -> np.ndarray:
         """The posterior Cramér-Rao bound of the truth on these inputs, (n,); NaN where its Q is singular.
 
         It is averaged over all inputs; for more than twelve states over as many as `posterior_variances` takes.
-        Of an angle it is that of wrapped errors (`filters.bounds.wrapped_variances`).
+        Of an angle it is that of wrapped errors (`filters.bounds.wrapped_variances`), of rotations that of small
+        ones.
         """
         return self._bound(data)
 
@@ -223,11 +238,8 @@ class ModelProblem(AssumedProblem):
         scale = self._bound(data)
         if np.isnan(scale).any():
             with np.errstate(all="ignore"):
-                parts = estimates_in_parts(OpenLoop(model=self.truth), data)
-                angles = [self.truth.shape.state_angles[i] for i in self._shared]
-                pairs = [(estimates.means[..., self._shared], part) for part, estimates in parts]
-                errors = [difference(means, part.known_states, angles)[:, part.late] for means, part in pairs]
-                scale = np.sqrt((np.concatenate(errors) ** 2).mean(axis=(0, 1)))
+                errors = self._open_loop_errors(data)[:, data.late]
+                scale = np.sqrt((errors**2).mean(axis=(0, 1)))
         if not (np.isfinite(scale).all() and (scale > 0).all()):
             raise ValueError(
                 f"the scale of problem {self.name} must be given if neither a bound nor the error of the open "
@@ -238,12 +250,33 @@ class ModelProblem(AssumedProblem):
     @property
     def found_scale_about(self) -> str:
         """The default scale: one zero on the diagonal of the true Q rules out the bound."""
-        return BOUND if has_bound(self.truth.process_noise_cov) else f"{OPEN_LOOP}, for the true Q is singular"
+        if not has_bound(self.truth.process_noise_cov):
+            return f"{OPEN_LOOP}, for the true Q is singular"
+        return BOUND_OF_ROTATIONS if self.truth.turns else BOUND
+
+    def _open_loop_errors(self, data: Data) -> np.ndarray:
+        """Errors (B, K + 1, n) of the truth's model without measurements."""
+        if self.truth.turns:  # whose open loop is the motion without noise
+            calm = self.truth.replace(
+                process_noise_cov=np.zeros((self.truth.t,) * 2), prior_cov=np.zeros((self.truth.t,) * 2)
+            )
+            return errors_of(
+                self.truth, simulate(calm, np.zeros((len(data.inputs), 2)), data.inputs).states, data.known_states
+            )
+        angles = [self.truth.shape.state_angles[i] for i in self._shared]
+        parts = estimates_in_parts(OpenLoop(model=self.truth), data)
+        return np.concatenate(
+            [
+                difference(estimates.means[..., self._shared], part.known_states, angles)
+                for part, estimates in parts
+            ]
+        )
 
     def _bound(self, data: Data) -> np.ndarray:
         if not has_bound(self.truth.process_noise_cov):
-            return np.full(len(self._shared), np.nan)
-        return average_bound(self.truth, data)[self._shared]
+            return np.full(len(tangent_of(self.truth, len(self._shared))), np.nan)
+        bound = average_bound(self.truth, data)
+        return bound[: len(tangent_of(self.truth, len(self._shared)))] if self.truth.turns else bound[self._shared]
 
     def make_env(self, **arguments: Any) -> ModelEnv:
         """The truth as a Gymnasium env, which offers filters the assumed model; the data of a seed is its episode.

@@ -17,8 +17,9 @@ import numpy as np
 
 from filters.consistency.time_constants import Run
 from thruster_env.core.checks import at_least, finite, short_repr
-from thruster_env.model.quantities import Quantities
+from thruster_env.model.quantities import Quantities, Quantity
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import tangent_of
 from tuning.problems import data as seeds
 from tuning.problems.data import Data, runs_of
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 STEP = 1e-4  # of differences of a model, in coordinates
 PART = 0.1  # fraction of its range that is the unit of a parameter on a linear scale
 BOUND = "the posterior Cramér-Rao bound"  # what a scale is, in words
+BOUND_OF_ROTATIONS = f"{BOUND} of small errors"  # where states are rotations
 PATH_BOUND = "the bound along noise-free paths"
 OPEN_LOOP = "the RMSE of the open loop"
 SPREAD = "the standard deviation of the true states"
@@ -362,6 +364,11 @@ class Problem(ABC):
     def quantities(self) -> Quantities:
         """Names, symbols and units of states, inputs and measurements."""
         return self.model().quantities
+
+    @property
+    def errors(self) -> tuple[Quantity, ...]:
+        """Those of errors of the state, of which Q, P and the scale are: of rotations the components in rad."""
+        return tangent_of(self.model())
 
     @property
     def parameters(self) -> tuple[Parameter, ...] | None:

@@ -333,7 +333,7 @@ def residual_sentences(problem: Problem, seed: int = 0) -> list[str]:
     if noise.process_cov is None or noise.measurement_cov is None:
         return []
     model = problem.quantities
-    w = _told(model.states, noise.process_cov, noise.process_mean, noise.process_correlation)
+    w = _told(problem.errors, noise.process_cov, noise.process_mean, noise.process_correlation)
     v = _told(model.measurements, noise.measurement_cov, noise.measurement_mean, noise.measurement_correlation)
     parts = [f"{what} {', '.join(remarks)}" for what, remarks in (("w of", w), ("v of", v)) if remarks]
     wrong = {f"{what} {remark.partition(' (')[0]}" for what, each in (("w of", w), ("v of", v)) for remark in each}
@@ -406,7 +406,7 @@ def _correlation_doubt(problem: Problem, seed: int) -> list[str]:
     if noise.process_correlation is None or noise.measurement_correlation is None:
         return []
     parts = (
-        ("w of", model.states, noise.process_correlation),
+        ("w of", problem.errors, noise.process_correlation),
         ("v of", model.measurements, noise.measurement_correlation),
     )
     strong = [

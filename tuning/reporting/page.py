@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from optuna.trial import FrozenTrial, TrialState
 
-from filters.engine.batch import Estimates
 from filters.filter import Filter
 from thruster_env.core.text_tables import Table, markdown_text, typeset, typeset_html
+from thruster_env.model.euler import displayed_quantities
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
 from tuning.problems.data import Data
 from tuning.reporting.style import SCRIPT, STYLE
-from tuning.reporting.time_figures import one_run
+from tuning.reporting.time_figures import Run, one_run
 from tuning.search.plan import reported, reported_name
 from tuning.search.trials import best_trial
 
@@ -334,11 +334,13 @@ def of_estimates(filters: Mapping[str, Filter], data: Data, index: int, dt: floa
     sentences = []
     for name, filter_ in filters.items():
         run, parts = one_run(filter_, data, index, dt), []
-        values, covs, what = _against(run.errors, run.innovations, run.estimates)
-        quantities = filter_.model.states if run.errors is not None else filter_.model.measurements
+        values, deviations, what = _against(run)
+        quantities = filter_.model.measurements
+        if run.errors is not None:
+            quantities = displayed_quantities(filter_.model.states, filter_.model.turns)
         for i in range(values.shape[-1]):
-            finite = np.isfinite(values[:, i]) & np.isfinite(covs[:, i, i])
-            inside = np.abs(values[finite, i]) <= TWO_SIDED * np.sqrt(covs[finite, i, i])
+            finite = np.isfinite(values[:, i]) & np.isfinite(deviations[:, i])
+            inside = np.abs(values[finite, i]) <= TWO_SIDED * deviations[finite, i]
             size = np.sqrt(np.mean(values[np.isfinite(values[:, i]), i] ** 2))
             share = f", {100 * inside.mean():.0f} % in the band" if finite.any() else ""
             parts.append(f"{quantities[i].name} {size:.3g} {quantities[i].unit}".rstrip() + share)
@@ -346,8 +348,13 @@ def of_estimates(filters: Mapping[str, Filter], data: Data, index: int, dt: floa
     return f"{'. '.join(sentences)}."
 
 
-def _against(errors, innovations: np.ndarray, estimates: Estimates):
-    """What is compared with a band: values, covariances and their name."""
-    if errors is not None:
-        return errors, estimates.covs[0], "RMSE of"
-    return innovations, estimates.innovation_covs[0], "RMS innovation of"
+def _against(run: Run) -> tuple[np.ndarray, np.ndarray, str]:
+    """What is compared with a band: values, standard deviations and their name."""
+    if run.errors is not None:
+        return run.errors, run.error_deviations, "RMSE of"
+    with np.errstate(invalid="ignore"):
+        return (
+            run.innovations,
+            np.sqrt(np.einsum("kii->ki", run.estimates.innovation_covs[0])),
+            "RMS innovation of",
+        )

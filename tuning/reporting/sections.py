@@ -17,7 +17,7 @@ from filters.consistency.report import rounded, sentences
 from filters.registry import filter_type
 from thruster_env.core.sources import is_array
 from thruster_env.model.quantities import Quantity
-from thruster_env.model.turns import error_quantities
+from thruster_env.model.turns import tangent_of
 from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison, versions
@@ -239,7 +239,7 @@ def score_section(subject: Subject) -> Section:
                 "better."
             )
             continue
-        states = scenario.quantities.states
+        states = scenario.errors
         scales = [
             f"{scale:.4g} {state.unit}".rstrip() + f" for {state.text_symbol}"
             for state, scale in zip(states, scenario.scale, strict=False)
@@ -270,7 +270,7 @@ def _no_bound(scenario: Problem) -> str:
 
 
 def _scored(scenario: Problem) -> list[str]:
-    pairs = zip(scenario.quantities.states, scenario.scale or (), strict=False)
+    pairs = zip(scenario.errors, scenario.scale or (), strict=False)
     return [state.text_symbol for state, scale in pairs if isfinite(scale)]
 
 
@@ -294,7 +294,7 @@ def model_section(choice: Choice, scenario: Problem) -> Section:
         "The filter assumes that w and v are white Gaussian noise of covariance Q and R. Covariances are per "
         "step and do not scale with dt: another sample time needs another Q."
     )
-    errors = error_quantities(model.states, model.turns)
+    errors = tangent_of(model)
     paragraphs += [
         f"In each step {state.text_symbol} moves by {_amount(variance, state)} (standard deviation) beyond the "
         "model."
@@ -493,7 +493,7 @@ def _gain_section(book: Sketchbook, pair, data, dt, scored, where: str) -> Secti
         if last:
             values = ", ".join(
                 f"{state.text_symbol} by {channel.text_symbol} {last[-1][i, j]:.3g}"
-                for i, state in enumerate(model.states)
+                for i, state in enumerate(tangent_of(model))
                 for j, channel in enumerate(model.measurements)
             )
             described.append(f"{title}: {values} at the end")

@@ -16,11 +16,12 @@ from thruster_env.core.angles import with_breaks, wrapped, wrapped_where
 from thruster_env.core.files import BLUE, GREY, RUST, new_figure, thinned, tidy
 from thruster_env.core.sources import as_value
 from thruster_env.core.text_tables import TITLE, verbatim
+from thruster_env.model.euler import displayed, displayed_deviations, displayed_quantities
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import observation_slopes
 from thruster_env.model.simulate import inputs_until
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import stored_covs
+from thruster_env.model.turns import Turn, leading, slopes_of_stored, tangent_of
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data, estimates_on
 
@@ -135,9 +136,12 @@ class Run(NamedTuple):
 
     time: np.ndarray  # (K + 1,)
     truth: np.ndarray | None  # (K + 1, n)
-    errors: np.ndarray | None  # (K + 1, n)
+    errors: np.ndarray | None  # (K + 1, n), of rotations [deg] on the tangent
     estimates: Estimates  # of this run alone
     innovations: np.ndarray  # (K + 1, m), NaN where nothing was measured
+    means: np.ndarray  # (K + 1, n), rotations by roll, pitch and yaw [deg]
+    deviations: np.ndarray  # (K + 1, n), of these
+    error_deviations: np.ndarray  # (K + 1, n), of the errors
 
 
 class Row(NamedTuple):
@@ -174,6 +178,7 @@ def draw_estimates(
     """
     model = next(iter(filters.values())).model
     states = model.states if data.states is None else model.states[: data.states.shape[-1]]
+    states = tuple(displayed_quantities(states, leading(model.turns, len(states))))
     indices, left_out = plotted_states(states, scored)
     rows = _rows(states, indices, model.measurements, data.states is not None)
     heights = [row.height for row in rows]
@@ -229,22 +234,42 @@ def _rows(
 
 def one_run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
     """One run of a filter on some data, with errors where there is a truth; `dt` as in `draw_estimates`."""
-    single = data.one(index)
-    estimates, turns = estimates_on(filter_, single), filter_.model.turns
-    estimates = estimates._replace(covs=stored_covs(estimates.means, estimates.covs, turns))
+    single, model = data.one(index), filter_.model
+    estimates = estimates_on(filter_, single)
+    means, covs, turns = estimates.means[0], estimates.covs[0], model.turns
+    with np.errstate(invalid="ignore"):
+        deviations = error_deviations = np.sqrt(np.einsum("kii->ki", covs))
+    if turns:
+        deviations = displayed_deviations(means, covs, turns)
+        means, error_deviations = _displayed(means, turns), _in_degrees(error_deviations, turns)
+    parts = means, deviations, error_deviations
     time = (1.0 if dt is None else dt) * np.arange(single.steps + 1)
     innovations = np.where(np.isnan(single.measurements[0]), np.nan, estimates.innovations[0])
     if single.states is None:
-        return Run(time, None, None, estimates, innovations)
-    errors = state_errors(filter_, estimates, single)[0]
-    truth = wrapped_where(
-        single.known_states[0], filter_.model.shape.state_angles[: single.known_states.shape[-1]]
-    )
-    return Run(time, truth, errors, estimates, innovations)
+        return Run(time, None, None, estimates, innovations, *parts)
+    errors, truth = state_errors(filter_, estimates, single)[0], single.known_states[0]
+    known = leading(turns, truth.shape[-1])
+    if known:
+        errors, truth = _in_degrees(errors, known), _displayed(truth, known)
+    else:
+        truth = wrapped_where(truth, model.any_shape.state_angles[: truth.shape[-1]])
+    return Run(time, truth, errors, estimates, innovations, *parts)
+
+
+def _displayed(states: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
+    return np.stack(displayed(states.T, turns), axis=-1)
+
+
+def _in_degrees(errors: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
+    """Errors (..., t) with the angles of rotations in degrees."""
+    errors = errors.copy()
+    for turn in turns:
+        errors[..., turn.tangent : turn.tangent + min(turn.size, 3)] *= np.rad2deg(1.0)
+    return errors
 
 
 def _values(axis, filtered: Run, i: int, angle: bool, colour: str) -> None:
-    mean, band = filtered.estimates.means[0, :, i], TWO_SIDED * np.sqrt(filtered.estimates.covs[0, :, i, i])
+    mean, band = filtered.means[:, i], TWO_SIDED * filtered.deviations[:, i]
     lines = filtered.time, mean, mean - band, mean + band
     time, _, low, high = with_breaks(*lines) if angle else lines
     draw_band(axis, time, low, high, colour)
@@ -262,7 +287,7 @@ def line_of(angle: bool, time: np.ndarray, line: np.ndarray) -> tuple[np.ndarray
 
 def _error(axis, filtered: Run, i: int, colour: str) -> None:
     assert filtered.errors is not None  # rows of errors are made where there is a truth
-    band = TWO_SIDED * np.sqrt(filtered.estimates.covs[0, :, i, i])
+    band = TWO_SIDED * filtered.error_deviations[:, i]
     draw_in_band(axis, filtered.time, filtered.errors[:, i], band, "error of the estimate", colour)
 
 
@@ -272,15 +297,15 @@ def _innovation(axis, filtered: Run, j: int, colour: str) -> None:
 
 
 def _limit_values(axes, runs: Sequence[Run], start: int, i: int) -> None:
-    means, ends = [filtered.estimates.means[0, start:, i] for filtered in runs], []
+    means, ends = [filtered.means[start:, i] for filtered in runs], []
     for filtered, mean in zip(runs, means, strict=True):
-        band = TWO_SIDED * np.sqrt(filtered.estimates.covs[0, start:, i, i])
+        band = TWO_SIDED * filtered.deviations[start:, i]
         ends += [mean - band, mean + band]
     limit_values(axes, [*means, *(filtered.truth[:, i] for filtered in runs if filtered.truth is not None)], ends)
 
 
 def _limit_errors(axes, runs: Sequence[Run], start: int, i: int) -> None:
-    bands = [TWO_SIDED * np.sqrt(filtered.estimates.covs[0, :, i, i]) for filtered in runs]
+    bands = [TWO_SIDED * filtered.error_deviations[:, i] for filtered in runs]
     limit_errors(axes, [filtered.errors[:, i] for filtered in runs if filtered.errors is not None], bands, start)
 
 
@@ -383,7 +408,8 @@ def gains(filter_: Filter, data: Data, index: int) -> np.ndarray:
 def draw_gains(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None, scored=None) -> Figure:
     """The gain on every state, a line per channel and a column per filter, each panel with its own axis."""
     model = next(iter(filters.values())).model
-    indices, left_out = plotted_states(model.states, scored)
+    states = tangent_of(model)
+    indices, left_out = plotted_states(states, scored)
     channels, _ = plotted_states(model.measurements)
     figure = new_figure((WIDTH * len(filters), HEIGHT * len(indices) + 0.8))
     axes = figure.subplots(len(indices), len(filters), squeeze=False, sharex=True)
@@ -400,21 +426,22 @@ def draw_gains(filters: Mapping[str, Filter], data: Data, index: int, dt: float 
         column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
         column[-1].set_xlabel(_time(dt))
     for axis, i in zip(axes[:, 0], indices, strict=True):
-        units = {_over(model.states[i], model.measurements[j]) for j in channels}
+        units = {_over(states[i], model.measurements[j]) for j in channels}
         unit = units.pop() if len(units) == 1 else "state/channel"
-        axis.set_ylabel(axis_label(model.states[i]._replace(name="gain on", unit=unit)))
+        axis.set_ylabel(axis_label(states[i]._replace(name="gain on", unit=unit)))
     figure.align_ylabels(axes[:, 0])
     _legend(figure, axes[:, 0], left_out)
     return figure
 
 
 def _slopes(model: StateSpaceModel, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Slopes of the measurements by the states at an estimate and the input until then, (m, n)."""
+    """Slopes of the measurements by errors of the state at an estimate and the input until then, (m, n)."""
     if not np.isfinite(mean).all():
-        return np.full((model.m, model.n), np.nan)
+        return np.full((model.m, model.t), np.nan)
     slopes, fed = observation_slopes(model.functions, model.any_shape), model.any_shape.fed(as_value(u.tolist()))
     h = slopes(as_value(mean.tolist()), as_value(model.scales), *fed, model.given_constants)
-    return np.array(h, dtype=float).reshape(model.m, model.n)
+    h = np.array(h, dtype=float).reshape(model.m, model.n)
+    return h @ np.array(slopes_of_stored(mean, model.turns)) if model.turns else h
 
 
 def _over(state: Quantity, channel: Quantity) -> str:

@@ -310,18 +310,18 @@ def _all_parameters(problem: Problem, *, hold_r: bool, full_q: bool, full_r: boo
     if problem.parameters is not None:
         return list(problem.parameters)
     untuned, quantities, parameters = problem.untuned, problem.quantities, []
-    variances, count = _diagonal(untuned[Q]), len(quantities.states)
+    variances, errors = _diagonal(untuned[Q]), problem.errors
     user_values = untuned if problem.given is None else problem.given
     given_q, given_r = _diagonal(user_values[Q]), _diagonal(user_values[R])
-    scales = [*(() if problem.scale is None else problem.scale), *[0.0] * count]
-    for i, (variance, state) in enumerate(zip(variances, quantities.states, strict=True)):
+    scales = [*(() if problem.scale is None else problem.scale), *[0.0] * len(errors)]
+    for i, (variance, state) in enumerate(zip(variances, errors, strict=True)):
         if variance > 0:  # otherwise the state has no noise, and no range
             # Where the input hardly moves a state, noise may move it more.
             scale = scales[i] if np.isfinite(scales[i]) else 0.0
             ends = _range(variance, given_q[i], max(variance, scale**2))
             parameters.append(_variance(f"Q{i + 1}{i + 1}", ends, Q_FIRST, state.unit, ProcessVariance(i)))
     if full_q:
-        parameters += _correlations(Q, count)
+        parameters += _correlations(Q, len(errors))
     if not hold_r:
         channels = quantities.measurements
         for i, (variance, channel) in enumerate(zip(_diagonal(untuned[R]), channels, strict=True)):

@@ -24,6 +24,7 @@ from filters.tuned_file import NOISE
 from thruster_env.core.checks import in_words, one_of, positive, short_repr
 from thruster_env.core.modules import is_code
 from tuning.evaluation.evaluate import Evaluation, mse
+from tuning.evaluation.runs import outputs_of
 from tuning.problems.assumed import may_estimate_constants
 from tuning.problems.check import checked_problem, data_of, digest_of
 from tuning.problems.data import Data, estimates_on
@@ -186,7 +187,7 @@ def check_objectives(names: Iterable[str], problem: Problem) -> None:
                 f"an objective on {problem.name}, which has no truth, must be one of {free}, "
                 f"but got {short_repr(name)}"
             )
-        outputs = tuple(problem.model().outputs) if objective.output else ()
+        outputs = tuple(outputs_of(problem.model())) if objective.output else ()
         if objective.output and objective.output not in outputs:
             has = ", ".join(f"{OUTPUT}{symbol}" for symbol in outputs) or "none"
             raise ValueError(
@@ -375,7 +376,7 @@ class Plan(NamedTuple):
                 )
             checked_problem(problem)
             parameters = [parameter.name for parameter in problem.parameters or ()]
-            sizes = () if parameters else (len(problem.quantities.states), len(problem.quantities.measurements))
+            sizes = () if parameters else (len(problem.errors), len(problem.quantities.measurements))
             shapes.append((sizes, parameters))
             if shapes[-1] != shapes[0]:
                 raise ValueError(

@@ -1,0 +1,171 @@
+"""Problems whose truth turns: simulation, errors on the tangent, their bound, and logs with a quaternion."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation as Turned
+
+import filters
+import tuning
+from filters.bounds import posterior_bound
+from filters.inertial import attitude
+from filters.registry import make_filter
+from thruster_env.core.streams import episode_keys
+from thruster_env.env.model_env import ModelEnv
+from thruster_env.logs.read import read_log
+from thruster_env.model import rotations
+from thruster_env.model.simulate import simulate
+from thruster_env.model.turns import Rotation
+from tuning.evaluation.evaluate import check_consistency, evaluate
+from tuning.problems.check import checked_problem
+from tuning.problems.model_problem import ModelProblem
+
+DT, UP, NORTH = 0.1, (0.0, 0.0, 1.0), (0.0, 0.6, -0.8)
+SCALE = (0.02, 0.013, 0.013, 0.006, 0.005, 0.006)
+
+
+def turn(x, u, c):
+    q, bias = x[:4], x[4:]
+    angles = tuple((u[i] - bias[i]) * DT for i in range(3))
+    return *rotations.product(q, rotations.exponential(angles)), *bias
+
+
+def look(x, c):
+    return *rotations.to_body(x[:4], UP), *rotations.to_body(x[:4], NORTH)
+
+
+def turning(side="body"):
+    return filters.StateSpaceModel(
+        transition=turn,
+        observe=look,
+        states=(Rotation("attitude", side=side), "b_x", "b_y", "b_z"),
+        inputs=3,
+        prior_mean=[1.0] + [0.0] * 6,
+        prior_cov=[np.deg2rad(5.0) ** 2] * 3 + [0.02**2] * 3,
+        process_noise_cov=[0.01**2 * DT] * 3 + [0.001**2 * DT] * 3,
+        measurement_noise_cov=[0.05**2] * 6,
+    )
+
+
+def rates(seeds, steps):
+    k = np.arange(steps)
+    return np.repeat(np.stack([0.3 * np.sin(0.2 * k), 0.2 + 0.0 * k, 0.1 + 0.0 * k], -1)[None], len(seeds), 0)
+
+
+def problem():
+    return ModelProblem(turning(), inputs=rates, steps=80, dt=DT, name="turning", scale=SCALE)
+
+
+def test_errors_are_on_the_tangent():
+    """Against SciPy's rotations: errors of the body, their RMSE, the angle in degrees and the NEES."""
+    data = checked_problem(problem()).data(range(40))
+    ekf = make_filter("ekf", turning())
+    evaluation = evaluate(ekf, data, SCALE)
+    means, covs, *_ = filters.run(ekf, data.filter_keys, data.inputs, data.measurements)
+    late = slice(data.first_scored, None)
+    estimated, true = (Turned.from_quat(x[:, late, [1, 2, 3, 0]].reshape(-1, 4)) for x in (means, data.states))
+    turned = (true.inv() * estimated).as_rotvec().reshape(40, -1, 3)
+    errors = np.concatenate([turned, (means - data.states)[:, late, 4:]], -1)
+    rmse = [interval.value for interval in evaluation.rmse]
+    np.testing.assert_allclose(rmse, np.sqrt((errors**2).mean((0, 1))), rtol=1e-9)
+    squares = np.einsum("bki,bki->bk", errors, np.linalg.solve(covs[:, late], errors[..., None])[..., 0])
+    np.testing.assert_allclose(evaluation.nees.value, squares.mean(), rtol=1e-9)
+    assert 5.0 < evaluation.nees.value < 7.0
+    angle = np.rad2deg(np.sqrt((turned**2).sum(-1).mean()))
+    assert evaluation.output_rmse["q_angle"].value == pytest.approx(angle, rel=1e-9)
+    assert [state.short_label for state in evaluation.states[:4]] == ["q_1 [rad]", "q_2 [rad]", "q_3 [rad]", "b_x"]
+    report = check_consistency(ekf, data, DT)
+    np.testing.assert_allclose(report.nees.mean.value, evaluation.nees.value, rtol=1e-9)
+
+
+def test_an_env_and_a_simulation_turn_alike():
+    """The noise moves on the tangent: quaternions keep length 1, and steps from f(x) have the covariance Q."""
+    model, u = turning("world"), rates(range(60), 50)
+    truth = simulate(model, episode_keys(range(60)), u)
+    q, expected = truth.states[..., :4], np.zeros((60, 50, 4))
+    np.testing.assert_allclose((q**2).sum(-1), 1.0, rtol=1e-14)
+    angles = (u - truth.states[:, :-1, 4:]) * DT
+    step = np.stack(rotations.exponential(np.moveaxis(angles, -1, 0)))
+    expected = np.stack(rotations.product(np.moveaxis(q[:, :-1], -1, 0), step))
+    noise = rotations.logarithm(rotations.product(np.moveaxis(q[:, 1:], -1, 0), rotations.inverse(expected)))
+    np.testing.assert_allclose(np.cov(np.reshape(noise, (3, -1))), 1e-5 * np.eye(3), atol=1e-6)
+    env = ModelEnv(model, low=-1.0, high=1.0)
+    _, info = env.reset(seed=7)
+    for k in range(50):
+        _, _, _, _, info = env.step(u[7, k])
+    np.testing.assert_allclose(info["state"], truth.states[7, -1], atol=1e-11)
+    np.testing.assert_allclose(info["measurement"], truth.measurements[7, -1], atol=1e-11)
+
+
+def test_the_bound_of_small_errors():
+    """Where errors are small it is about the covariance of the extended filter, on each side in its axes."""
+    for side in ("body", "world"):
+        model, u = turning(side), rates([0], 30)
+        bound = posterior_bound(model, u, truths=20)[0, -1]
+        truth = simulate(model, episode_keys(range(20)), np.repeat(u, 20, 0))
+        covs = filters.run(
+            make_filter("ekf", model), inputs=np.repeat(u, 20, 0), measurements=truth.measurements
+        ).covs
+        np.testing.assert_allclose(np.diag(bound), np.diag(covs[:, -1].mean(0)), rtol=0.1)
+
+
+@pytest.mark.slow
+def test_a_study_of_what_turns(undrawn, tmp_path):
+    study = tuning.tune(problem(), filter="ekf", method="gradient", out=tmp_path / "tuned.json")
+    comparison = (
+        study.result.held_out.comparison if hasattr(study.result, "held_out") else study.held_out.comparison
+    )
+    assert comparison.tuned.score.value < 1.02 * comparison.true.score.value
+    tuning.report(str(tmp_path / "tuned.json"), problem=problem(), out=tmp_path / "report")
+    assert "q_angle" in (tmp_path / "report" / "tuned.html").read_text(encoding="utf-8")
+
+
+def table(columns):
+    """A second of an IMU that turns about z, with a quaternion under some names."""
+    time = np.arange(100) / 100.0
+    q = np.stack(rotations.exponential((0.0 * time, 0.0 * time, time)))
+    wave = np.sin(7.0 * time)
+    motion = {f"{name}_{axis}": 0.01 * wave for name in ("gyr", "acc", "mag") for axis in "xyz"}
+    return {"time": time, **motion, **columns(q)}
+
+
+def test_quaternions_of_logs():
+    """Names tell the order; lengths and signs are repaired in words, and numbers are not read."""
+
+    def of_ros(q):
+        sign = np.where(np.arange(100) < 60, 1.03, -1.03)
+        return {f"orientation.{axis}": sign * q["wxyz".index(axis)] for axis in "xyzw"}
+
+    log = read_log(table(of_ros), attitude())
+    states = log.true_states(attitude())
+    np.testing.assert_allclose(states[:, 3], np.sin(0.5 * log.times), atol=1e-12)
+    said = " ".join(finding.sentence for finding in log.findings)
+    assert "100 of 100 have a length of 1.03 to 1.03" in said
+    assert "the sign changes 1 times" in said
+    log = read_log(table(lambda q: {f"q{i}": q[i] for i in range(4)}), attitude())
+    assert log.true_states(attitude()) is None
+    assert "q0, q1, q2, q3 may be a quaternion" in " ".join(finding.sentence for finding in log.findings)
+    with pytest.raises(ValueError, match="four columns, but there is none for q_z"):
+        read_log(table(lambda q: {f"q_{axis}": q["wxyz".index(axis)] for axis in "wxy"}), attitude())
+    with pytest.raises(ValueError, match=r"length 1, but its median is 3"):
+        read_log(table(lambda q: {f"q_{axis}": 3.0 * q["wxyz".index(axis)] for axis in "wxyz"}), attitude())
+
+
+def test_a_log_with_its_reference():
+    """The error is an angle, for q and -q alike, and the truth of a problem is the quaternion alone."""
+    columns = table(lambda q: {f"q_{axis}": -q["wxyz".index(axis)] for axis in "wxyz"})
+    columns |= {
+        "acc_z": 9.81 + columns["acc_x"],
+        "mag_y": 25.0 + columns["mag_x"],
+        "mag_z": columns["mag_x"] - 43.3,
+    }
+    columns |= {"gyr_z": 1.0 + columns["gyr_x"]}
+    estimate = tuning.estimate(tuning.read_logs(columns, model="attitude"), filter="ekf")
+    angle = next(r for r in estimate.findings.references if r.quantity.symbol == "q_angle")
+    q = np.moveaxis(estimate.means[:, :4], -1, 0)
+    off = Turned.from_quat(q[[1, 2, 3, 0]].T) * Turned.from_rotvec([[0, 0, t] for t in columns["time"]]).inv()
+    first = estimate.findings.first
+    assert angle.rmse == pytest.approx(np.rad2deg(np.sqrt((off.magnitude()[first:] ** 2).mean())), rel=1e-9)
+    frame = estimate.to_frame()
+    np.testing.assert_allclose(frame["yaw_deg"], np.rad2deg(rotations.euler(q)[2]), rtol=1e-12)
+    assert "reference_yaw_deg" in frame
+    assert "std_roll_deg" in frame
