@@ -247,7 +247,7 @@ class Copies:
             return _Silent()
         name = getattr(value, "__name__", "")
         for module in MODULES:
-            if callable(value) and value is getattr(module, name, None):
+            if callable(value) and value is vars(module).get(name):  # NumPy warns if asked for its np.object
                 return self._in_place_of(module, name)
         if isinstance(value, types.MethodType) and isinstance(value.__func__, types.FunctionType):
             return types.MethodType(self.of(value.__func__), self.of(value.__self__))

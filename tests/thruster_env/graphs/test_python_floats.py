@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -10,7 +11,15 @@ import pytest
 import filters
 from filters import StateSpaceModel, make_filter, run
 from filters.c.programs import programs_of
-from thruster_env.core.compiled import caught, functions_in, interpreted, inverts, needs_floats, needs_python
+from thruster_env.core.compiled import (
+    Copies,
+    caught,
+    functions_in,
+    interpreted,
+    inverts,
+    needs_floats,
+    needs_python,
+)
 from thruster_env.core.streams import filter_keys
 from thruster_env.graphs.python_floats import Floats, in_python
 
@@ -255,3 +264,9 @@ def test_a_function_s_own_error_is_raised_and_not_replaced(as_python):
         in_python(lambda x: (x[0] > 0.0) % (x[0] > 1.0), [(np.float64(1.0),)])
     with pytest.raises(ZeroDivisionError):
         in_python(lambda x: 1.0 / len(x[1:]), [(1.0,)])
+
+
+def test_a_class_whose_name_numpy_has_given_up_is_copied_in_silence():
+    """Annotated functions of Python 3.14 hold `object`, and NumPy warns if asked for np.object."""
+    with warnings.catch_warnings(action="error"):
+        assert Copies(getattr, {}).of(object) is object
