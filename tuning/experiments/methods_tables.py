@@ -195,7 +195,8 @@ def tables(results: Sequence[Result], protocol: Protocol) -> dict[str, Callable[
     return {
         "what to use": lambda: what_to_use(results, protocol),
         "groups A to D": lambda: group_table(results, protocol, "ABCD"),
-        "groups E to H": lambda: group_table(results, protocol, "EFGH"),
+        "groups E, F and H": lambda: group_table(results, protocol, "EFH"),
+        "group G": lambda: group_table(results, protocol, "G"),
     }
 
 
