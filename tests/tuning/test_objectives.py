@@ -11,9 +11,8 @@ from tuning.evaluation.evaluate import evaluate, variance_ratios
 from tuning.evaluation.runs import RunMetrics
 from tuning.experiments.benchmark import run_in_memory
 from tuning.plants.thruster import find_scenario
-from tuning.reporting.page import of_history
 from tuning.reporting.search_figures import draw_history
-from tuning.reporting.sections import of_front, reported_about
+from tuning.reporting.sections import of_front, of_history, reported_about
 from tuning.reporting.tuning_report import _band_sentence
 from tuning.search.among_types import TypeResult
 from tuning.search.measures import measured

@@ -38,18 +38,9 @@ from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.evaluation.tuned import tuned_content
 from tuning.likelihood.identifiability import Identifiability, identify, sentences, too_many
 from tuning.problems.problem import Problem
-from tuning.reporting.page import Section, Table, Words, html_page, markdown_page, of_sizes
-from tuning.reporting.search_figures import Sketchbook, draw_sizes
-from tuning.reporting.sections import (
-    advice,
-    facts_section,
-    held_out_section,
-    lines_section,
-    model_section,
-    run_sections,
-    score_section,
-    search_section,
-)
+from tuning.reporting.page import Section, Sketchbook, Table, Words, html_page, markdown_page, of_sizes
+from tuning.reporting.search_figures import draw_sizes
+from tuning.reporting.sections import advice, sections_of
 from tuning.reporting.subject import Subject, find_subject, is_file, kept_nis
 from tuning.search.plan import SIZE_SEEDS, at_ends, nis_ratio
 from tuning.search.storage import quiet_optuna, storage_text
@@ -244,26 +235,11 @@ def contents_of(file: str | None, subject: Subject) -> Contents:
     determined = [known_table(known)] if known else []
     words = [Words(identified)] if identified else []
     book = Sketchbook()
-    sections = [
-        held_out_section(book, subject, comparisons, results),
-        *data_sections(plan.scenarios),
-        score_section(subject),
-        *([Section("What the data determine", [*determined, *words])] if determined or words else []),
-        model_section(choice, plan.scenarios[0]),
-        search_section(book, subject),
-        *([sizes_section(book, subject, sizes)] if sizes else []),
-        *run_sections(book, subject, comparisons[0]),
-        lines_section(choice, plan.scenarios[0], file),
-        facts_section(subject, nis),
-    ]
+    of_data = [Section("What the data determine", [*determined, *words])] if determined or words else []
+    on_sizes = [sizes_section(book, subject, sizes)] if sizes else []
+    sections = sections_of(book, subject, comparisons, results, of_data, on_sizes, file, nis)
     summary = advice(choice, plan, comparisons, subject.validation)
     return Contents(title, summary, sections, [*sum(results, []), *determined, *identified])
-
-
-def data_sections(problems: Sequence[Problem]) -> list[Section]:
-    """A section with remarks on the data, if there are any."""
-    remarks = [remark for problem in problems for remark in problem.remarks]
-    return [Section("The data", [Words(remarks)])] if remarks else []
 
 
 def _short(name: str) -> str:

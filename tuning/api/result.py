@@ -73,8 +73,7 @@ class Result:
         Raises:
             ValueError: for another ending, or if the files cannot be written.
         """
-        from tuning.reporting.page import Section, as_parts, html_page
-        from tuning.reporting.search_figures import Sketchbook
+        from tuning.reporting.page import Section, Sketchbook, as_parts, html_page
 
         path, beside = check_page(page), Path(page).with_suffix(".md")
         book = Sketchbook()

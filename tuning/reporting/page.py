@@ -11,25 +11,14 @@ import io
 import json
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
-from itertools import groupby
-from math import isfinite
+from itertools import count, groupby
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-from optuna.trial import FrozenTrial, TrialState
-
-from filters.filter import Filter
 from thruster_env.core.text_tables import Table, markdown_text, typeset, typeset_html
-from thruster_env.model.euler import displayed_quantities
-from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
-from tuning.problems.data import Data
 from tuning.reporting.style import SCRIPT, STYLE
-from tuning.reporting.time_figures import Run, one_run
-from tuning.search.plan import reported, reported_name
-from tuning.search.trials import best_trial
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,8 +39,6 @@ COLOUR = re.compile(r"#([0-9a-fA-F]{6})\b")
 
 # Of tables and pictures on a page.
 WIDE = 480.0  # [pt] pictures beyond this are scrolled on a phone
-NO_TRIALS = "No trial was finished."
-TWO_SIDED = 1.96
 
 
 def figure_svg(figure: Figure, name: str) -> tuple[str, str]:
@@ -280,45 +267,6 @@ def markdown_page(title: str, results: Sequence[Table | str]) -> str:
     return "\n\n".join([f"# {markdown_text(title)}", *filter(None, parts)]) + "\n"
 
 
-def of_history(trials: Sequence[FrozenTrial], objective: str) -> str:
-    """First and best trial of a study, and how many were pruned."""
-    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    best = best_trial(done) if done else None
-    if best is None:
-        return NO_TRIALS
-    early = sum(trial.state == TrialState.PRUNED for trial in trials)
-    first, last = (
-        f"trial {trial.number + 1} has {reported(objective, trial.values[0]):.4g}" for trial in (done[0], best)
-    )
-    return (
-        f"{reported_name(objective)} of {len(trials)} trials, {early} of them pruned: {first}; the best, {last}."
-    )
-
-
-def of_comparison(comparison: Comparison) -> str:
-    """RMSE of every filter, state by state, and the bound."""
-    sentences = []
-    for i, state in enumerate(comparison.tuned.states):
-        values = [f"{name} {evaluation.rmse[i].value:.3g}" for name, evaluation in comparison.evaluations.items()]
-        values += [f"bound {comparison.bound[i]:.3g}"] if isfinite(comparison.bound[i]) else []
-        sentences.append(f"RMSE of {state.name}{f' in {state.unit}' if state.unit else ''}: {', '.join(values)}")
-    return f"Bars with whiskers. {'; '.join(sentences)}."
-
-
-def of_slices(trials: Sequence[FrozenTrial]) -> str:
-    """Parameters of the best trial, and the range of the trials."""
-    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    best = best_trial(done) if done else None
-    if best is None:
-        return NO_TRIALS
-    ranges = []
-    for name, value in best.params.items():
-        if isinstance(value, (int, float)):
-            tried = [trial.params[name] for trial in done if name in trial.params]
-            ranges.append(f"{name} {value:.3g}, tried from {min(tried):.3g} to {max(tried):.3g}")
-    return f"Scatter of {len(done)} complete trials. The best has {'; '.join(ranges)}."
-
-
 def of_sizes(sizes: Sequence[SizeRow], chosen: int) -> str:
     """RMSE at the smallest, the kept and the largest size."""
     states, sentences = sizes[0].evaluation.states, []
@@ -329,32 +277,14 @@ def of_sizes(sizes: Sequence[SizeRow], chosen: int) -> str:
     return f"{'; '.join(sentences)}."
 
 
-def of_estimates(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> str:
-    """RMSE of each filter in one run and the share of the truth, or of the innovations, in its band."""
-    sentences = []
-    for name, filter_ in filters.items():
-        run, parts = one_run(filter_, data, index, dt), []
-        values, deviations, what = _against(run)
-        quantities = filter_.model.measurements
-        if run.errors is not None:
-            quantities = displayed_quantities(filter_.model.states, filter_.model.turns)
-        for i in range(values.shape[-1]):
-            finite = np.isfinite(values[:, i]) & np.isfinite(deviations[:, i])
-            inside = np.abs(values[finite, i]) <= TWO_SIDED * deviations[finite, i]
-            size = np.sqrt(np.mean(values[np.isfinite(values[:, i]), i] ** 2))
-            share = f", {100 * inside.mean():.0f} % in the band" if finite.any() else ""
-            parts.append(f"{quantities[i].name} {size:.3g} {quantities[i].unit}".rstrip() + share)
-        sentences.append(f"{name}: {what} {'; '.join(parts)}")
-    return f"{'. '.join(sentences)}."
+class Sketchbook:
+    """Numbers pictures, each with a caption and a text alternative."""
 
+    def __init__(self):
+        """Pictures are called by a number."""
+        self._names = (f"p{number}" for number in count(1))
 
-def _against(run: Run) -> tuple[np.ndarray, np.ndarray, str]:
-    """What is compared with a band: values, standard deviations and their name."""
-    if run.errors is not None:
-        return run.errors, run.error_deviations, "RMSE of"
-    with np.errstate(invalid="ignore"):
-        return (
-            run.innovations,
-            np.sqrt(np.einsum("kii->ki", run.estimates.innovation_covs[0])),
-            "RMS innovation of",
-        )
+    def picture(self, figure: Figure, caption: str, alt: str) -> Picture:
+        """A figure as a part of a page."""
+        svg, readings = figure_svg(figure, next(self._names))
+        return Picture(svg, caption, alt, readings)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,20 +25,15 @@ from thruster_env.core.files import (
     MUSTARD,
     PALE,
     RUST,
-    grid_of,
-    new_figure,
     panels,
-    tidy,
 )
 from thruster_env.core.text_tables import TITLE, verbatim
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
-from tuning.reporting.page import Picture, figure_svg
 from tuning.reporting.time_figures import COLUMNS, plotted_states
 from tuning.search.plan import SCORE, reported
-from tuning.search.space import FILTER_TYPE
-from tuning.search.trials import best_trial, is_consistent
+from tuning.search.trials import is_consistent
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -186,93 +180,6 @@ def _with_pruned(study: optuna.Study) -> optuna.Study:
     return copied
 
 
-def draw_importance(importances: Mapping[str, float]) -> Figure:
-    """Importance of each number, the largest above."""
-    figure = new_figure((6.4, 0.9 + 0.4 * len(importances)))
-    axis = figure.subplots()
-    tidy([axis])
-    names, values = list(importances)[::-1], list(importances.values())[::-1]
-    axis.barh([words(name) for name in names], values, 0.6, color=BLUE)
-    for row, value in enumerate(values):
-        axis.annotate(f"{value:.2f}", (value, row), (4, 0), textcoords="offset points", va="center", fontsize=9)
-    axis.margins(x=0.12)
-    axis.grid(axis="y", visible=False)
-    axis.set_xlabel("importance, of a sum of 1 [-]")
-    return figure
-
-
-def draw_slices(trials: Sequence[FrozenTrial], label: str, objective: str = SCORE) -> Figure:
-    """First objective against each parameter, a panel per parameter; dashed is the best trial.
-
-    Hollow circles have a mean NIS outside its band; crosses were pruned and stand at the mean of their seeds.
-    """
-    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    early, names = early_trials(trials), [name for name in done[0].params if name != FILTER_TYPE]
-    figure, axes = panels(len(names), COLUMNS, (3.2, 2.7), extra=0.4, sharey=True)
-    best, values = best_trial(done), [trial.values[0] for trial in done]
-    assert best is not None  # a report is of a study with a complete trial
-    faces = [BLUE if is_consistent(trial) else "white" for trial in done]
-    for axis, name in zip(axes, names, strict=True):
-        tried = [trial.params[name] for trial in done]
-        axis.scatter(
-            tried,
-            [reported(objective, value) for value in values],
-            s=16,
-            facecolors=faces,
-            edgecolors=BLUE,
-            linewidths=0.8,
-            alpha=0.7,
-        )
-        crosses = [trial.params[name] for trial, _ in early], [reported(objective, value) for _, value in early]
-        axis.plot(*crosses, "x", **CROSS)
-        axis.axvline(best.params[name], color=RUST, linestyle="--", linewidth=1)
-        if getattr(best.distributions[name], "log", False):
-            if len({*tried, *(trial.params[name] for trial, _ in early)}) == 1:
-                axis.set_xlim(tried[0] / 2.0, tried[0] * 2.0)  # the few trials of a short study may be alike
-            axis.set_xscale("log")
-        if name == "N" or name.endswith(" N"):
-            _size_axis(axis, sorted(trial.params[name] for trial in trials if name in trial.params))
-        axis.set_xlabel(verbatim(words(name)))
-    limit_values(axes[0], values, objective)
-    for axis in axes[:: grid_of(len(names), COLUMNS)[1]]:
-        axis.set_ylabel(verbatim(label), fontsize=9)
-    return figure
-
-
-def draw_front(
-    trials: Sequence[FrozenTrial], front: Sequence[FrozenTrial], labels: Sequence[str], objectives: Sequence[str]
-) -> Figure:
-    """Trials by their two objectives, and the Pareto front."""
-    figure = new_figure((6.4, 4.4))
-    axis = figure.subplots()
-    tidy([axis])
-    done = np.array([trial.values for trial in trials if trial.state == TrialState.COMPLETE])
-    best = np.array(sorted(trial.values for trial in front))
-    signs = np.array([reported(name, 1.0) for name in objectives])
-    axis.plot(*(signs * done).T, "o", color=GREY, markersize=4, label="trial")
-    axis.plot(
-        *(signs * best).T,
-        "o-",
-        color=BLUE,
-        markersize=6,
-        linewidth=1,
-        drawstyle="steps-post",
-        label="Pareto front",
-    )
-    axis.plot(*(signs * best[0]), "s", color=RUST, markersize=8, label="best in the first objective")
-    for axis_name, column in (("x", 0), ("y", 1)):
-        low, high = best[:, column].min(), best[:, column].max()
-        room = 0.5 * (high - low) or 0.2 * abs(low) or 1.0
-        near = done[done[:, column] <= high + room, column]
-        pad = 0.08 * (near.max() - low) or room
-        ends = signs[column] * np.array([low - pad, near.max() + pad])
-        getattr(axis, f"set_{axis_name}lim")(*sorted(ends))
-    axis.set_xlabel(verbatim(labels[0]))
-    axis.set_ylabel(verbatim(labels[1]))
-    axis.legend(frameon=False)
-    return figure
-
-
 def draw_sizes(sizes: Sequence[SizeRow], chosen: int) -> Figure:
     """RMSE of every state against ensemble size with 95 % intervals; dashed is the size that was kept."""
     states, numbers = sizes[0].evaluation.states, [row.size for row in sizes]
@@ -286,7 +193,7 @@ def draw_sizes(sizes: Sequence[SizeRow], chosen: int) -> Figure:
         axis.axvline(chosen, color=RUST, linestyle="--", linewidth=1)
         coordinates = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
         axis.annotate(f"N = {chosen}", (chosen, 1), (4, -10), **coordinates, color=RUST, fontsize=9)
-        _size_axis(axis, numbers)
+        size_axis(axis, numbers)
         axis.set_xlabel("ensemble size N [-]")
         axis.set_ylabel(f"RMSE of {states[i].plot_label}")
     if left_out:
@@ -299,25 +206,12 @@ def words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _size_axis(axis, sizes: Sequence[int]) -> None:
+def size_axis(axis, sizes: Sequence[int]) -> None:
     """A logarithmic axis of ensemble sizes, smallest first, with round numbers."""
     ticks = [n for n in (5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000) if sizes[0] <= n <= sizes[-1]]
     axis.set_xscale("log")
     axis.set_xticks(ticks, [str(tick) for tick in ticks])
     axis.set_xticks([], minor=True)
-
-
-class Sketchbook:
-    """Numbers pictures, each with a caption and a text alternative."""
-
-    def __init__(self):
-        """Pictures are called by a number."""
-        self._names = (f"p{number}" for number in count(1))
-
-    def picture(self, figure: Figure, caption: str, alt: str) -> Picture:
-        """A figure as a part of a page."""
-        svg, readings = figure_svg(figure, next(self._names))
-        return Picture(svg, caption, alt, readings)
 
 
 def draw_consistency(

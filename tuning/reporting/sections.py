@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from math import isnan, sqrt
-from pathlib import Path
 from textwrap import fill
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy import isfinite
@@ -15,51 +14,48 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.consistency.report import rounded, sentences
 from filters.registry import filter_type
+from thruster_env.core.files import BLUE, GREY, RUST, grid_of, new_figure, panels, tidy
 from thruster_env.core.sources import is_array
+from thruster_env.core.text_tables import verbatim
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.turns import tangent_of
 from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison, versions
 from tuning.evaluation.worth import all_warnings, tuning_effect
-from tuning.problems.assumed import within
-from tuning.problems.find import built_in
-from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import BOUND, OPEN_LOOP, Problem, score_label
 from tuning.reporting.choice_words import choice_sentences, consistency_of, model_doubts
-from tuning.reporting.matlab import matlab_function
-from tuning.reporting.page import (
-    Code,
-    Part,
-    Picture,
-    Section,
-    Table,
-    Words,
-    as_parts,
-    of_comparison,
-    of_estimates,
-    of_history,
-    of_slices,
-)
+from tuning.reporting.matlab import lines_section
+from tuning.reporting.page import Part, Picture, Section, Sketchbook, Table, Words, as_parts
 from tuning.reporting.search_figures import (
+    CROSS,
     FEWEST_TRIALS,
-    Sketchbook,
     counted_trials,
     draw_comparison,
     draw_consistency,
-    draw_front,
     draw_history,
-    draw_importance,
-    draw_slices,
+    early_trials,
     importances,
+    limit_values,
+    size_axis,
+    words,
 )
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import kinds_table
-from tuning.reporting.time_figures import draw_estimates, draw_gains, draw_innovations, draw_signal, gains
+from tuning.reporting.time_figures import (
+    COLUMNS,
+    draw_estimates,
+    draw_gains,
+    draw_innovations,
+    draw_signal,
+    gains,
+    of_estimates,
+)
 from tuning.search.among_types import filter_types_tried
 from tuning.search.parameters import index_pairs
 from tuning.search.plan import (
     NIS_BAND,
+    SCORE,
     TRAINING_SEEDS,
     Plan,
     find_objective,
@@ -69,27 +65,13 @@ from tuning.search.plan import (
     reported_name,
 )
 from tuning.search.space import AUTO, FILTER_TYPE, Choice
+from tuning.search.trials import best_trial, is_consistent
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MANY_TRIALS = 50
 MOST_ROWS = 40  # of a table of variances
-ON_ENV = """from filters import EstimateState
-{problem}
-env = EstimateState(problem.make_env(), tuned={file!r})  # observations are estimates
-tuned = env.filter  # with its model, Q and R
-"""
-ON_LOG = """import tuning
-
-found = tuning.estimate("run.csv", tuned={file!r})  # of a log; the same as `thruster estimate`
-tuned = found.filter  # with its model, Q and R
-"""
-BY_HAND = """
-belief = tuned.init()
-for measurement, command in zip(measurements, inputs):  # arrays of your own, a row per step
-    belief, innovation = tuned.update(belief, measurement)
-    print(belief.mean, belief.cov)
-    belief = tuned.predict(belief, command)
-"""
-UNSAVED = "TUNED.json"  # a name to be replaced
 AXES = (
     "Limits are those of the scored steps, the same in a row unless its panels say otherwise; RMSE and RMS "
     "are over these steps."
@@ -127,6 +109,33 @@ def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen
     warned += range_warning(choice, plan)
     doubts = [model_doubts(*pair, plan.seed) for pair in zip(plan.scenarios, comparisons, strict=True)]
     return " ".join([*choice_sentences(chosen, plan), "; ".join(parts) + ".", *warned, *sum(doubts, [])])
+
+
+def sections_of(
+    book: Sketchbook,
+    subject: Subject,
+    comparisons: Sequence[Comparison],
+    results: Sequence[Sequence[Table | str]],
+    determined: Sequence[Section],
+    sizes: Sequence[Section],
+    file: str | None,
+    nis: Sequence[float],
+) -> list[Section]:
+    """All sections of a page on a study, in their order; those on what data determine and on sizes are given."""
+    choice, problems = subject.choice, subject.plan.scenarios
+    remarks = [remark for problem in problems for remark in problem.remarks]
+    return [
+        held_out_section(book, subject, comparisons, results),
+        *([Section("The data", [Words(remarks)])] if remarks else []),
+        score_section(subject),
+        *determined,
+        model_section(choice, problems[0]),
+        search_section(book, subject),
+        *sizes,
+        *run_sections(book, subject, comparisons[0]),
+        lines_section(choice, problems[0], file),
+        facts_section(subject, nis),
+    ]
 
 
 def held_out_section(
@@ -208,11 +217,6 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
     return Section(title, parts)
 
 
-def of_importances(importances: Mapping[str, float]) -> str:
-    """Every importance."""
-    return f"Bars: {', '.join(f'{name} {value:.2f}' for name, value in importances.items())}."
-
-
 def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Words:
     """Importances, and how they were computed; or how many trials they need."""
     shares = importances(study)
@@ -225,12 +229,13 @@ def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Wor
         "Importance of each parameter for a trial to be among the best tenth, from the difference between "
         f"its values there and those of all trials (PED-ANOVA): {complete} complete trials{pruned}{rough}."
     )
-    return book.picture(draw_importance(shares), caption, of_importances(shares))
+    alt = f"Bars: {', '.join(f'{name} {value:.2f}' for name, value in shares.items())}."
+    return book.picture(draw_importance(shares), caption, alt)
 
 
 def score_section(subject: Subject) -> Section:
     """The definition of the score, in words and with its scales."""
-    paragraphs = []
+    paragraphs, word = [], subject.plan.scenarios[0].seed_word
     for scenario in subject.plan.scenarios:
         if scenario.scale is None:
             paragraphs.append(
@@ -251,7 +256,7 @@ def score_section(subject: Subject) -> Section:
             f"errors as large as the scale, which is {scenario.scale_about}.{_no_bound(scenario)}"
         )
     paragraphs.append(
-        f"The filter tuned on training {_word(subject)} is evaluated on held-out {_word(subject)}, which no "
+        f"The filter tuned on training {word} is evaluated on held-out {word}, which no "
         "trial saw. Intervals contain 95 % of resampled sets of runs; ratios are paired, run by run."
     )
     return Section("What the score is", [Words(paragraphs)])
@@ -272,10 +277,6 @@ def _no_bound(scenario: Problem) -> str:
 def _scored(scenario: Problem) -> list[str]:
     pairs = zip(scenario.errors, scenario.scale or (), strict=False)
     return [state.text_symbol for state, scale in pairs if isfinite(scale)]
-
-
-def _word(subject: Subject) -> str:
-    return subject.plan.scenarios[0].seed_word
 
 
 def model_section(choice: Choice, scenario: Problem) -> Section:
@@ -347,7 +348,7 @@ def _listed(quantities: Sequence[Quantity]) -> str:
 
 def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
     """What was tuned, on which data and how; `nis` is the choice's on training seeds, over the channels."""
-    plan, word = subject.plan, _word(subject)
+    plan, word = subject.plan, subject.plan.scenarios[0].seed_word
     trained = dict.fromkeys(scenario.training_seeds(plan.seed, TRAINING_SEEDS) for scenario in plan.scenarios)
     about = [
         f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name for scenario in plan.scenarios
@@ -383,46 +384,6 @@ def _nis_words(nis: Sequence[float], plan: Plan) -> str:
         f"to lie between {low:g} and {high:g}, where {channels} is right; it is {means}, {side}, on the "
         f"training {word}"
     )
-
-
-def lines_section(choice: Choice, problem: Problem, file: str | None) -> Section:
-    """Lines that use the tuned filter.
-
-    Args:
-        choice: the tuned filter.
-        problem: what it was tuned on.
-        file: the tuned file; None where the report is of a study, which has none yet.
-    """
-    name = Path(file).name if file else UNSAVED
-    model = problem.model(**choice.model)
-    lines = ON_LOG if isinstance(within(problem), LogProblem) else ON_ENV
-    python = lines.format(file=name, problem=_found_by(problem)) + BY_HAND
-    noise = {"process_noise_cov": model.process_noise_cov, "measurement_noise_cov": model.measurement_noise_cov}
-    entry = {"name": choice.name, "numbers": dict(choice.numbers)}
-    entry["model"] = {key: value.tolist() for key, value in noise.items()} | dict(choice.model)
-    command = f"`study.save({UNSAVED!r})` or `thruster tune --out {UNSAVED}`"
-    remarks = [] if file else [Words([f"{command} writes the tuned file that these lines read."])]
-    matlab = matlab_function(choice, model, problem.name, problem.dt)
-    return Section(
-        "Lines to copy",
-        [
-            *remarks,
-            Code("Python", python),
-            Code("JSON: the filter, as in the tuned file", json.dumps(entry, indent=2, default=str)),
-            Code("MATLAB or GNU Octave: a function that needs no toolbox", matlab, folded=True),
-        ],
-    )
-
-
-def _found_by(problem: Problem) -> str:
-    """Lines that load a problem: by its name or, if it is the user's code, from its module."""
-    if problem.name in built_in() or problem.name.endswith(".toml"):
-        return f"from tuning.problems.find import find_problem\n\nproblem = find_problem({problem.name!r})"
-    module, colon, name = problem.name.partition(":")
-    if colon and module.replace(".", "").isidentifier() and name.isidentifier():
-        statement = f"from {module} import {name}" + ("" if name == "problem" else " as problem")
-        return f"{statement}  # if it is a function: problem = problem()\n"
-    return "from your_module import problem  # the object that it was tuned on\n"
 
 
 def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) -> str:
@@ -506,3 +467,132 @@ def _gain_section(book: Sketchbook, pair, data, dt, scored, where: str) -> Secti
         draw_gains(pair, data, 0, dt, scored), caption, f"Gain over time. {'. '.join(described)}."
     )
     return Section("Gain over time", [picture])
+
+
+NO_TRIALS = "No trial was finished."
+
+
+def of_history(trials: Sequence[FrozenTrial], objective: str) -> str:
+    """First and best trial of a study, and how many were pruned."""
+    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    best = best_trial(done) if done else None
+    if best is None:
+        return NO_TRIALS
+    early = sum(trial.state == TrialState.PRUNED for trial in trials)
+    first, last = (
+        f"trial {trial.number + 1} has {reported(objective, trial.values[0]):.4g}" for trial in (done[0], best)
+    )
+    return (
+        f"{reported_name(objective)} of {len(trials)} trials, {early} of them pruned: {first}; the best, {last}."
+    )
+
+
+def of_comparison(comparison: Comparison) -> str:
+    """RMSE of every filter, state by state, and the bound."""
+    sentences = []
+    for i, state in enumerate(comparison.tuned.states):
+        values = [f"{name} {evaluation.rmse[i].value:.3g}" for name, evaluation in comparison.evaluations.items()]
+        values += [f"bound {comparison.bound[i]:.3g}"] if isfinite(comparison.bound[i]) else []
+        sentences.append(f"RMSE of {state.name}{f' in {state.unit}' if state.unit else ''}: {', '.join(values)}")
+    return f"Bars with whiskers. {'; '.join(sentences)}."
+
+
+def of_slices(trials: Sequence[FrozenTrial]) -> str:
+    """Parameters of the best trial, and the range of the trials."""
+    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    best = best_trial(done) if done else None
+    if best is None:
+        return NO_TRIALS
+    ranges = []
+    for name, value in best.params.items():
+        if isinstance(value, (int, float)):
+            tried = [trial.params[name] for trial in done if name in trial.params]
+            ranges.append(f"{name} {value:.3g}, tried from {min(tried):.3g} to {max(tried):.3g}")
+    return f"Scatter of {len(done)} complete trials. The best has {'; '.join(ranges)}."
+
+
+def draw_importance(importances: Mapping[str, float]) -> Figure:
+    """Importance of each number, the largest above."""
+    figure = new_figure((6.4, 0.9 + 0.4 * len(importances)))
+    axis = figure.subplots()
+    tidy([axis])
+    names, values = list(importances)[::-1], list(importances.values())[::-1]
+    axis.barh([words(name) for name in names], values, 0.6, color=BLUE)
+    for row, value in enumerate(values):
+        axis.annotate(f"{value:.2f}", (value, row), (4, 0), textcoords="offset points", va="center", fontsize=9)
+    axis.margins(x=0.12)
+    axis.grid(axis="y", visible=False)
+    axis.set_xlabel("importance, of a sum of 1 [-]")
+    return figure
+
+
+def draw_slices(trials: Sequence[FrozenTrial], label: str, objective: str = SCORE) -> Figure:
+    """First objective against each parameter, a panel per parameter; dashed is the best trial.
+
+    Hollow circles have a mean NIS outside its band; crosses were pruned and stand at the mean of their seeds.
+    """
+    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    early, names = early_trials(trials), [name for name in done[0].params if name != FILTER_TYPE]
+    figure, axes = panels(len(names), COLUMNS, (3.2, 2.7), extra=0.4, sharey=True)
+    best, values = best_trial(done), [trial.values[0] for trial in done]
+    assert best is not None  # a report is of a study with a complete trial
+    faces = [BLUE if is_consistent(trial) else "white" for trial in done]
+    for axis, name in zip(axes, names, strict=True):
+        tried = [trial.params[name] for trial in done]
+        axis.scatter(
+            tried,
+            [reported(objective, value) for value in values],
+            s=16,
+            facecolors=faces,
+            edgecolors=BLUE,
+            linewidths=0.8,
+            alpha=0.7,
+        )
+        crosses = [trial.params[name] for trial, _ in early], [reported(objective, value) for _, value in early]
+        axis.plot(*crosses, "x", **CROSS)
+        axis.axvline(best.params[name], color=RUST, linestyle="--", linewidth=1)
+        if getattr(best.distributions[name], "log", False):
+            if len({*tried, *(trial.params[name] for trial, _ in early)}) == 1:
+                axis.set_xlim(tried[0] / 2.0, tried[0] * 2.0)  # the few trials of a short study may be alike
+            axis.set_xscale("log")
+        if name == "N" or name.endswith(" N"):
+            size_axis(axis, sorted(trial.params[name] for trial in trials if name in trial.params))
+        axis.set_xlabel(verbatim(words(name)))
+    limit_values(axes[0], values, objective)
+    for axis in axes[:: grid_of(len(names), COLUMNS)[1]]:
+        axis.set_ylabel(verbatim(label), fontsize=9)
+    return figure
+
+
+def draw_front(
+    trials: Sequence[FrozenTrial], front: Sequence[FrozenTrial], labels: Sequence[str], objectives: Sequence[str]
+) -> Figure:
+    """Trials by their two objectives, and the Pareto front."""
+    figure = new_figure((6.4, 4.4))
+    axis = figure.subplots()
+    tidy([axis])
+    done = np.array([trial.values for trial in trials if trial.state == TrialState.COMPLETE])
+    best = np.array(sorted(trial.values for trial in front))
+    signs = np.array([reported(name, 1.0) for name in objectives])
+    axis.plot(*(signs * done).T, "o", color=GREY, markersize=4, label="trial")
+    axis.plot(
+        *(signs * best).T,
+        "o-",
+        color=BLUE,
+        markersize=6,
+        linewidth=1,
+        drawstyle="steps-post",
+        label="Pareto front",
+    )
+    axis.plot(*(signs * best[0]), "s", color=RUST, markersize=8, label="best in the first objective")
+    for axis_name, column in (("x", 0), ("y", 1)):
+        low, high = best[:, column].min(), best[:, column].max()
+        room = 0.5 * (high - low) or 0.2 * abs(low) or 1.0
+        near = done[done[:, column] <= high + room, column]
+        pad = 0.08 * (near.max() - low) or room
+        ends = signs[column] * np.array([low - pad, near.max() + pad])
+        getattr(axis, f"set_{axis_name}lim")(*sorted(ends))
+    axis.set_xlabel(verbatim(labels[0]))
+    axis.set_ylabel(verbatim(labels[1]))
+    axis.legend(frameon=False)
+    return figure

@@ -476,3 +476,34 @@ def _legend(figure, axes, left_out: str) -> None:
         named |= dict(zip(labels, handles, strict=True))
     options = {"ncols": min(len(named), 4), "frameon": False, "title": left_out or None}
     figure.legend(named.values(), named, loc="outside lower center", **options)
+
+
+def of_estimates(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> str:
+    """RMSE of each filter in one run and the share of the truth, or of the innovations, in its band."""
+    sentences = []
+    for name, filter_ in filters.items():
+        run, parts = one_run(filter_, data, index, dt), []
+        values, deviations, what = _against(run)
+        quantities = filter_.model.measurements
+        if run.errors is not None:
+            quantities = displayed_quantities(filter_.model.states, filter_.model.turns)
+        for i in range(values.shape[-1]):
+            finite = np.isfinite(values[:, i]) & np.isfinite(deviations[:, i])
+            inside = np.abs(values[finite, i]) <= TWO_SIDED * deviations[finite, i]
+            size = np.sqrt(np.mean(values[np.isfinite(values[:, i]), i] ** 2))
+            share = f", {100 * inside.mean():.0f} % in the band" if finite.any() else ""
+            parts.append(f"{quantities[i].name} {size:.3g} {quantities[i].unit}".rstrip() + share)
+        sentences.append(f"{name}: {what} {'; '.join(parts)}")
+    return f"{'. '.join(sentences)}."
+
+
+def _against(run: Run) -> tuple[np.ndarray, np.ndarray, str]:
+    """What is compared with a band: values, standard deviations and their name."""
+    if run.errors is not None:
+        return run.errors, run.error_deviations, "RMSE of"
+    with np.errstate(invalid="ignore"):
+        return (
+            run.innovations,
+            np.sqrt(np.einsum("kii->ki", run.estimates.innovation_covs[0])),
+            "RMS innovation of",
+        )

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import isfinite
 from shlex import quote
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from filters.consistency.nees import slightly, span
 from filters.consistency.report import mean_sentence
@@ -43,7 +46,7 @@ from tuning.reporting.choice_words import (
     model_doubts,
     residual_sentences,
 )
-from tuning.reporting.tables import front_table, gradient_table, kinds_table
+from tuning.reporting.tables import cell_of, kinds_table
 from tuning.search.among_types import filter_types_tried
 from tuning.search.parameters import index_pairs, size_ladder
 from tuning.search.plan import LIKELIHOOD, NIS_BAND, PROPER, Plan, at_ends, range_words, reported, reported_name
@@ -403,3 +406,48 @@ def consistency_sentence(comparison: Comparison) -> str:
     if not comparison.tuned.has_truth or sentence.startswith("Consistent"):
         return sentence
     return f"{sentence} RMSE and NIS do not fully test the covariance."
+
+
+MOST_FACTORS = 4  # of a start, that fit into a caption
+
+
+def front_table(plan: Plan, front: Sequence) -> Table:
+    """The Pareto front of trials, the best in the first objective first."""
+    names = list(dict.fromkeys(name for trial in front for name in trial.params))
+    rows = [
+        [str(trial.number + 1)]
+        + [f"{reported(*pair):.4g}" for pair in zip(plan.objectives, trial.values, strict=True)]
+        + [cell_of(trial.params.get(name, "")) for name in names]
+        for trial in sorted(front, key=lambda trial: trial.values)
+    ]
+    caption = "No other trial is better in both objectives. The first one is the tuned filter."
+    return Table(
+        f"Pareto front on the training {plan.scenarios[0].seed_word}",
+        ["trial", *map(reported_name, plan.objectives), *names],
+        rows,
+        caption=caption,
+    )
+
+
+def gradient_table(result: GradientResult, seed_word: str = "seeds") -> Table:
+    """Where each start led, and how well the data determine the optimum."""
+    likeliest = result.objective == LIKELIHOOD
+    starts = "; ".join(", ".join(f"{factor:g}" for factor in factors) for factors in result.starts)
+    caption = f"starts: factors {starts} on the untuned values" if len(result.free) <= MOST_FACTORS else ""
+    rows = []
+    for i, (parameter, error) in enumerate(zip(result.free, result.standard_errors.tolist(), strict=True)):
+        of_factor = f"± {100 * error:.0f} %" if error < 1 else f"x/: {np.exp(error):.2g}"
+        values = [f"{optimum.parameters[i]:.4g}" for optimum in result.optima]
+        name = index_pairs(parameter.name) + (f" [{parameter.unit}]" if parameter.unit else "")
+        rows.append([name, *values, of_factor if parameter.log else f"± {error:.2g}"])
+    levels = [
+        optimum.level if likeliest else reported(result.objective, optimum.level) for optimum in result.optima
+    ]
+    rows.append(
+        [reported_name(result.objective), *(f"{level:{'.2f' if likeliest else '.6g'}}" for level in levels), ""]
+    )
+    rows.append(["evaluations", *(str(optimum.evaluations) for optimum in result.optima), ""])
+    what = f"{'Maximum' if result.objective in PROPER else 'Minimum'} of {reported_name(result.objective)}"
+    what = "Maximum of the innovations' likelihood" if likeliest else what
+    titles = [f"start {i + 1}" for i in range(len(result.starts))]
+    return Table(f"{what} on the training {seed_word}", ["", *titles, "standard error"], rows, caption=caption)
