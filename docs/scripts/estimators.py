@@ -108,10 +108,13 @@ def network_papers() -> str:
             for kind in TRAININGS
         }
         evaluations = [evaluate(filter_, data, problem.scale) for filter_ in filters.values()]
-        rows.append(
-            [problem.name, *(digits(kalmannet.decibels(evaluation.mean_squares)) for evaluation in evaluations)]
-        )
+        rows.append([problem.name, *(digits(decibels(evaluation.mean_squares)) for evaluation in evaluations)])
     return markdown_table(["setting", "ekf, oracle", *TRAININGS], rows)
+
+
+def decibels(mean_squares: np.ndarray) -> float:
+    """Mean square errors of runs and states, (B, n), as one figure in dB."""
+    return float(10.0 * np.log10(np.mean(mean_squares)))
 
 
 def filterpy() -> str:

@@ -7,13 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
+from rich.console import Console
+
 from filters.consistency.nees import Interval, rmse_ratios
+from filters.estimators.foreign import label_of
 from filters.registry import filter_type
 from thruster_env.core.checks import short_repr
 from thruster_env.core.files import check_target
-from thruster_env.core.parallel import task_map
+from thruster_env.core.parallel import IN_PROCESS, TaskMap, task_map
 from thruster_env.logs.write import check_picture
-from tuning.api.held_out import CovarianceCheck, HeldOut, on_held_out
+from tuning.api.held_out import CovarianceCheck, HeldOut
 from tuning.api.markers import (
     FILTER,
     INPUT,
@@ -34,6 +37,7 @@ from tuning.api.problems import given_for, is_filter, problem_of
 from tuning.api.progress import console_for, working
 from tuning.api.study import DEFAULT_FILTER, Study, is_own, user_choice
 from tuning.evaluation.baselines import GIVEN, ORACLE, OWN, TUNED, given_noise, rule_of_thumb
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
 from tuning.problems.assumed import constants_in, suited
 from tuning.problems.problem import Problem
@@ -175,3 +179,20 @@ def covariance_check(evaluation: HeldOut, label: str, path: str | Path) -> Covar
     title = f"{evaluation.choice.name}, {label}, on {report.runs} seeds of {evaluation.problem.name}"
     save_figure(draw_consistency(report, title, against, comparison.tuned.scored or None), path)
     return CovarianceCheck(label, report, ratios, str(path))
+
+
+def on_held_out(
+    choice: Choice,
+    problem: Problem,
+    seed: int = 0,
+    seeds: int = HELD_OUT_SEEDS,
+    *,
+    is_tuned: bool,
+    console: Console,
+    name: str = TUNED,
+    tasks: TaskMap = IN_PROCESS,
+) -> HeldOut:
+    """Run a choice and its baselines on held-out seeds; arguments as in `HeldOut` and `evaluate_held_out`."""
+    with working(f"{label_of(choice.name)} on {seeds} seeds of {problem.name}", console):
+        comparison = evaluate_held_out(choice, problem, seed, seeds, tasks)
+    return HeldOut(choice, problem, comparison, is_tuned, seed, name)

@@ -7,26 +7,22 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
 
 from filters.consistency.nees import Interval, SquaresCheck
 from filters.consistency.report import MOST_STATES, ConsistencyReport, sentences, span
 from filters.estimators.foreign import label_of
 from filters.filter import Filter
 from thruster_env.core.checks import at_least
-from thruster_env.core.parallel import IN_PROCESS, TaskMap
 from thruster_env.core.text_tables import Table
-from tuning.api.progress import working
 from tuning.api.result import Result, about, drawn, frame, number
 from tuning.evaluation.baselines import ORACLE, RULE, TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency, restart_sentences
-from tuning.evaluation.held_out import Comparison, evaluate_held_out
+from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import metrics
 from tuning.evaluation.worth import memory_sentence, scaling_sentence, warnings_of, without_truth
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import gains, model_doubts, residual_sentences
 from tuning.reporting.tables import choice_table, comparison_table
-from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
 if TYPE_CHECKING:
@@ -308,23 +304,6 @@ def _of_squares(check: SquaresCheck) -> dict[str, Any]:
         "distance_from_chi_square": check.distribution.distance,
         "p_value": check.distribution.p_value,
     }
-
-
-def on_held_out(
-    choice: Choice,
-    problem: Problem,
-    seed: int = 0,
-    seeds: int = HELD_OUT_SEEDS,
-    *,
-    is_tuned: bool,
-    console: Console,
-    name: str = TUNED,
-    tasks: TaskMap = IN_PROCESS,
-) -> HeldOut:
-    """Run a choice and its baselines on held-out seeds; arguments as in `HeldOut` and `evaluate_held_out`."""
-    with working(f"{label_of(choice.name)} on {seeds} seeds of {problem.name}", console):
-        comparison = evaluate_held_out(choice, problem, seed, seeds, tasks)
-    return HeldOut(choice, problem, comparison, is_tuned, seed, name)
 
 
 def cells_of(evaluation: Evaluation) -> dict[str, float]:

@@ -13,8 +13,6 @@ IEEE Transactions on Signal Processing 70, sections IV-B and IV-D.
 
 from __future__ import annotations
 
-import numpy as np
-
 from filters import StateSpaceModel
 from tuning.problems.model_problem import ModelProblem
 
@@ -70,11 +68,6 @@ def problem_of(transition, observe, start: tuple[float, ...], r2: float, name: s
     return ModelProblem(
         model, steps=STEPS, first_scored_step=0, scale=[r2**0.5] * n, name=name, about=about, dt=DT
     )
-
-
-def decibels(mean_squares: np.ndarray) -> float:
-    """Mean square errors of runs and states, (B, n), as one figure in dB."""
-    return float(10.0 * np.log10(np.mean(mean_squares)))
 
 
 linear = problem_of(move, see, (1.0, 0.0), 1.0, "linear")

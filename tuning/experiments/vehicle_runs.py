@@ -17,10 +17,8 @@ import numpy as np
 from filters.bounds import path_bound, wrapped_variances
 from filters.consistency.nees import (
     Interval,
-    interval,
     mean_interval,
     normalized_squares,
-    resampled_means,
     rmse_intervals,
 )
 from filters.engine.batch import run
@@ -125,13 +123,6 @@ class Scores(NamedTuple):
 def joined(parts: Sequence[Scores]) -> Scores:
     """Scores of all runs from those of some at a time."""
     return Scores(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-
-def position_ratio(a: Scores, b: Scores, field: str) -> Interval:
-    """RMSE of position of a over that of b on the same runs, paired, of a field of poses such as "full"."""
-    above, below = (getattr(scores, field)[:, :3].sum(axis=1) for scores in (a, b))
-    ratios = np.sqrt(resampled_means(above) / resampled_means(below))
-    return interval(float(np.sqrt(above.mean() / below.mean())), ratios)
 
 
 MEASURED_PLACES = tuple("uvwpqr".index(name) for name in MEASURED)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from filters.consistency.nees import Interval
+from filters.consistency.nees import Interval, interval, resampled_means
 from thruster_env.core.checks import at_least
 from thruster_env.core.text_tables import Table, markdown_table
 from thruster_env.logs.write import check_picture
@@ -34,7 +34,6 @@ from tuning.experiments.vehicle_runs import (
     Scores,
     path_runs,
     paths_figure,
-    position_ratio,
     run_tasks,
     tasks_of,
 )
@@ -199,6 +198,13 @@ def velocities(result: PathResult, base: str = "", omitted: tuple[str, ...] = ()
     world = "" if result.world == "vehicle" else f", {result.world}"
     title = f"Path {result.path}{world}: RMSE in mm/s, mrad/s and mrad from 2 s on"
     return Table(title, [*columns, f"position over {base}"] if base else columns, rows)
+
+
+def position_ratio(a: Scores, b: Scores, field: str) -> Interval:
+    """RMSE of position of a over that of b on the same runs, paired, of a field of poses such as "full"."""
+    above, below = (getattr(scores, field)[:, :3].sum(axis=1) for scores in (a, b))
+    ratios = np.sqrt(resampled_means(above) / resampled_means(below))
+    return interval(float(np.sqrt(above.mean() / below.mean())), ratios)
 
 
 def _ratio(scores: Scores, base: Scores) -> str:

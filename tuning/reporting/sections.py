@@ -15,7 +15,6 @@ from optuna.trial import FrozenTrial, TrialState
 from filters.consistency.report import rounded, sentences
 from filters.registry import filter_type
 from thruster_env.core.files import BLUE, GREY, RUST, grid_of, new_figure, panels, tidy
-from thruster_env.core.sources import is_array
 from thruster_env.core.text_tables import verbatim
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.turns import tangent_of
@@ -44,12 +43,7 @@ from tuning.reporting.subject import Subject
 from tuning.reporting.tables import kinds_table
 from tuning.reporting.time_figures import (
     COLUMNS,
-    draw_estimates,
-    draw_gains,
-    draw_innovations,
-    draw_signal,
-    gains,
-    of_estimates,
+    sections_over_time,
 )
 from tuning.search.among_types import filter_types_tried
 from tuning.search.parameters import index_pairs
@@ -72,11 +66,6 @@ if TYPE_CHECKING:
 
 MANY_TRIALS = 50
 MOST_ROWS = 40  # of a table of variances
-AXES = (
-    "Limits are those of the scored steps, the same in a row unless its panels say otherwise; RMSE and RMS "
-    "are over these steps."
-)
-READ = "Point at a figure to read values; drag sideways to zoom in, double-click to zoom out."
 NEES_NIS = (
     "NEES, the normalised estimation error squared, relates the error to the filter's covariance: if the "
     "covariance is right, its mean is the number of states. NIS, the normalised innovation squared, does the "
@@ -386,20 +375,6 @@ def _nis_words(nis: Sequence[float], plan: Plan) -> str:
     )
 
 
-def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) -> str:
-    """Range and mean of every column of values (K, m), and how many are missing."""
-    sentences = []
-    for name, unit, column in zip(names, units, values.T, strict=True):
-        finite = column[np.isfinite(column)]
-        if not finite.size:
-            sentences.append(f"{name}: nothing")
-            continue
-        missing = f", {len(column) - len(finite)} of {len(column)} missing" if len(finite) < len(column) else ""
-        ends = f"from {finite.min():.3g} to {finite.max():.3g} {unit}".rstrip()
-        sentences.append(f"{name} {ends}, mean {finite.mean():.3g}{missing}")
-    return f"{'; '.join(sentences)}."
-
-
 def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> list[Section]:
     """One held-out run over time, and whether the covariance is consistent, both on the first scenario."""
     choice, scenario = subject.choice, subject.plan.scenarios[0]
@@ -410,29 +385,10 @@ def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> 
     pair, dt = {name: before.filter(scenario), TUNED: tuned}, scenario.dt
     word = scenario.seed_word.removesuffix("s")
     where = f"{scenario.name}, held-out {word} {comparison.seeds.start}"
-    has_covariance, scored = filter_type(choice.name).has_covariance, comparison.tuned.scored or None
-    what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
-    caption = f"{what} 95 % band on {where}, before and after. {AXES} {READ}"
-    alt = of_estimates(pair, data, 0, dt)
-    remark = [] if data.states is not None else [Words([f"{scenario.name} has no truth, so there are no errors."])]
-    picture = book.picture(draw_estimates(pair, data, 0, dt, scored), caption, alt)
-    sections = [Section("One run over time", [picture, *remark])]
-    model = tuned.model
-    named = [channel.name for channel in model.measurements], [channel.unit for channel in model.measurements]
-    alt = f"Measured: {of_series(named[0], data.one(0).measurements[0], named[1])}"
-    caption = f"Measurements on {where}, their prediction by the tuned filter before each update, and the inputs."
-    sections.append(Section("Measured signal", [book.picture(draw_signal(tuned, data, 0, dt), caption, alt)]))
-    if not has_covariance:
+    scored = comparison.tuned.scored or None
+    sections = sections_over_time(book, pair, data, dt, scored, where)
+    if not filter_type(choice.name).has_covariance:
         return sections
-    if data.states is not None:
-        without = data._replace(states=None, outputs=None)
-        caption = (
-            f"Innovations on {where}, each in the 95 % band that the filter expects, before and after. {AXES}"
-        )
-        picture = book.picture(draw_innovations(pair, data, 0, dt), caption, of_estimates(pair, without, 0, dt))
-        sections.append(Section("Innovations", [picture]))
-    if not is_array(model.n, model.m):
-        sections.append(_gain_section(book, pair, data, dt, scored, where))
     report = check_consistency(tuned, data, dt)
     remarks = sentences(report)
     runs = f"{report.runs} held-out {scenario.seed_word} of {scenario.name}"
@@ -443,30 +399,6 @@ def run_sections(book: Sketchbook, subject: Subject, comparison: Comparison) -> 
         book.picture(drawn, f"Checks of the tuned filter's covariance on {runs}.", " ".join(remarks)),
     ]
     return [*sections, Section("Is the covariance consistent?", parts)]
-
-
-def _gain_section(book: Sketchbook, pair, data, dt, scored, where: str) -> Section:
-    """The gain over time, before and after."""
-    described = []
-    for title, filter_ in pair.items():
-        matrices, model = gains(filter_, data, 0), filter_.model
-        last = [matrix for matrix in matrices if np.isfinite(matrix).all()]
-        if last:
-            values = ", ".join(
-                f"{state.text_symbol} by {channel.text_symbol} {last[-1][i, j]:.3g}"
-                for i, state in enumerate(tangent_of(model))
-                for j, channel in enumerate(model.measurements)
-            )
-            described.append(f"{title}: {values} at the end")
-    caption = (
-        f"Gain K on {where}: the change of each state per unit of innovation, before and after tuning. It "
-        "is computed from the covariance after the update, K = P H' inv(R), with H at the estimate. Each "
-        "panel has its own axis."
-    )
-    picture = book.picture(
-        draw_gains(pair, data, 0, dt, scored), caption, f"Gain over time. {'. '.join(described)}."
-    )
-    return Section("Gain over time", [picture])
 
 
 NO_TRIALS = "No trial was finished."

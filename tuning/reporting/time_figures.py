@@ -14,7 +14,7 @@ from filters.filter import Filter
 from filters.logs.findings import MEASURED, TRUTH, colour_of
 from thruster_env.core.angles import with_breaks, wrapped, wrapped_where
 from thruster_env.core.files import BLUE, GREY, RUST, new_figure, thinned, tidy
-from thruster_env.core.sources import as_value
+from thruster_env.core.sources import as_value, is_array
 from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.model.euler import displayed, displayed_deviations, displayed_quantities
 from thruster_env.model.quantities import Quantity
@@ -24,6 +24,7 @@ from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import Turn, leading, slopes_of_stored, tangent_of
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data, estimates_on
+from tuning.reporting.page import Section, Sketchbook, Words
 
 FAR = 20.0  # where one panel of a row reaches so many times as far as another each has its own limits
 WIDEST = 4.0  # times the largest error: how much of a band is shown
@@ -328,10 +329,6 @@ def draw_band(axis, time: np.ndarray, low: np.ndarray, high: np.ndarray, colour:
     axis.fill_between(times, below, above, color=colour, alpha=0.22, linewidth=0, label="95 % band of the filter")
 
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-
 def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Figure:
     """Every measured channel of a run with the filter's prediction, and the inputs below.
 
@@ -507,3 +504,89 @@ def _against(run: Run) -> tuple[np.ndarray, np.ndarray, str]:
             np.sqrt(np.einsum("kii->ki", run.estimates.innovation_covs[0])),
             "RMS innovation of",
         )
+
+
+AXES = (
+    "Limits are those of the scored steps, the same in a row unless its panels say otherwise; RMSE and RMS "
+    "are over these steps."
+)
+READ = "Point at a figure to read values; drag sideways to zoom in, double-click to zoom out."
+
+
+def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) -> str:
+    """Range and mean of every column of values (K, m), and how many are missing."""
+    sentences = []
+    for name, unit, column in zip(names, units, values.T, strict=True):
+        finite = column[np.isfinite(column)]
+        if not finite.size:
+            sentences.append(f"{name}: nothing")
+            continue
+        missing = f", {len(column) - len(finite)} of {len(column)} missing" if len(finite) < len(column) else ""
+        ends = f"from {finite.min():.3g} to {finite.max():.3g} {unit}".rstrip()
+        sentences.append(f"{name} {ends}, mean {finite.mean():.3g}{missing}")
+    return f"{'; '.join(sentences)}."
+
+
+def sections_over_time(
+    book: Sketchbook, filters: Mapping[str, Filter], data: Data, dt: float | None, scored: Any, where: str
+) -> list[Section]:
+    """The first of some runs: estimates, measured signal and, with a covariance, innovations and gain.
+
+    Args:
+        book: takes the pictures.
+        filters: by title; the last one is the tuned filter.
+        data: of a problem.
+        dt: sample time [s]; None for an axis of steps.
+        scored: places of the states that count in the score; all if None.
+        where: what the run is of, in words.
+    """
+    tuned = list(filters.values())[-1]
+    what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
+    caption = f"{what} 95 % band on {where}, before and after. {AXES} {READ}"
+    alt = of_estimates(filters, data, 0, dt)
+    remark = [] if data.states is not None else [Words(["There is no truth, so there are no errors."])]
+    picture = book.picture(draw_estimates(filters, data, 0, dt, scored), caption, alt)
+    sections = [Section("One run over time", [picture, *remark])]
+    model = tuned.model
+    named = [channel.name for channel in model.measurements], [channel.unit for channel in model.measurements]
+    alt = f"Measured: {of_series(named[0], data.one(0).measurements[0], named[1])}"
+    caption = f"Measurements on {where}, their prediction by the tuned filter before each update, and the inputs."
+    sections.append(Section("Measured signal", [book.picture(draw_signal(tuned, data, 0, dt), caption, alt)]))
+    if not tuned.has_covariance:
+        return sections
+    if data.states is not None:
+        without = data._replace(states=None, outputs=None)
+        caption = (
+            f"Innovations on {where}, each in the 95 % band that the filter expects, before and after. {AXES}"
+        )
+        picture = book.picture(
+            draw_innovations(filters, data, 0, dt), caption, of_estimates(filters, without, 0, dt)
+        )
+        sections.append(Section("Innovations", [picture]))
+    if not is_array(model.n, model.m):
+        sections.append(_gain_section(book, filters, data, dt, scored, where))
+    return sections
+
+
+def _gain_section(book: Sketchbook, pair, data, dt, scored, where: str) -> Section:
+    """The gain over time, before and after."""
+    described = []
+    for title, filter_ in pair.items():
+        matrices, model = gains(filter_, data, 0), filter_.model
+        last = [matrix for matrix in matrices if np.isfinite(matrix).all()]
+        if last:
+            values = ", ".join(
+                f"{state.text_symbol} by {channel.text_symbol} {last[-1][i, j]:.3g}"
+                for i, state in enumerate(tangent_of(model))
+                for j, channel in enumerate(model.measurements)
+            )
+            described.append(f"{title}: {values} at the end")
+    caption = (
+        f"Gain K on {where}: the change of each state per unit of innovation, before and after tuning. It "
+        "is computed from the covariance after the update, K = P H' inv(R), with H at the estimate. Each "
+        "panel has its own axis."
+    )
+    picture = book.picture(
+        draw_gains(pair, data, 0, dt, scored), caption, f"Gain over time. {'. '.join(described)}."
+    )
+    return Section("Gain over time", [picture])
