@@ -123,7 +123,7 @@ class VariationalBayesFilter(PageFilter):
     """
 
     name: ClassVar[str] = "vb"
-    rotations: ClassVar[bool] = True
+    takes_rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise, update_variational, initial=initial_variational)
     unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
     varying_noise: ClassVar[bool] = False  # R is in the belief, and starts at the model's
@@ -201,7 +201,7 @@ class RobustExtendedKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "ekf-robust"
-    rotations: ClassVar[bool] = True
+    takes_rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise, update_robust, initial=initial_robust)
     unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
     degrees_of_freedom: float = 4.0
@@ -273,7 +273,7 @@ class SageHusaFilter(PageFilter):
     """
 
     name: ClassVar[str] = "sage-husa"
-    rotations: ClassVar[bool] = True
+    takes_rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(
         propagate, add_process_noise_sage_husa, update_sage_husa, initial=initial_sage_husa
     )

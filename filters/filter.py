@@ -287,11 +287,11 @@ class PageFilter(FilterWithPage):
 
     Attributes:
         forms: pages of the same estimates in other arithmetic, by the value of the field `form`.
-        rotations: whether its page is written with the steps of a state that has rotations.
+        takes_rotations: whether its page is written with the steps of a state that has rotations.
     """
 
     forms: ClassVar[Mapping[str, Page]] = {}
-    rotations: ClassVar[bool] = False
+    takes_rotations: ClassVar[bool] = False
 
     @property
     def written_page(self) -> Page:
@@ -304,11 +304,6 @@ class PageFilter(FilterWithPage):
     def known_forms(self) -> tuple[str, ...]:
         """What the field `form` may be."""
         return "covariance", *self.forms
-
-    @property
-    def takes_rotations(self) -> bool:
-        """Whether this form takes models with rotations."""
-        return self.rotations and getattr(self, "form", "") not in self.forms
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""

@@ -16,7 +16,7 @@ from filters.algebra import roots
 from filters.algebra.operations import divide, eye, joseph, mask_missing, present, sym, uncorrelated, wrap
 from filters.algebra.points import density, log_density, root, square
 from filters.algebra.roots import factor_of, forward_quotient, hstack, part, triangle, vstack, zeros
-from filters.algebra.tangents import move, reset, reset_columns
+from filters.algebra.tangents import after_reset, move, reset, reset_columns
 from filters.baselines import indices_of
 from filters.filter import PageFilter
 from filters.pages.page import Page
@@ -83,19 +83,21 @@ def add_process_noise_root(model, x, L):
 
 def update_root(model, x, P, z):
     """Update with the measurement z; NaN marks missing channels."""
-    n, m, measured, L = len(x), len(z), present(z), model.extras["L"]
+    m, measured, L = len(z), present(z), model.extras["L"]
     H, R = mask_missing(measured, model.H(x)), uncorrelated(measured, model.R)
     v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
-    both = triangle(vstack(hstack(root(R), H @ L), hstack(zeros(L, n, m), L)))
+    both = triangle(vstack(hstack(root(R), H @ L), hstack(zeros(L, len(L), m), L)))
     return root_result(model, x, both, v, measured)
 
 
 def root_result(model, x, both, v, measured):
     """The results of an update, from the triangle [[S^(1/2), 0], [K S^(1/2), L]]."""
-    n, m = len(x), len(v)
+    m = len(v)
+    n = len(both) - m
     of_s, of_gain, L = part(both, 0, 0, m, m), part(both, m, 0, n, m), part(both, m, m, n, n)
-    x = wrap(x + of_gain @ forward_quotient(of_s, v), model.state_angles)
-    return x, square(L), v, square(of_s), density(v, factor_of(of_s), measured), {"L": L}
+    d = of_gain @ forward_quotient(of_s, v)
+    L = triangle(after_reset(model, L, x, d)) if model.turns else L
+    return move(model, x, d), square(L), v, square(of_s), density(v, factor_of(of_s), measured), {"L": L}
 
 
 SQUARE_ROOT = Page(propagate_root, add_process_noise_root, update_root, represent_root, initial_root)
@@ -139,9 +141,18 @@ def update_ud(model, x, P, z):
     v = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
     white = forward_quotient(R_root, H)
     of_s = triangle(hstack(R_root, H @ roots.upper_root(UD)))
-    x = wrap(x + roots.measured_gain(UD, white) @ forward_quotient(R_root, v), model.state_angles)
+    d = roots.measured_gain(UD, white) @ forward_quotient(R_root, v)
     UD = roots.measured_factors(UD, white)
-    return x, square(roots.upper_root(UD)), v, square(of_s), density(v, factor_of(of_s), measured), {"UD": UD}
+    if model.turns:
+        UD = roots.weighted_factors(after_reset(model, roots.unit_upper(UD), x, d), UD)
+    return (
+        move(model, x, d),
+        square(roots.upper_root(UD)),
+        v,
+        square(of_s),
+        density(v, factor_of(of_s), measured),
+        {"UD": UD},
+    )
 
 
 UD = Page(propagate_ud, add_process_noise_ud, update_ud, represent_ud, initial_ud)
@@ -166,7 +177,7 @@ class ExtendedKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "ekf"
-    rotations: ClassVar[bool] = True
+    takes_rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise, update)
     forms: ClassVar[Mapping[str, Page]] = {"square-root": SQUARE_ROOT, "ud": UD}
     form: str = "covariance"
@@ -220,7 +231,7 @@ class IteratedExtendedKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "iekf"
-    rotations: ClassVar[bool] = True
+    takes_rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise, update_iterated)
     unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
     iterations: int = 5
@@ -258,7 +269,7 @@ class FadingMemoryFilter(PageFilter):
     """
 
     name: ClassVar[str] = "fading"
-    rotations: ClassVar[bool] = True
+    takes_rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise_fading, update)
     fading: float = 1.01
 
@@ -302,7 +313,7 @@ class SchmidtKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "schmidt"
-    rotations: ClassVar[bool] = True
+    takes_rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise, update_schmidt)
     considered: Any = ()
 
@@ -351,7 +362,7 @@ class HInfinityFilter(PageFilter):
     """
 
     name: ClassVar[str] = "h-infinity"
-    rotations: ClassVar[bool] = True
+    takes_rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate, add_process_noise_h_infinity, update)
     theta: float = 0.01
     scale: Any = None

@@ -71,19 +71,20 @@ def deviations(model, D, s):
 
 def add_process_noise_unscented_root(model, X):
     """Mean and root of the points, with Q added, at the end of a step."""
-    x, s, D = unscented_moments(model, X, model.state_angles)
-    L = triangle(hstack(deviations(model, D, s), model.Q_root))
-    return wrap(x, model.state_angles), square(L), {"L": L}
+    D = differences(model, without_first(X), first(X))
+    s = (D @ ones(D)) * model.own.weight
+    L = triangle(hstack(after_reset(model, deviations(model, D, s), first(X), s), model.Q_root))
+    return move(model, first(X), s), square(L), {"L": L}
 
 
 def update_unscented_root(model, x, P, z):
     """Update with the measurement z; NaN marks missing channels."""
-    n, m, measured, L = len(x), len(z), present(z), model.extras["L"]
+    m, measured, L = len(z), present(z), model.extras["L"]
     y, s, D = unscented_moments(model, model.h(unscented_points(model, x, L)), model.measurement_angles)
     s, D, R = mask_missing(measured, s), mask_missing(measured, D), uncorrelated(measured, model.R)
     v = mask_missing(measured, wrap(z - y, model.measurement_angles))
-    of_x = (L * model.own.spread) @ without_first(units(x)) * model.own.weight_root
-    both = vstack(hstack(deviations(model, D, s), root(R)), hstack(of_x, zeros(L, n, m + 1)))
+    of_x = (L * model.own.spread) @ without_first(units(first(L))) * model.own.weight_root
+    both = vstack(hstack(deviations(model, D, s), root(R)), hstack(of_x, zeros(L, len(L), m + 1)))
     return root_result(model, x, triangle(both), v, measured)
 
 
@@ -161,7 +162,7 @@ class UnscentedKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "ukf"
-    rotations: ClassVar[bool] = True
+    takes_rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(
         propagate_points, add_process_noise_unscented, update_unscented, represent_unscented
     )
@@ -265,7 +266,7 @@ class CubatureKalmanFilter(PageFilter):
     """
 
     name: ClassVar[str] = "ckf"
-    rotations: ClassVar[bool] = True
+    takes_rotations: ClassVar[bool] = True
     page: ClassVar[Page] = Page(propagate_points, add_process_noise_cubature, update_cubature, represent_cubature)
 
     @property

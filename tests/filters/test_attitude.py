@@ -531,8 +531,6 @@ def test_every_other_path_refuses_them():
     data = {"inputs": np.zeros((2, 3)), "measurements": np.zeros((3, 6))}
     batch = {name: np.tile(part, (2, 1, 1)) for name, part in data.items()}
     refusals = (
-        lambda: filters.ExtendedKalmanFilter(model=model, form="square-root").kernels(),
-        lambda: filters.ExtendedKalmanFilter(model=model, form="ud").kernels(),
         lambda: filters.run(filter_, **data).to_frame(),
         lambda: filters.smooth(filters.EnsembleKalmanFilter(model=model), **data),
         lambda: filters.EnsembleTransformFilter(model=model, rotations=1).kernels(),

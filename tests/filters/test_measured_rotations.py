@@ -16,7 +16,10 @@ from filters.sensitivity import likelihood
 from filters.starts import begun_at
 from tests.filters.test_attitude import BIAS, DT, ENSEMBLES, GYRO, OTHERS, TAKE_ROTATIONS, WALK, advance
 from thruster_env.core.compiled import interpreted
+from thruster_env.core.streams import episode_keys
+from thruster_env.env.model_env import ModelEnv
 from thruster_env.model import poses, rotations
+from thruster_env.model.simulate import simulate
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import Direction, Pose, Rotation, difference, move
 
@@ -337,3 +340,44 @@ def test_what_cannot_measure_rotations_says_so():
         filters.run(
             filters.ExtendedKalmanFilter(model=model), inputs=np.zeros((1, 3)), measurements=np.ones((2, 3))
         )
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize(("name", "form"), [("ekf", "square-root"), ("ekf", "ud"), ("ukf", "square-root")])
+def test_forms_have_the_same_estimates(name, form):
+    """Of states and measurements that turn; the factors follow the reset."""
+    gyro, z = tracked(20.0)
+    plain, factored = (
+        filters.run(
+            filters.make_filter(name, tracker_model("body", "world", 20.0), form=kind),
+            inputs=gyro[:5],
+            measurements=z[:6],
+        )
+        for kind in ("covariance", form)
+    )
+    np.testing.assert_allclose(factored.means, plain.means, atol=1e-13)
+    np.testing.assert_allclose(factored.covs, plain.covs, atol=1e-14)
+    np.testing.assert_allclose(factored.log_likelihoods, plain.log_likelihoods, atol=1e-10)
+
+
+def test_a_simulation_and_its_env_draw_errors_of_a_sensor_in_its_axes():
+    """Both draw the same, and the mean NIS of the filter is that of three components, at a level of 1e-4."""
+    model = tracker_model()
+    keys, inputs = episode_keys(range(20)), np.full((20, 30, 3), 0.2)
+    truth = simulate(model, keys, inputs)
+    x, z = (Turned.from_quat(part.reshape(-1, part.shape[-1])[:, :4], scalar_first=True) for part in truth)
+    errors = (x.inv() * z).as_rotvec() / SENSOR
+    assert (np.abs(np.cov(errors.T) - np.eye(3)) < 0.25).all()
+    estimates = filters.run(
+        filters.ExtendedKalmanFilter(model=model), inputs=inputs, measurements=truth.measurements
+    )
+    v, S = estimates.innovations, estimates.innovation_covs
+    nis = np.einsum("bki,bki->bk", v, np.linalg.solve(S, v[..., None])[..., 0])
+    assert 2.6 < nis.mean() < 3.4
+    env = ModelEnv(model)
+    _, info = env.reset(seed=3)
+    alone = simulate(model, episode_keys([3]), np.full((1, 2, 3), 0.2))
+    for k in range(2):
+        np.testing.assert_allclose(info["measurement"], alone.measurements[0, k], atol=1e-13)
+        _, _, _, _, info = env.step(np.full(3, 0.2))
+    assert info["measurement"].shape == (4,)

@@ -47,7 +47,7 @@ from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import Functions, Shape, constants_are_array
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.traced import TracedFunction, traced_function
-from thruster_env.model.turns import move, refuse_measured
+from thruster_env.model.turns import move
 
 DISTURBANCES = Registry(
     "disturbances",
@@ -125,10 +125,10 @@ def _called(function: Callable, sizes: tuple[int, ...], form: type | int, count:
 @lru_cache(maxsize=64)
 def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, task: ModelTask) -> Page:
     """The page of a model: its f and h, traced or called, its noise, disturbances and task."""
-    n, m = shape.n, shape.m
+    n, channels = shape.n, shape.channels
     of_f, of_h = _parts(functions, shape)
     f, h, call_f, call_h = _traced(*of_f), _traced(*of_h), _called(*of_f), _called(*of_h)
-    act, advance = chain_runner(dict(kinds)), traced(move) if shape.turns else move
+    act, advance = chain_runner(dict(kinds)), traced(move) if shape.turns or shape.measured_turns else move
 
     def evaluated(function: TracedFunction | None, call: Callable, count: int, p: Any, *vectors) -> tuple:
         if function is None:
@@ -141,10 +141,10 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
         return tuple(value for value, _ in parts), {k: v for _, memory in parts for k, v in memory.items()}
 
     def observed(p: Parameters, x: tuple, u: tuple, v: tuple, effects: dict | None, memories: dict, t: Moment):
-        z = evaluated(h, call_h, m, p, *((x, v) if shape.feeds else (x,)))
-        noise, readings = correlated(p.r_root, t.draws.normals(MEASUREMENT, m)), list[Reading]()
-        for i in range(m):
-            reading, memory = act(f"sensor {i}", p, Reading(z[i] + noise[i], 1.0), effects, t._replace(state=x))
+        exact = evaluated(h, call_h, channels, p, *((x, v) if shape.feeds else (x,)))
+        noise, readings = correlated(p.r_root, t.draws.normals(MEASUREMENT, shape.m)), list[Reading]()
+        for i, z in enumerate(advance(exact, noise, shape.measured_turns)):
+            reading, memory = act(f"sensor {i}", p, Reading(z, 1.0), effects, t._replace(state=x))
             readings, memories = [*readings, reading], memories | memory
         ends = traceable(task.ends)(x) if task.ends and not t.begin else 0.0
         report = {
@@ -180,7 +180,7 @@ def model_page(functions: Functions, shape: Shape, substeps: int, kinds: tuple, 
 
 def _parts(functions: Functions, shape: Shape) -> tuple[Part, Part]:
     """The functions f and h, with the sizes of their arguments, form of constants and number of results."""
-    n, p, m, c = shape.n, shape.inputs, shape.m, shape.constants
+    n, p, m, c = shape.n, shape.inputs, shape.channels, shape.constants
     sizes = (n, p, c) if shape.feeds else (n, c)
     return (functions.transition, (n, p, c), shape.form, n), (functions.observe, sizes, shape.form, m)
 
@@ -188,7 +188,6 @@ def _parts(functions: Functions, shape: Shape) -> tuple[Part, Part]:
 def page_of(plant: ModelPlant, task: ModelTask) -> tuple[Page, Parameters]:
     """The page of a model with a task, and its parameters."""
     truth, context = plant.truth, Context(plant.dt)
-    refuse_measured(truth, "ModelEnv")
     signals = [plant.disturbances.get(quantity.symbol, ()) for quantity in truth.input_quantities]
     effects = [plant.sensors.get(quantity.symbol, ()) for quantity in truth.measurements]
     chains = {f"input {i}": chain_of(chain, context, i * SPACING) for i, chain in enumerate(signals)}

@@ -15,7 +15,7 @@ from thruster_env.core.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill
 from thruster_env.model.shape import Functions, Shape, constants_reader, for_any_input, padded
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.traced import called_function
-from thruster_env.model.turns import move, refuse_measured
+from thruster_env.model.turns import Turn, move
 
 
 def inputs_until(inputs: np.ndarray) -> np.ndarray:
@@ -45,7 +45,7 @@ def add_correlated(out, numbers, root, count, draws):
 @cache
 def noise_step(shape: Shape):
     """Function disturb(x, draws, step, key, numbers), which moves an array x (n,) by a step's process noise."""
-    t, q_root, add = shape.t, shape.offsets.q_root, _noise_adder(shape)
+    t, q_root, add = shape.t, shape.offsets.q_root, _noise_adder(shape.n, shape.turns)
 
     def disturb(x, draws, step, key_0, key_1, numbers):
         fill_normals(draws, t, step, PROCESS, key_0, key_1)
@@ -54,9 +54,9 @@ def noise_step(shape: Shape):
     return disturb
 
 
-def _noise_adder(shape: Shape):
-    """Function add(x, numbers, root, draws): x moved by L draws, with L (t, t) by rows at numbers[root]."""
-    n, t, turns = shape.n, shape.t, shape.turns
+def _noise_adder(n: int, turns: tuple[Turn, ...]):
+    """Function add(x, numbers, root, draws): x (n,) moved by L draws, with L (t, t) by rows at numbers[root]."""
+    t = n - len(turns)
     if not turns:
 
         def add(x, numbers, root, draws):
@@ -82,13 +82,14 @@ def _noise_adder(shape: Shape):
 def truth_steps(functions: Functions, shape: Shape):
     """Functions begin(x, draws, key, numbers), advance(x, u, draws, step, key, numbers), measure(z, x, u, ...).
 
-    They work on arrays x (n,), u (inputs,), z (m,), draws with room for GROUP multiples, key (2,).
+    They work on arrays x (n,), u (inputs,), z (channels,), draws with room for GROUP multiples, key (2,).
     """
     n, t, m, transition, observe = shape.n, shape.t, shape.m, functions.transition, functions.observe
-    source, add_noise = shape.offsets, _noise_adder(shape)
+    source, channels, add_noise = shape.offsets, shape.channels, _noise_adder(n, shape.turns)
+    add_error = _noise_adder(channels, shape.measured_turns)
     prior_mean, prior_root, substeps = source.prior_mean, source.prior_root, source.substeps
     r_root, disturb = source.r_root, noise_step(shape)
-    state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
+    state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(channels)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
     look = for_any_input(observe, shape)
 
@@ -107,14 +108,13 @@ def truth_steps(functions: Functions, shape: Shape):
     def measure(z, x, u, draws, step, key_0, key_1, numbers):
         store_measurement(z, look(state(x), control(u), constants(numbers)))
         fill_normals(draws, m, step, MEASUREMENT, key_0, key_1)
-        add_correlated(z, numbers, r_root, m, draws)
+        add_error(z, numbers, r_root, draws)
 
     return begin, advance, measure
 
 
 def truth_steps_of(model: StateSpaceModel):
     """`truth_steps` for a model."""
-    refuse_measured(model, "a simulation")
     return truth_steps(model.functions, model.any_shape)
 
 
@@ -156,7 +156,7 @@ def seconds_as_python(model: StateSpaceModel) -> float:
         return 0.0
     key, inputs = np.zeros((1, 2)), np.zeros((1, 1, model.inputs))
     simulate(model, key, inputs)
-    if not _simulation(*truth_steps_of(model), model.n, model.m, is_interpreting()).in_python:
+    if not _simulation(*truth_steps_of(model), model.n, model.channels, is_interpreting()).in_python:
         return 0.0
     started = time.perf_counter()
     simulate(model, key, inputs)
@@ -192,7 +192,7 @@ def simulate(model: StateSpaceModel, keys: np.ndarray, inputs: np.ndarray) -> Tr
             f"but got {keys.shape} and {inputs.shape}"
         )
     count, steps, _ = inputs.shape
-    truth = Truth(np.empty((count, steps + 1, model.n)), np.empty((count, steps + 1, model.m)))
-    run = _simulation(*truth_steps_of(model), model.n, model.m, is_interpreting())
+    truth = Truth(np.empty((count, steps + 1, model.n)), np.empty((count, steps + 1, model.channels)))
+    run = _simulation(*truth_steps_of(model), model.n, model.channels, is_interpreting())
     run(keys, inputs, model.numbers, truth.states, truth.measurements)
     return truth
