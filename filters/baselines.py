@@ -10,12 +10,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.engine.belief import Kernels, filter_offset, memory_offsets, row_access
+from filters.engine.belief import Kernels, filter_offset, memory_offsets
 from filters.filter import Filter
 from filters.pages.kernels import nothing_to_summarise
-from thruster_env.core.angles import wrapped
+from thruster_env.core.angles import angle_writer, wrapped
 from thruster_env.core.checks import at_least, positive, short_repr
-from thruster_env.core.sources import Source, vector_reader, vector_writer, written_out, zeros_of
+from thruster_env.core.sources import Source, vector_reader, vector_writer, written_out
 from thruster_env.model.shape import (
     Functions,
     Shape,
@@ -112,7 +112,8 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     at_last = vector_reader(feed, acting + feed)
     reach_offset, share_offset = first_parameter, first_parameter + 1
     read_open, store_open = vector_reader(n, layout.extras), vector_writer(n, layout.extras)
-    (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
+    read_mean, store_mean = vector_reader(n, layout.mean), angle_writer(layout.mean, shape.state_angles)
+    store_innovation, cov, s = vector_writer(m, layout.innovation), layout.cov, layout.innovation_cov
     prior_mean, control = vector_reader(n, source.prior_mean), vector_reader(shape.inputs)
     constants = constants_reader(shape)
     measured, difference = vector_reader(m), innovation_of(shape)
@@ -120,7 +121,6 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     angle, inverts = shape.measurement_angles[channel], inverted is not None
     of_both = written_out("of_both", "x, both", "observe(x, both[0], both[1])", observe=observe)
     solve = component_solver(of_both, n, component, channel, angle)
-    no_cov, no_s = zeros_of(n, n), zeros_of(m, m)
 
     def blend(y, z, share):  # the low-pass filter; of angles from y the short way towards z
         return wrapped(y + (1.0 - share) * wrapped(z - y)) if angle else share * y + (1.0 - share) * z
@@ -139,7 +139,8 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
         for i in range(feed):
             row[acting + i] = 0.0
         estimate(row, numbers)
-        store_cov(row, no_cov())
+        for i in range(n * n):
+            row[cov + i] = 0.0
 
     def predict(memory, u, numbers, size):
         row, _, _ = memory
@@ -154,7 +155,8 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     def update(memory, z, numbers, size):
         row, _, _ = memory
         store_innovation(row, difference(measured(z), observe(read_mean(row), acts(row), constants(numbers))))
-        store_s(row, no_s())
+        for i in range(m * m):
+            row[s + i] = 0.0
         row[likelihood_offset] = 0.0
         if inverts and z[channel] == z[channel]:
             share = numbers[share_offset] * row[known_offset]

@@ -33,10 +33,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.core.angles import angle_writer
 from thruster_env.core.checks import ROUNDING, as_floats, at_least, covariance, short_repr
 from thruster_env.core.compiled import is_interpreting
-from thruster_env.core.sources import Source, matrix_reader, matrix_writer, vector_reader, vector_writer
 from thruster_env.core.streams import truncated_normal
 from thruster_env.model.quantities import Bound
 from thruster_env.model.shape import NumberOffsets, Shape, number_offsets, starts_of
@@ -189,26 +187,6 @@ def memory_offsets(n: int, m: int, t: int | None = None) -> MemoryOffsets:
     return MemoryOffsets(*starts_of(n, tt, 1, 1, 1, 1, m, m * m, 1, n * m))
 
 
-@lru_cache(maxsize=64)
-def row_access(shape: Shape) -> tuple[tuple[Callable, Callable], ...]:
-    """Functions that read and write a filter's row, as pairs: a vector's, then that of its covariance.
-
-    Vectors are tuples, covariances tuples of rows. Angles in a mean are kept in (-pi, pi].
-
-    Returns:
-        `read(row)` of the mean (n,) and its covariance (t, t).
-        `write(row, value)` of the same.
-        `write(row, value)` of the innovation (m,) and its covariance (m, m).
-    """
-    n, m, t = shape.n, shape.m, shape.t
-    layout = memory_offsets(n, m, t)
-    return (
-        (vector_reader(n, layout.mean), matrix_reader(t, t, layout.cov)),
-        (angle_writer(layout.mean, shape.state_angles), matrix_writer(t, t, layout.cov)),
-        (vector_writer(m, layout.innovation), matrix_writer(m, m, layout.innovation_cov)),
-    )
-
-
 def filter_offset(shape: Shape) -> int:
     """Offset of the filter's own parameters in the packed row, behind those of its model."""
     return shape.offsets.constants + shape.constants
@@ -357,40 +335,22 @@ def _many(mean: np.ndarray, cov: np.ndarray, prior_variances: np.ndarray) -> boo
 LARGEST = 1e300  # of the sum of a belief's absolute numbers
 
 
-@cache
-def row_magnitude(n: int, m: int, t: int) -> Callable:
-    """Return `magnitude(row)`: the sum of the absolute values of the numbers of a belief and its innovation.
-
-    A negative variance, which rounding may leave in a covariance of very unequal numbers, counts as a number
-    beyond LARGEST, and so does NaN.
-    """
-    layout = memory_offsets(n, m, t)
-    beyond = 10 * LARGEST
-    variances = [layout.cov + i * (t + 1) for i in range(t)]
-    source = Source("magnitude", "row", work=layout.gain)
-    if source.loops:
-        of_all = source.sum(f"abs(row[{i}])" for i in source.range(layout.gain))
-        of_variances = source.sum(
-            f"(0.0 if row[{variance}] >= 0.0 else {beyond})"
-            for variance in (i * (t + 1) + layout.cov for i in source.range(t))
-        )
-        return source.function(f"{of_all} + {of_variances}")
-    terms = [f"abs(row[{i}])" for i in range(layout.gain) if i not in variances]
-    terms += [f"(row[{i}] if row[{i}] >= 0.0 else {beyond})" for i in variances]
-    return source.function(" + ".join(terms))
-
-
 @lru_cache(maxsize=64)
 def restart_if_lost(kernels: Kernels) -> Callable:
     """Return `restart(memory, numbers, size)`: replace a diverged belief by the prior, and count the restart."""
     m, start, summarise = kernels.m, kernels.start, kernels.summarise
     layout, r_offset = kernels.layout, kernels.offsets.r
     innovation, s_offset, log_likelihood = layout.innovation, layout.innovation_cov, layout.log_likelihood
-    divergences, magnitude = layout.divergences, row_magnitude(kernels.n, m, kernels.t)
+    divergences, cov, end, t = layout.divergences, layout.cov, layout.gain, kernels.t
 
     def restart(memory, numbers, size):
         row, _, _ = memory
-        if not magnitude(row) < LARGEST:
+        total, least = 0.0, 0.0
+        for i in range(end):
+            total += abs(row[i])
+        for i in range(t):  # of which rounding may leave one negative in a covariance of very unequal numbers
+            least = min(least, row[cov + i * (t + 1)])
+        if not (total < LARGEST and least >= 0.0):
             start(memory, numbers, size)
             summarise(memory, size)
             row[divergences] += 1.0

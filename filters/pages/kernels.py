@@ -22,10 +22,10 @@ from filters.algebra.matrices import Matrix, Operation, evaluate, in_order, inpu
 from filters.algebra.members import on_branch
 from filters.algebra.operations import present, quotient, slopes_of
 from filters.algebra.tangents import local_at, moved
-from filters.engine.belief import Kernels, filter_offset, memory_offsets, row_access
+from filters.engine.belief import Kernels, filter_offset, memory_offsets
 from filters.pages.charts import measured_about_mean, moments, on_tangent
 from filters.pages.page import Equations, NumbersMemory, Page, PagedModel, RowMemory, acting_places
-from thruster_env.core.sources import matrix_reader, vector_reader
+from thruster_env.core.angles import wrapped
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from thruster_env.graphs.graphs import CONDITIONS, Graph, Number, TooLarge, needed_by, uncollected
 from thruster_env.graphs.programs import (
@@ -361,14 +361,17 @@ def page_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
 @cache
 def prior_start(shape: Shape) -> Callable:
     """Return `start(memory, numbers, size)`: mean and covariance are those of the prior."""
-    n, t, source = shape.n, shape.t, shape.offsets
-    read_mean, read_cov = vector_reader(n, source.prior_mean), matrix_reader(t, t, source.prior_cov)
-    _, (store_mean, store_cov), _ = row_access(shape)
+    n, t, source, angles = shape.n, shape.t, shape.offsets, shape.state_angles
+    layout, has_angles = memory_offsets(n, shape.m, t), any(angles)
+    mean, cov, prior_mean, prior_cov = layout.mean, layout.cov, source.prior_mean, source.prior_cov
 
     def start(memory, numbers, size):
         row, _, _ = memory
-        store_mean(row, read_mean(numbers))
-        store_cov(row, read_cov(numbers))
+        for i in range(n):
+            x = numbers[prior_mean + i]
+            row[mean + i] = wrapped(x) if has_angles and angles[i] else x
+        for i in range(t * t):
+            row[cov + i] = numbers[prior_cov + i]
 
     return start
 
