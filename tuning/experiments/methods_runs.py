@@ -258,7 +258,7 @@ def reference(case: Case, protocol: Protocol) -> Result:
             if value < least:
                 least, choice = value, simplex.best
     found_score, seconds = scored(choice, case, protocol.held_out), time.process_time() - begin
-    return Result(case.name, REFERENCE, 0, {}, {}, found_score, 0.0, seconds, _plain(choice))
+    return Result(case.model, REFERENCE, 0, {}, {}, found_score, 0.0, seconds, _plain(choice))
 
 
 def _plain(choice: Choice) -> dict[str, Any]:
@@ -312,8 +312,13 @@ def run_protocol(
 
 def read(folder: Path, protocol: Protocol) -> list[Result]:
     """The results that are there."""
-    files = (file_of(folder, *job, protocol) for job in jobs_of(protocol))
-    return [_result(json.loads(file.read_text(encoding="utf-8"))) for file in files if file.is_file()]
+    results = []
+    for case, method, set_index in jobs_of(protocol):
+        file = file_of(folder, case, method, set_index, protocol)
+        if file.is_file():
+            result = _result(json.loads(file.read_text(encoding="utf-8")))
+            results.append(result._replace(case=case.model) if method == REFERENCE else result)
+    return results
 
 
 def file_of(folder: Path, case: Case, method: str, set_index: int, protocol: Protocol) -> Path:
@@ -436,9 +441,8 @@ def regrets(
 
 def reference_of(results: Sequence[Result], case: Case) -> Scored | None:
     """What the best constant numbers of a case have, which cases that differ in their data share."""
-    names = {result.case for result in results if result.method == REFERENCE}
-    name = next((candidate for candidate in (case.name, case.name.split(",")[0]) if candidate in names), None)
-    return next((result.last for result in results if result.method == REFERENCE and result.case == name), None)
+    of_model = (result for result in results if result.method == REFERENCE and result.case == case.model)
+    return next((result.last for result in of_model), None)
 
 
 def _by_method(results: Iterable[Result], case: Case) -> dict[str, list[Result]]:

@@ -39,7 +39,8 @@ WALK = QUICK[0]
 
 def result(method, place, score, error="", log_score=-1.0):
     scored = Scored(score, 1.0, 1.0, -10.0, log_score)
-    return Result(WALK.name, method, place, {"1000": scored}, {"1": scored}, scored, 100.0, 0.1, {}, error)
+    name = WALK.model if method == REFERENCE else WALK.name
+    return Result(name, method, place, {"1000": scored}, {"1": scored}, scored, 100.0, 0.1, {}, error)
 
 
 def test_intervals_and_chances_are_students():
