@@ -27,6 +27,8 @@ from thruster_env.logs.write import check_picture, check_suffix, draw_findings, 
 from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, LogsArgument, Option
 from tuning.api.read_logs import recorded_runs
 from tuning.api.result import Printed
+from tuning.logs.allan import allan_of, at_rest, draw_allan, rows_of, start_values
+from tuning.logs.allan import sentences as sentences_on_noise
 from tuning.problems.find import logs_package
 
 BLOCKS = "▁▂▃▄▅▆▇█"
@@ -157,6 +159,7 @@ def command(
     log: Annotated[Any, LogsArgument(INPUT, metavar="LOG", type=Path, file=READ, last="stamps")],
     *,
     only: Annotated[str | None, Option(INPUT, metavar="TEXT")] = None,
+    allan: Annotated[bool, Option(INPUT)] = False,
     plot: Annotated[Path | None, Option(OUTPUT, metavar="FILE", file=WRITTEN)] = None,
     out: Annotated[Path | None, Option(OUTPUT, metavar="FILE", file=WRITTEN)] = None,
 ) -> Printed:
@@ -174,13 +177,19 @@ def command(
 
     Example: thruster log flight.ulg --only actuator
 
+    Example: thruster log at_rest.csv --allan --plot allan.png
+
     Args:
         log: recorded run.
         only: of a recorder's file, list the fields whose names contain this.
+        allan: noise of a gyroscope gyr_x ... gyr_z, and an accelerometer acc_x ..., at rest for some minutes at
+            least: the Allan deviation, and start values for `--model attitude` (docs/attitude.md).
         plot: picture of all channels, findings marked: .png, .svg or .pdf.
         out: write the log as it is read, on its grid and in the model's units: .csv, .npz or .parquet.
     """
     runs = recorded_runs(log)
+    if allan:
+        return _allan(runs.files, runs.reading, only, plot, out)
     file, stamps = runs.files, runs.reading.get("stamps")
     if is_listed(file, only, bool(runs.reading.keys() - {"stamps"}) or plot is not None or out is not None):
         selected = listed_in(file, only, stamps)
@@ -197,6 +206,41 @@ def command(
         save_figure(draw_findings(recorded), plot)
     files = [str(path) for path in (plot, out) if path is not None]
     return Printed([*_report(recorded), *(f"wrote {path}" for path in files)], _as_json(recorded, files))
+
+
+def _allan(
+    file: Path, reading: Mapping[str, Any], only: str | None, plot: Path | None, out: Path | None
+) -> Printed:
+    """Noise of an inertial sensor at rest, and the picture of its Allan deviations."""
+    if only is not None or out is not None:
+        raise ValueError("--allan must come without --only and --out, but got one of them")
+    if plot is not None:
+        check_picture(plot, "--plot")
+    options = {name: value for name, value in reading.items() if name in ("columns", "dt", "grid", "stamps")}
+    recorded = at_rest(file, **options)
+    channels = allan_of(recorded)
+    title = f"{recorded.name}: noise at rest over {recorded.steps * recorded.dt:.4g} s, dt {recorded.dt:g} s"
+    if plot is not None:
+        save_figure(draw_allan(channels, title), plot)
+    columns = [
+        "",
+        "unit",
+        "N, random walk\n[unit/√Hz]",
+        "B, instability\n[unit]",
+        "K, rate random walk\n[unit/s/√Hz]",
+    ]
+    files = [str(plot)] if plot is not None else []
+    messages = [*sentences_on_noise(channels, recorded), *(f"wrote {path}" for path in files)]
+    data = {
+        "log": recorded.name,
+        "dt": recorded.dt,
+        "noise": {c.quantity.symbol: {name: value._asdict() for name, value in c.noise.items()} for c in channels},
+        "start": start_values(channels, recorded.dt),
+        "files": files,
+    }
+    return Printed(
+        [Table(title, columns, rows_of(channels), caption="95 % intervals in brackets"), *messages], data
+    )
 
 
 def _report(log: Log) -> list[RenderableType]:
