@@ -658,3 +658,55 @@ def test_a_measured_quaternion_is_refused_and_the_columns_of_its_matrix_have_its
     estimates = filters.run(filters.make_filter("ekf", of_columns), inputs=np.zeros((0, 3)), measurements=[z])
     prior = np.deg2rad(5.0) ** 2
     np.testing.assert_allclose(estimates.stds[0, :3] ** 2, prior * sigma**2 / (prior + sigma**2), rtol=5e-3)
+
+
+def navlie_update(q, bias, P, z, iterations):
+    """navlie's IteratedKalmanFilter for a rotation of the body: each step in the tangent at the last iterate.
+
+    e = log(x_0^-1 x),  P = J P_0 J',  J = J_r(e),  x := x exp(-J e + K (z - h(x) + H J e))
+    """
+    x, b, prior = q, bias, P
+    for _ in range(iterations):
+        e = np.concatenate([(q.inv() * x).as_rotvec(), b - bias])
+        J = np.eye(6)
+        J[:3, :3] = rotations.left_jacobian(-e[:3])
+        back = J @ e
+        P = J @ prior @ J.T
+        expected = x.inv().apply([GRAVITY, FIELD])
+        H = np.zeros((6, 6))
+        H[:3, :3], H[3:, :3] = skew(expected[0]), skew(expected[1])
+        S = H @ P @ H.T + SENSOR**2 * np.eye(6)
+        K = np.linalg.solve(S, H @ P).T
+        d = -back + K @ (z - expected.ravel() + H @ back)
+        x, b, P = x * Turned.from_rotvec(d[:3]), b + d[3:], P - K @ S @ K.T
+    return x, b, P
+
+
+@pytest.mark.usefixtures("as_python")
+def test_updates_are_those_of_navlie_and_of_ukfm(data):
+    """navlie's iterated filter, once it has converged; ukfm's unscented filter, but for the reset.
+
+    Sources: navlie, IteratedKalmanFilter; Brossard, Barrau, Bonnabel (2020), "A code for unscented Kalman
+    filtering on manifolds (UKF-M)".
+    """
+    z, model = data[2][0, 0], attitude_model(degrees=30.0)
+    iterated = filters.IteratedExtendedKalmanFilter(model=model, iterations=15)
+    belief, _ = iterated.update(iterated.init(), z)
+    q, bias, P = navlie_update(Turned.identity(), np.zeros(3), model.prior_cov, z, 15)
+    assert (q.inv() * Turned.from_quat(belief.mean[[1, 2, 3, 0]])).magnitude() < 1e-10
+    np.testing.assert_allclose(belief.mean[4:], bias, atol=1e-10)
+    np.testing.assert_allclose(belief.cov, P, atol=1e-10)
+
+    unscented = filters.UnscentedKalmanFilter(model=model)  # beta = 2, whose weights are ukfm's
+    belief, _ = unscented.update(unscented.init(), z)
+    q, _, D = naive_points(model.prior_mean, model.prior_cov)
+    Y = np.hstack([q.inv().apply(GRAVITY), q.inv().apply(FIELD)])
+    w, of_centre = np.r_[0.0, np.full(12, 1.0 / 12.0)], np.r_[2.0, np.full(12, 1.0 / 12.0)]
+    E = Y - w @ Y
+    S = (E * of_centre[:, None]).T @ E + SENSOR**2 * np.eye(6)
+    K = np.linalg.solve(S, (E * of_centre[:, None]).T @ D).T
+    d, G = K @ (z - w @ Y), np.eye(6)
+    G[:3, :3] = rotations.left_jacobian(-d[:3])  # the reset, which ukfm leaves out
+    assert (Turned.from_rotvec(-d[:3]) * Turned.from_quat(belief.mean[[1, 2, 3, 0]])).magnitude() < 1e-13
+    np.testing.assert_allclose(belief.mean[4:], d[3:], atol=1e-15)
+    np.testing.assert_allclose(belief.cov, G @ (model.prior_cov - K @ S @ K.T) @ G.T, atol=1e-14)
