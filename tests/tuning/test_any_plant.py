@@ -24,8 +24,7 @@ from tuning.problems.problem import score_label
 from tuning.reporting import tables as leaderboard
 from tuning.reporting.choice_words import gains
 from tuning.reporting.search_figures import draw_consistency
-from tuning.reporting.sections import advice, held_out_section
-from tuning.reporting.subject import Subject
+from tuning.reporting.sections import Subject, advice, held_out_section
 from tuning.reporting.tables import ABOVE, choice_table, comparison_table
 from tuning.search.plan import Plan, check_objectives, find_objective, nis_ratio
 from tuning.search.space import oracle_choice, untuned_choice

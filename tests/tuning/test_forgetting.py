@@ -14,6 +14,7 @@ from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.text_tables import plain_text
 from thruster_env.model.state_space import StateSpaceModel
+from tuning.api.report import _plan
 from tuning.evaluation.baselines import baselines, rule_of_thumb, same_filter
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.tuned import read_tuned
@@ -22,7 +23,6 @@ from tuning.problems.assumed import augmented
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem, log_of
 from tuning.reporting.choice_words import choice_sentences
-from tuning.reporting.subject import _plan
 from tuning.reporting.tables import report as leaderboard_report
 from tuning.reporting.tuning_report import as_json, report, way_out
 from tuning.search.measures import measured, over

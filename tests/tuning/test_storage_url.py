@@ -6,7 +6,7 @@ import optuna
 import pytest
 import sqlalchemy
 
-from tuning.reporting.subject import find_subject
+from tuning.api.report import find_subject
 from tuning.search import storage as database
 from tuning.search.storage import open_storage, public_url, without_secrets
 
@@ -112,6 +112,6 @@ def test_an_outage_tells_no_password(tmp_path, monkeypatch):
 
 
 def test_a_report_of_a_study_that_is_not_there_tells_no_password(monkeypatch):
-    monkeypatch.setattr("tuning.reporting.subject._load", lambda name, storage: None)
+    monkeypatch.setattr("tuning.api.report._load", lambda name, storage: None)
     with pytest.raises(ValueError, match="of a study in postgresql://host/s, but got 'none'"):
         find_subject("none", "postgresql://tuner:secret@host/s")

@@ -20,6 +20,7 @@ from thruster_env.core.compiled import interpreted
 from thruster_env.effects.effects import Gusts
 from thruster_env.thruster.parameters import PRESETS, PresetFile, write_preset
 from thruster_env.thruster.plant import differences, make_plant, plant_data
+from tuning.api.report import find_subject
 from tuning.api.tune import name_of
 from tuning.api.verify import verify
 from tuning.evaluation.tuned import read_tuned
@@ -28,7 +29,6 @@ from tuning.logs.read import as_tuned
 from tuning.plants.thruster import SCENARIOS, find_scenario
 from tuning.policies.setup import make_configuration
 from tuning.problems.find import scenario_of
-from tuning.reporting.subject import find_subject
 from tuning.search.plan import Plan
 
 TOML = 'base = "nominal"\nscale = [1.0, 0.05]\nsteps = 60\nflow = [{name = "gusts", std = 0.5}]\n'

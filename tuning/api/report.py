@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -12,7 +13,8 @@ import optuna
 from optuna.study import StudyDirection
 
 from filters.registry import filter_type
-from thruster_env.core.checks import short_repr
+from filters.tuned_file import read_tuned_file
+from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.files import check_target, write_whole
 from tuning.api.held_out import HeldOut
 from tuning.api.markers import (
@@ -33,18 +35,22 @@ from tuning.evaluation.held_out import (
     evaluate_held_out,
     stored_comparison,
     stored_sizes,
+    versions,
 )
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
-from tuning.evaluation.tuned import tuned_content
+from tuning.evaluation.tuned import problem_in, read_tuned, tuned_content
 from tuning.likelihood.identifiability import Identifiability, identify, sentences, too_many
+from tuning.problems.find import find_given
 from tuning.problems.problem import Problem
 from tuning.reporting.page import Section, Sketchbook, Table, Words, html_page, markdown_page, of_sizes
 from tuning.reporting.search_figures import draw_sizes
-from tuning.reporting.sections import advice, sections_of
-from tuning.reporting.subject import Subject, find_subject, is_file, kept_nis
-from tuning.search.plan import SIZE_SEEDS, at_ends, nis_ratio
-from tuning.search.storage import quiet_optuna, storage_text
-from tuning.search.trials import measure
+from tuning.reporting.sections import Subject, advice, sections_of
+from tuning.search.among_types import SIZES
+from tuning.search.plan import HELD_OUT_SEEDS, SIZE_SEEDS, Plan, at_ends, nis_ratio
+from tuning.search.storage import open_storage, public_url, quiet_optuna, storage_text
+from tuning.search.study import chosen_of
+from tuning.search.trials import best_trial, is_consistent, measure
+from tuning.search.validation import choice_from
 
 
 @dataclass(frozen=True)
@@ -262,3 +268,105 @@ def known_table(result: Identifiability) -> Table:
     return Table(
         "Parameters determined by the innovations of the training runs, with 95 % probability", header, rows
     )
+
+
+def find_subject(source: str | Path, storage: str, problems: Sequence[Problem] = ()) -> Subject:
+    """The subject of a report.
+
+    Args:
+        source: a tuned file (what ends in .json, or is a file), or the name of a study.
+        storage: where the study is; a tuned file may come without.
+        problems: what it is of, where that is code: nothing that a file or a study names is imported.
+
+    Raises:
+        ValueError: if the tuned file is refused, or there is no such study or none of its trials is complete.
+    """
+    return (_of_file if is_file(source) else _of_study)(str(source), storage, problems)
+
+
+def is_file(source: str | Path) -> bool:
+    """Whether a source stands for a tuned file."""
+    return Path(source).suffix == ".json" or Path(source).is_file()
+
+
+def _of_file(path: str, storage: str, problems: Sequence[Problem]) -> Subject:
+    content, (choice, scenario, _) = read_tuned_file(path), read_tuned(path, problems)
+    name, plan = (
+        str(content["study"].get("name")),
+        _plan(content["study"], path, partial(problem_in, content, path=path, problems=problems)),
+    )
+    study = _load(name, storage)
+    if study is not None and study.user_attrs.get("identity") != plan.identity:
+        study = None  # another study of the same name
+    try:
+        first, beyond = content["held_out"][scenario.name]["seeds"]
+        count = at_least("the number of held-out seeds", beyond - first, 2)
+    except (KeyError, TypeError):
+        raise ValueError(f"a tuned file must contain its held-out seeds, but {path} does not") from None
+    consistent = plan.is_constrained and bool(content["study"].get("any_trial_consistent"))
+    stored = content if content.get("digest") == plan.scenarios[0].digest else {}
+    sizes, nis = content.get("ensemble_sizes"), kept_nis(stored, plan)
+    met = content.get("choice")
+    return Subject(name, plan, choice, study, count, True, consistent, stored, sizes, met, nis)
+
+
+def kept_nis(content: Mapping, plan: Plan) -> tuple[float, ...]:
+    """The mean NIS on the training seeds in a tuned file; nothing if it was made with other packages."""
+    ratios = content.get("study", {}).get("mean_nis") if content.get("made_with") == versions() else None
+    if not isinstance(ratios, list) or len(ratios) != len(plan.scenarios):
+        return ()
+    return tuple(ratios) if all(isinstance(ratio, float) for ratio in ratios) else ()
+
+
+def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
+    study = _load(name, storage)
+    if study is None:
+        where = public_url(storage)
+        raise ValueError(f"a report must be of a tuned file or of a study in {where}, but got {name!r}")
+    where = f"study {name!r}"
+    plan = _plan(study.user_attrs.get("identity"), where, partial(find_given, problems=problems, where=where))
+    best = best_trial(study.get_trials(deepcopy=False))
+    if best is None:
+        raise ValueError(f"a study must have a complete trial for a report, but {name!r} has none")
+    choice, met = plan.choice_of(best.params), chosen_of(study)
+    if met is not None:
+        contender = next(contender for contender in met["met"] if contender["name"] == met["chosen"])
+        choice = choice_from(contender["choice"])
+    consistent = plan.is_constrained and is_consistent(best)
+    chosen, sizes = len(plan.objectives) > 1 or met is not None, study.user_attrs.get(SIZES)
+    return Subject(name, plan, choice, study, HELD_OUT_SEEDS, chosen, consistent, sizes=sizes, validation=met)
+
+
+def _load(name: str, storage: str) -> optuna.Study | None:
+    """A study by name, None if it does not exist; no storage is created."""
+    if "://" not in storage and not Path(storage).is_file():
+        return None
+    try:
+        return optuna.load_study(study_name=name, storage=open_storage(storage))
+    except KeyError:
+        return None
+
+
+def _plan(identity, where: str | Path, find: Callable[[str], Problem]) -> Plan:
+    """The plan of an identity, its scenarios found by name."""
+    try:
+        scenarios = tuple(find(name) for name in identity["scenarios"])
+        objectives, seed = tuple(identity["objectives"]), at_least("seed", identity["seed"], 0)
+        plan = Plan(
+            identity["filter"],
+            scenarios,
+            seed,
+            objectives,
+            identity["consistent"],
+            identity["sampler"],
+            identity["hold_r"],
+            budget=identity["budget"],
+            full_q=identity["full_q"],
+            full_r=identity.get("full_r", False),
+            where=tuple(identity.get("where", ())),
+            worst=identity.get("worst", False),
+            forget=identity.get("forget"),
+        )
+    except (KeyError, TypeError):
+        raise ValueError(f"a report needs the plan of the study, but {where} has {short_repr(identity)}") from None
+    return plan.checked()

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import isnan, sqrt
 from textwrap import fill
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import optuna
 from numpy import isfinite
 from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
@@ -39,7 +40,6 @@ from tuning.reporting.search_figures import (
     size_axis,
     words,
 )
-from tuning.reporting.subject import Subject
 from tuning.reporting.tables import kinds_table
 from tuning.reporting.time_figures import (
     COLUMNS,
@@ -72,6 +72,22 @@ NEES_NIS = (
     "same with the innovation: its mean is the number of channels. CRPS, the continuous ranked probability "
     "score, is the error of a whole distribution, in the unit of the state."
 )
+
+
+class Subject(NamedTuple):
+    """A choice and its source."""
+
+    name: str  # of the study
+    plan: Plan
+    choice: Choice
+    study: optuna.Study | None  # None where it is not in the storage
+    seeds: int  # number of held-out seeds
+    chosen: bool  # whether the ensemble size is that of a tuned file, or still to be chosen
+    consistent: bool = False  # whether its mean NIS is in its band, where it has to be
+    content: Mapping = {}  # of the tuned file
+    sizes: object = None  # the table of ensemble sizes as it is kept
+    validation: Mapping | None = None  # how the best trials met the baselines: `validation.as_data`
+    nis: tuple[float, ...] = ()  # mean NIS over the channels on each scenario's training seeds, where it is kept
 
 
 def advice(choice: Choice, plan: Plan, comparisons: Sequence[Comparison], chosen: Mapping | None = None) -> str:
