@@ -36,7 +36,7 @@ TIDY := $(BIN)/python -m thruster_env.core.modules
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1 - \2/p' Makefile
 
-demo: $(BASE) ## install what is needed (once), tune a filter, prove it, draw it, report it
+demo: $(BASE) ## install what is needed (once), tune a filter, prove it, report it
 	@$(BIN)/thruster demo $(ARGS)
 
 test: $(TEST) ## install what tests need (once) and run all but the slow tests; ARGS="-k name" picks some
