@@ -107,7 +107,7 @@ def start(module: str, orders: dict[str, Any], **options: Any) -> subprocess.Pop
         command = as_module(module)
         process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, **OWN_SESSION, **options)
     assert process.stdin is not None  # a pipe
-    with suppress(BrokenPipeError):  # it has died already, which its exit code shows
+    with suppress(OSError):  # of a pipe that is broken, on Windows EINVAL: it has died, which its exit code shows
         process.stdin.write(json.dumps(orders) + "\n")
         process.stdin.flush()
     return process
@@ -116,7 +116,7 @@ def start(module: str, orders: dict[str, Any], **options: Any) -> subprocess.Pop
 def close_input(process: subprocess.Popen) -> None:
     """Close a process's standard input, which asks it to end."""
     if process.stdin is not None:
-        with suppress(BrokenPipeError):
+        with suppress(OSError):
             process.stdin.close()
 
 

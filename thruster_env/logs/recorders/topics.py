@@ -255,7 +255,7 @@ class Opened:
         try:
             self._child.stdin.write(line.encode() + b"\n")  # type: ignore[union-attr]
             self._child.stdin.flush()  # type: ignore[union-attr]
-        except BrokenPipeError:
+        except OSError:
             raise ValueError(self._end()) from None
         answer = self._child.stdout.readline()  # type: ignore[union-attr]
         if not answer.endswith(b"\n"):
@@ -294,5 +294,5 @@ def opened(form: str, path: Path) -> Iterator[Opened]:
             yield Opened(child, form, path)
         finally:
             child.kill()
-            with suppress(BrokenPipeError):  # of a request that was never read
+            with suppress(OSError):  # of a request that was never read
                 child.stdin.close()  # type: ignore[union-attr]
