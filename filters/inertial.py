@@ -40,11 +40,12 @@ from thruster_env.model import rotations
 from thruster_env.model.continuous import noise_of_densities
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import Rotation
+from thruster_env.model.turns import Rotation, Turn
 
 GRAVITY = 9.81  # [m/s^2]
 UNKNOWN = 2.0  # standard deviation of the first attitude on each axis [rad], which is none
 FIRST_BIAS = 0.02  # of a gyroscope [rad/s]
+FIRST_YAW = 0.01  # where no magnetometer gives it, and it counts from the start [rad]
 AXES = "xyz"
 WORLD = ("east", "north", "up")
 GYROSCOPE = tuple(Quantity(f"gyroscope {axis}", f"gyr_{axis}", "rad/s") for axis in AXES)
@@ -53,6 +54,10 @@ MEASURED = (
     *(Quantity(f"magnetometer {axis}", f"mag_{axis}", "uT") for axis in AXES),
 )
 TURNING = (Rotation("attitude"), *(Quantity(f"gyroscope bias {axis}", f"b_{axis}", "rad/s") for axis in AXES))
+OSCILLATION = (
+    *(Quantity(f"oscillation {axis}", f"o_{axis[0]}", "m/s^2") for axis in WORLD),
+    *(Quantity(f"acceleration {axis}", f"a_{axis[0]}", "m/s^2") for axis in WORLD),
+)
 FIRST = [UNKNOWN**2] * 3 + [FIRST_BIAS**2] * 3  # variances of these
 # What a log of motion determines.
 FREE = ("accelerometer", "magnetometer", "acceleration", "frequency", "damping", "field", "dip", "gravity")
@@ -100,6 +105,22 @@ def _sense(x, c):
     return *accelerometer, *rotations.to_body(x[:4], (0.0, c.north, c.up))
 
 
+def _turn_imu(x, u, c):
+    turned = _turn((*x[:4], *x[10:], *x[4:10]), u, c)
+    return *turned[:4], *turned[7:], *turned[4:7]
+
+
+def _sense_imu(x, c):
+    return rotations.to_body(x[:4], (x[7], x[8], x[9] + c.gravity))
+
+
+def _oscillation(dt: float, *numbers: float) -> tuple[np.ndarray, np.ndarray]:
+    """The step and Q of an acceleration by its frequency, damping and deviation."""
+    names = "frequency", "damping", "acceleration"
+    swing = oscillator(*(positive(name, value) for name, value in zip(names, numbers, strict=True)))
+    return swing.step(positive("dt", dt))
+
+
 def attitude(
     dt: float = 0.01,
     gyroscope: float = 2e-4,
@@ -134,14 +155,7 @@ def attitude(
     Raises:
         ValueError: if a number is not positive, but for the dip.
     """
-    dt = positive("dt", dt)
-    swing = oscillator(
-        *(
-            positive(name, value)
-            for name, value in (("frequency", frequency), ("damping", damping), ("acceleration", acceleration))
-        )
-    )
-    step, pair = swing.step(dt)
+    step, pair = _oscillation(dt, frequency, damping, acceleration)
     gyro = _gyroscope_noise(gyroscope, positive("bias_walk", bias_walk), dt)
     return StateSpaceModel(
         transition=_turn,
@@ -151,17 +165,63 @@ def attitude(
         prior_mean=[1.0] + [0.0] * 12,
         prior_cov=FIRST + [acceleration**2] * 6,
         constants=Sensors._make([dt, *step.ravel().tolist(), *_at_rest(gravity, field, dip)]),
-        states=(
-            *TURNING,
-            *(Quantity(f"oscillation {axis}", f"o_{axis[0]}", "m/s^2") for axis in WORLD),
-            *(Quantity(f"acceleration {axis}", f"a_{axis[0]}", "m/s^2") for axis in WORLD),
-        ),
+        states=(*TURNING, *OSCILLATION),
         input_quantities=GYROSCOPE,
         measurements=MEASURED,
     )
 
 
 attitude.free = FREE  # type: ignore[attr-defined]  # of `tuning.identify`, where no parameter is named
+
+
+def attitude_imu(
+    dt: float = 0.01,
+    gyroscope: float = 2e-4,
+    bias_walk: float = 1e-5,
+    accelerometer: float = 0.02,
+    acceleration: float = 1.0,
+    frequency: float = 1.0,
+    damping: float = 0.3,
+    gravity: float = GRAVITY,
+) -> StateSpaceModel:
+    """`attitude` without a magnetometer: yaw begins at about 0, and drifts with the gyroscope's bias about up.
+
+    Rotation, oscillation and acceleration are one element of SE_2(3), as an `ExtendedPose` with errors of the
+    world, of which those about up are known at the start. With this the slope of h by an error about up is zero,
+    so that measurements tell nothing of yaw, whose deviation grows.
+
+    Args:
+        dt: sample time [s].
+        gyroscope: as `attitude` takes it [rad/s/sqrt(Hz)].
+        bias_walk: likewise [rad/s^2/sqrt(Hz)].
+        accelerometer: deviation of a sample of the accelerometer [m/s^2].
+        acceleration: deviation of the sensor's acceleration on each axis [m/s^2].
+        frequency: of the acceleration [Hz].
+        damping: its damping ratio.
+        gravity: g [m/s^2], as the accelerometer measures it.
+
+    Raises:
+        ValueError: if a number is not positive.
+    """
+    step, pair = _oscillation(dt, frequency, damping, acceleration)
+    gyro = _gyroscope_noise(gyroscope, positive("bias_walk", bias_walk), dt)
+    names, quaternion = TURNING[1:], Rotation("attitude").quantities
+    return StateSpaceModel(
+        transition=_turn_imu,
+        observe=_sense_imu,
+        process_noise_cov=block_diagonal([gyro[:3, :3], np.kron(pair, np.eye(3)), gyro[3:, 3:]]),
+        measurement_noise_cov=_sensor_variances(accelerometer, 1.0)[:3],
+        prior_mean=[1.0] + [0.0] * 12,
+        prior_cov=[*FIRST[:2], FIRST_YAW**2, *[acceleration**2] * 6, *FIRST[3:]],
+        constants=Sensors._make([dt, *step.ravel().tolist(), positive("gravity", gravity), 0.0, 0.0]),
+        states=(*quaternion, *OSCILLATION, *names),
+        turns=(Turn(0, 0, "world", "attitude", "extended pose", 9),),
+        input_quantities=GYROSCOPE,
+        measurements=MEASURED[:3],
+    )
+
+
+attitude_imu.free = ("accelerometer", "acceleration", "frequency", "damping", "gravity")  # type: ignore[attr-defined]
 
 
 SWAY, WAVE, BIAS = 7, 11, 15  # offsets of horizontal motion, the wave and the accelerometer's bias, as stored

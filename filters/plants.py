@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.inertial import attitude, heave
+from filters.inertial import attitude, attitude_imu, heave
 from thruster_env.core.checks import one_of, positive, short_repr
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.model.continuous import ContinuousModel
@@ -477,6 +477,7 @@ def battery(
 # Functions of numbers that make a model in continuous time, or one of a sample time dt.
 PLANTS: Mapping[str, Callable[..., Any]] = {
     "attitude": attitude,
+    "attitude-imu": attitude_imu,
     "heave": heave,
     "coordinated-turn": coordinated_turn,
     "unicycle": unicycle,

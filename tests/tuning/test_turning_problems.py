@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation as Turned
 import filters
 import tuning
 from filters.bounds import posterior_bound
-from filters.inertial import attitude
+from filters.inertial import attitude, attitude_imu
 from filters.registry import make_filter
 from thruster_env.core.streams import episode_keys
 from thruster_env.env.model_env import ModelEnv
@@ -169,3 +169,17 @@ def test_a_log_with_its_reference():
     np.testing.assert_allclose(frame["yaw_deg"], np.rad2deg(rotations.euler(q)[2]), rtol=1e-12)
     assert "reference_yaw_deg" in frame
     assert "std_roll_deg" in frame
+
+
+def test_without_a_magnetometer_yaw_is_not_measured():
+    """Consistent over runs; at rest the deviation of yaw grows, and with it that of no other angle."""
+    model = attitude_imu(dt=0.05, gyroscope=2e-3, acceleration=0.3)
+    near = np.diag([0.1**2] * 2 + [0.01**2] + [0.3**2] * 6 + [0.02**2] * 3)
+    model = model.replace(prior_cov=near)  # the model's own knows no tilt
+    unmeasured = ModelProblem(model, inputs=rates, steps=120, first_scored_step=60, scale=[1.0] * 12)
+    evaluation = evaluate(make_filter("ekf", model), unmeasured.data(range(40)), [1.0] * 12)
+    assert 10.5 < evaluation.nees.value < 14.0
+    still = {"inputs": np.zeros((400, 3)), "measurements": np.tile([0.0, 0.0, 9.81], (401, 1))}
+    deviations = filters.run(make_filter("ekf", model), **still).stds
+    assert (np.diff(deviations[:, 2]) > 0.0).all()
+    assert (deviations[-1, :2] < 0.02).all()

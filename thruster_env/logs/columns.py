@@ -297,6 +297,8 @@ def _check_columns(
     ]
     if needs_time and TIME not in columns:
         texts.append("times (use --column time=HEADER, or --dt)")
+    if all(channel.quantity.symbol.startswith("mag_") for channel in missing):
+        texts[-1] += " or --model attitude-imu"
     python = f"in Python columns={{{missing[0].quantity.symbol!r}: 'HEADER'}}"
     rule = f"{NO_COLUMN} for {' and for '.join(texts)}"
     raise ValueError(f"{rule}, but {file} has {listed(headers)}; {python}")

@@ -50,10 +50,7 @@ MEASURED = (
     "the state."
 )
 
-ATTITUDES = (
-    "Each block begins at the attitude of its first measurement. True attitudes are not used: studies do not "
-    "score their errors."
-)
+ATTITUDES = "Each block begins at the attitude of its first measurement."
 
 
 def as_rows(log: Log) -> Log:
