@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from filters.engine.belief import Kernels, vector_like
+from filters.engine.belief import Kernels, restart_if_lost, vector_like
 from filters.engine.compile import (
     PREDICT,
     START,
@@ -441,16 +441,17 @@ class Beliefs:
         self._filter = filter_
         self._kernels, self._size, self._numbers = filter_.kernels(), filter_.size, filter_.numbers
         self._places = self._kernels.layout
-        row, table, _ = self._own = new_memory(self._kernels, self._size)
+        row, *of_thread = new_memory(self._kernels, self._size)
         self._rows = np.zeros((count, len(row)))
-        self._tables = np.zeros((count, self._kernels.kept_rows, table.shape[1]))
+        self._tables = np.zeros((count, self._kernels.kept_rows, of_thread[0].shape[1]))
         self._u, self._z = (
             np.zeros((count, filter_.kernel_model.inputs)),
             np.zeros((count, self._kernels.channels)),
         )
         operation = _operation(self._kernels, self._u.shape[1], is_interpreting())
         beliefs = self._rows, self._tables, self._u, self._z, self._numbers
-        self._operate = operation.on(count, (*self._own, self._size, *beliefs), (count,))
+        parts = -(-count // LANES) if self._kernels.vectors else count
+        self._operate = operation.on(parts, (*of_thread, self._size, *beliefs), (count,))
 
     def __getstate__(self) -> tuple:
         """The filter and the beliefs; machine code is looked up again."""
@@ -498,19 +499,15 @@ class Beliefs:
 def _operation(kernels: Kernels, inputs: int, interpreting: bool) -> InParts:
     from thruster_env.graphs.workers import InParts
 
+    length, kept_rows, m, p = row_length(kernels), kernels.kept_rows, kernels.channels, inputs
     operate = build_operation(kernels)
-    kept_rows, m, p = kernels.kept_rows, kernels.channels, inputs
 
-    def operate_many(first, last, row_like, table_like, draws_like, size, rows, tables, us, zs, numbers, tasks):
-        # Each thread has its own memory: slices of shared arrays cost contended reference counts.
-        row, table, draws = np.zeros(row_like.shape), np.zeros(table_like.shape), np.zeros(draws_like.shape)
-        values = np.zeros(p + m)
+    def operate_many(first, last, table_like, draws_like, size, rows, tables, us, zs, numbers, tasks):
+        table, draws, values = np.zeros(table_like.shape), np.zeros(draws_like.shape), np.zeros(p + m)
         for b in range(first, last):
             task = int(tasks[b])
             if task == IDLE:
                 continue
-            for i in range(row.shape[0]):
-                row[i] = rows[b, i]
             if task == STEP:
                 for i in range(kept_rows):
                     for j in range(tables.shape[2]):
@@ -519,16 +516,12 @@ def _operation(kernels: Kernels, inputs: int, interpreting: bool) -> InParts:
                 values[i] = us[b, i]
             for i in range(m):
                 values[p + i] = zs[b, i]
-            operate(row, table, draws, size, values, numbers, task)
-            for i in range(row.shape[0]):
-                rows[b, i] = row[i]
+            operate(rows[b], table, draws, size, values, numbers, task)
             for i in range(kept_rows):
                 for j in range(tables.shape[2]):
                     tables[b, i, j] = table[i, j]
 
-    length = row_length(kernels)
     shapes = (
-        (length,),
         (kernels.table_rows, None),
         (None,),
         None,
@@ -539,4 +532,52 @@ def _operation(kernels: Kernels, inputs: int, interpreting: bool) -> InParts:
         (None,),
         (None,),
     )
+    if kernels.vectors:
+        return InParts(_groups(kernels, p), shapes, few=THREADED_COPIES // LANES)
     return InParts(operate_many, shapes, few=THREADED_COPIES)
+
+
+def _groups(kernels: Kernels, p: int) -> Callable:
+    """`operate_many` for eight copies side by side, some of them idle, with the numbers of a batch."""
+    start, restart, (begin, advance, finish, update) = kernels.start, restart_if_lost(kernels), kernels.vectors
+    length, m, substeps = row_length(kernels), kernels.channels, kernels.offsets.substeps
+    step, divergences = kernels.layout.step, kernels.layout.divergences
+
+    def operate_groups(first, last, table_like, draws_like, size, rows, tables, us, zs, numbers, tasks):
+        row, u, z = np.zeros(length * LANES), np.zeros(p * LANES), np.zeros(m * LANES)
+        for g in range(first, last):
+            used, steps, begins = min(LANES, rows.shape[0] - g * LANES), 0, 0
+            for j in range(LANES):
+                b = g * LANES + min(j, used - 1)
+                steps += int(tasks[b] == STEP)
+                begins += int(tasks[b] == BEGIN)
+                for i in range(length):
+                    row[i * LANES + j] = rows[b, i]
+                for i in range(p):
+                    u[i * LANES + j] = us[b, i]
+                for i in range(m):
+                    z[i * LANES + j] = zs[b, i]
+            if steps > 0:
+                begin(row, u, numbers)
+                for _ in range(int(numbers[substeps])):
+                    advance(row, u, numbers)
+                finish(row, u, numbers)
+            if begins > 0:
+                for j in range(used):
+                    if tasks[g * LANES + j] == BEGIN:
+                        belief = rows[g * LANES + j]
+                        belief[step] = belief[divergences] = 0.0
+                        start((belief, None, None), numbers, 0)
+                        for i in range(length):
+                            row[i * LANES + j] = belief[i]
+            if steps + begins > 0:
+                update(row, z, numbers)
+                for j in range(used):
+                    if tasks[g * LANES + j] != IDLE:
+                        estimate = rows[g * LANES + j]
+                        for i in range(length):
+                            estimate[i] = row[i * LANES + j]
+                        estimate[step] += float(tasks[g * LANES + j] == STEP)
+                        restart((estimate, None, None), numbers, 0)
+
+    return operate_groups
