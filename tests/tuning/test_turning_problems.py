@@ -16,8 +16,9 @@ from thruster_env.model import rotations
 from thruster_env.model.simulate import simulate
 from thruster_env.model.turns import Rotation
 from tuning.evaluation.evaluate import check_consistency, evaluate
+from tuning.logs.problem import of_gyroscope
 from tuning.problems.check import checked_problem
-from tuning.problems.model_problem import ModelProblem
+from tuning.problems.model_problem import ModelProblem, log_of
 
 DT, UP, NORTH = 0.1, (0.0, 0.0, 1.0), (0.0, 0.6, -0.8)
 SCALE = (0.02, 0.013, 0.013, 0.006, 0.005, 0.006)
@@ -183,3 +184,17 @@ def test_without_a_magnetometer_yaw_is_not_measured():
     deviations = filters.run(make_filter("ekf", model), **still).stds
     assert (np.diff(deviations[:, 2]) > 0.0).all()
     assert (deviations[-1, :2] < 0.02).all()
+
+
+def test_the_trap_of_a_free_gyroscope():
+    """Where the motion is the model's innovations are white; of another frequency they are not, which is said."""
+    model = attitude(dt=0.05, frequency=2.0)
+    model = model.replace(prior_cov=np.diag([0.05**2] * 3 + [0.001**2] * 3 + [1.0] * 6))
+    u = rates([0], 1500)
+    drawn = simulate(model, episode_keys([3]), u)
+    log = log_of((u[0], drawn.measurements[0]), model, 0.05)
+    assert of_gyroscope(["gyroscope", "dip"], model, [log]) == []
+    wrong = attitude(dt=0.05, frequency=0.3)
+    assert of_gyroscope(["dip"], wrong, [log]) == []
+    (sentence,) = of_gyroscope(["gyroscope", "dip"], wrong, [log])
+    assert sentence.startswith("Beware of gyroscope: innovations of acc_")

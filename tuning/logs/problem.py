@@ -16,8 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from filters.logs.estimate import estimate_with
+from filters.logs.findings import findings
 from filters.named import NamedMaker, is_model_name
 from filters.plants import PLANTS
+from filters.registry import make_filter
 from filters.tuned_file import check_preset_file, made_with, read_tuned_file, tune_options
 from thruster_env.core.checks import short_repr
 from thruster_env.env.model_env import read_for
@@ -53,6 +56,8 @@ EVERY_THIRD = 3
 LAST_PART = 4  # of a run the rows that are held out: one in so many, at its end
 SHORTEST_HELD_OUT = 50  # rows of that part
 SHORTEST_PIECE = 10  # rows of a run between gaps: fewer tell little beside how they begin
+GYROSCOPE = ("gyroscope", "bias_walk")  # numbers of `attitude` that a log of motion does not determine
+CORRELATED = 0.1  # of innovations with later ones, at least
 OFFSET_SHARE = 4  # a clock offset may be at most the length of a log divided by this
 
 
@@ -506,6 +511,7 @@ def remarks(runs: Sequence[Log], proving: Sequence[Log], result: Identification)
         sentences.append(
             "Outliers bias the result: --gate 5 (gate=5) leaves out samples beyond five standard deviations."
         )
+    sentences += of_gyroscope(result.names, result.objective.model_at(result.at), runs)
     gate = result.objective.gate
     if gate < math.inf:
         held_out, training_note = "held-out runs count all samples", "the runs it has seen are of the same samples"
@@ -515,6 +521,35 @@ def remarks(runs: Sequence[Log], proving: Sequence[Log], result: Identification)
             f"{(held_out if proving else training_note)}."
         )
     return sentences
+
+
+def of_gyroscope(names: Sequence[str], model: StateSpaceModel, runs: Sequence[Log]) -> list[str]:
+    """That a free noise of a gyroscope is a trap, where innovations show that the acceleration is another one.
+
+    The likelihood is then higher with more noise of the gyroscope, and attitudes are worse (docs/attitude.md).
+
+    Args:
+        names: of the free parameters.
+        model: with the identified values.
+        runs: of which the longest is filtered.
+    """
+    free = [name for name in names if name in GYROSCOPE]
+    if not free or not model.turns:
+        return []
+    run = max(runs, key=lambda log: log.steps)
+    white = findings(estimate_with(make_filter("ekf", model), run)).whiteness
+    if white is None:
+        return []
+    sizes = np.abs(np.einsum("lii->li", white.correlations)).max(axis=0)
+    if sizes.max() < max(CORRELATED, 5.0 / math.sqrt(run.steps)):
+        return []
+    channel = model.measurements[int(sizes.argmax())].symbol
+    return [
+        f"Beware of {' and '.join(free)}: innovations of {channel} are correlated, up to {sizes.max():.2f}, so "
+        "the acceleration is not that of the model, for which noise of the gyroscope then pays: the likelihood "
+        "rises, and attitudes get worse. Hold it at the number of the data sheet, or of a log at rest (thruster "
+        "log --allan)."
+    ]
 
 
 def check_offsets(parameters: Sequence[Parameter], logs: Sequence[Log]) -> None:
