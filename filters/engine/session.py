@@ -416,7 +416,6 @@ class Session:
         key = int(row[layout.key_0]), int(row[layout.key_1])
         if not self._size and isfinite(self._moments.sum()):
             return self._own_belief(self._table[:, :0].copy(), key, int(row[layout.step]), self.divergences)
-        key = int(row[layout.key_0]), int(row[layout.key_1])
         members = self._table[: self._kept_rows, : self._size].copy()
         step, extras = int(row[layout.step]), self._extras.copy()
         # The sum is NaN or infinite if one of the numbers is.

@@ -21,7 +21,7 @@ from filters.algebra.operations import divide, geometric_mean, mask_missing, pre
 from filters.engine.belief import Kernels, filter_offset, memory_offsets
 from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compare, expect, propagate
 from filters.ensembles.stochastic import relax_row, row_moments, stretch_row
-from filters.pages.kernels import MembersMemory, Stage, stored
+from filters.pages.kernels import MembersMemory, Stage, anything_measured, stored
 from filters.pages.kernels import member_stages_of as stages_of
 from filters.pages.kernels import member_works_of as works_of
 from filters.pages.page import Page
@@ -224,10 +224,7 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
     def update(memory, z, numbers, size):
         row, table, draws = memory
         look(row, z, numbers, table, draws, size)
-        measured = False
-        for k in range(m):
-            measured = measured or z[k] == z[k]
-        if measured:
+        if anything_measured(z):
             for iteration in range(1, iterations + 1):
                 for i in range(rows):
                     pull_row(table, window + i, iterate + i, slopes, pulls, m, size)
@@ -238,7 +235,7 @@ def window_kernels(page: Page, functions: Functions, shape: Shape, length: int, 
                 if iteration < iterations:
                     again(row, z, numbers, table, draws, size)
             copy_rows(table, iterate, window, rows)
-        moments_of(row, row, row, table, draws, size)
+        summarise(memory, size)
 
     def summarise(memory, size):
         row, table, draws = memory

@@ -530,14 +530,11 @@ def _correction(work: Works, shape: Shape) -> Callable:
 
     def update(memory, z, numbers, size):
         row, table, draws = memory
+        if draws_noise:
+            fill_normals(draws, m * table.shape[1], row[step], FILTER_MEASUREMENT, row[key_0], row[key_1])
         correct(row, z, numbers, table, draws, size)
 
-    def update_with_noise(memory, z, numbers, size):
-        row, table, draws = memory
-        fill_normals(draws, m * table.shape[1], row[step], FILTER_MEASUREMENT, row[key_0], row[key_1])
-        correct(row, z, numbers, table, draws, size)
-
-    return update_with_noise if draws_noise else update
+    return update
 
 
 def extras_size(page: Page, shape: Shape) -> int:
