@@ -8,8 +8,9 @@ state does not move.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -20,8 +21,11 @@ from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.horizon.window import HUBER, LOSSES, kept_places, limits, scratch_places, window_works
 from filters.pages.kernels import anything_measured, nothing_to_summarise, page_kernels
 from thruster_env.core.checks import at_least, one_of, positive
+from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.model.quantities import Bound
 from thruster_env.model.shape import Functions, Shape
+from thruster_env.model.traced import called_function
+from thruster_env.model.turns import innovation as difference
 
 MOST_PASSES = 100  # besides `iterations`, until the right bounds hold
 HALVINGS = 6  # of a step that increases the cost, if bounds do not change
@@ -40,7 +44,7 @@ def horizon_kernels(
     Extras are the number of steps, arrival mean and P, and the steps. Scratch has the numbers of a step, then the
     results of each.
     """
-    n, m, t, inputs = shape.n, shape.m, shape.t, shape.inputs
+    n, m, t, channels, inputs = shape.n, shape.m, shape.t, shape.channels, shape.inputs
     layout, step_layout, at = memory_offsets(n, m, t), kept_places(shape), scratch_places(shape)
     end, width, square = step_layout.end, at.end, t * t
     acting, feed = layout.extras, shape.feed  # the input of the last step, if h takes it
@@ -61,7 +65,7 @@ def horizon_kernels(
     )
     plain = page_kernels(ExtendedKalmanFilter.page, functions, shape)
     begin, predict_belief = plain.start, plain.predict
-    has_bounds = bool(bounds) or limited
+    has_bounds, known = bool(bounds) or limited, known_errors(shape)
     more = MOST_PASSES if has_bounds else 0
 
     def copy(target, at, source, first, size):
@@ -94,7 +98,7 @@ def horizon_kernels(
         for j in range(count):
             rows = row[scratch + j * width : scratch + (j + 2) * width]
             step = row[steps + j * end : steps + (j + 2) * end]
-            for i in range(m):
+            for i in range(channels):
                 rows[at.z + i] = step[step_layout.z + i] if step[step_layout.z + i] < math.inf else math.nan
             copy(then, r_offset, step, step_layout.R, m * m)
             copy(then, constants_offset, step, step_layout.seen_by, constants)
@@ -158,7 +162,7 @@ def horizon_kernels(
             row[first + i] = 0.0
         for i in range(n):
             row[first + step_layout.x + i] = row[mean + i]
-        for i in range(m):
+        for i in range(channels):
             row[first + step_layout.z + i] = math.inf
         row[first + step_layout.fresh] = 1.0
         keep_sight(row, numbers, count)
@@ -232,7 +236,7 @@ def horizon_kernels(
         """Store a measurement with those of the same time; their errors are independent."""
         newest = steps + (int(row[number]) - 1) * end
         is_first, fits = True, True
-        for i in range(m):
+        for i in range(channels):
             if row[newest + step_layout.z + i] < math.inf:
                 is_first = False
                 fits = fits and z[i] != z[i]
@@ -246,11 +250,13 @@ def horizon_kernels(
             if not fits:
                 repeat_step(row, numbers, int(row[number]))
                 newest = steps + (int(row[number]) - 1) * end
+        for i in range(channels):
+            row[newest + step_layout.z + i] = z[i] if z[i] == z[i] else row[newest + step_layout.z + i]
+        errors = known(z)
         for i in range(m):
-            if z[i] == z[i]:
-                row[newest + step_layout.z + i] = z[i]
+            if errors[i] == errors[i]:
                 for j in range(m):
-                    joint = numbers[r_offset + i * m + j] if z[j] == z[j] else 0.0
+                    joint = numbers[r_offset + i * m + j] if errors[j] == errors[j] else 0.0
                     row[newest + step_layout.R + i * m + j] = row[newest + step_layout.R + j * m + i] = joint
 
     def update(memory, z, numbers, size):
@@ -273,7 +279,34 @@ def horizon_kernels(
         scratch=numbers_end + (room + 1) * width,
         acting=tuple(range(acting, number)),
         turns=len(shape.turns),
+        measured_turns=len(shape.measured_turns),
     )
+
+
+@cache
+def known_errors(shape: Shape) -> Callable:
+    """Return `known(z)`: numbers (m,) that are NaN where z misses them, all of a rotation if it misses one."""
+    turns, m, channels = shape.measured_turns, shape.m, shape.channels
+    if not turns:
+        return same
+
+    def without_error(z, c):
+        return tuple(difference(z, z, turns))
+
+    function = called_function(without_error, "x, c", (channels, 0), 0, (m,))
+    read, store = vector_reader(channels), vector_writer(m)
+
+    def known(z):
+        errors = np.zeros(m)
+        store(errors, function(read(z), ()))
+        return errors
+
+    return known
+
+
+def same(z):
+    """What it gets."""
+    return z
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -361,9 +394,9 @@ class MovingHorizonFilter(Filter):
 
     @property
     def takes_rotations(self) -> bool:
-        """Whether it takes the rotations of its model: of states, without bounds; no direction steps back."""
+        """Whether it takes the rotations of its model: without bounds; no direction steps back."""
         model = self.kernel_model
-        free = not (model.bounds or model.measured_turns) and self.disturbance_limit == math.inf
+        free = not model.bounds and self.disturbance_limit == math.inf
         return free and all(turn.kind != "direction" for turn in model.turns)
 
     def window(self, belief: Belief) -> np.ndarray:

@@ -7,9 +7,9 @@ They use deviations d_j = x_j - X_j from the estimate X of the window, about whi
                 l = F_{j-1}' l
 
 with d_j and P_j before the update in the last line. Of states that turn, d_j lies in the tangent at X_j
-(`thruster_env.model.turns`): f(X_j) - X_{j+1} is the difference c there, F_j and Q are brought there by J(c), and
-x_j is X_j moved.  The adjoint l, a vector, needs neither P^-1 nor Q^-1: both may
-be singular. Components at a bound are conditioned on it, or released (`limits`).
+(`thruster_env.model.turns`): f(X_j) - X_{j+1} is a difference there, F_j and Q are brought there by a reset, and
+x_j is X_j moved. The adjoint l, a vector, needs neither P^-1 nor Q^-1: both may be singular. Components at a bound
+are conditioned on it, or released (`limits`).
 
 Source: Bryson, Frazier (1963), "Smoothing for linear and nonlinear dynamic systems".
 """
@@ -40,7 +40,17 @@ from filters.algebra.operations import (
 )
 from filters.algebra.points import dot
 from filters.algebra.roots import careful
-from filters.algebra.tangents import differences, inverse_reset_slopes, move, reset, reset_back
+from filters.algebra.tangents import (
+    after_reset,
+    differences,
+    inverse_reset_slopes,
+    local_at,
+    local_at_measurement,
+    move,
+    reset,
+    reset_back,
+    reset_slopes,
+)
 from filters.engine.belief import memory_offsets
 from filters.gaussian import extended
 from filters.pages.kernels import Stage, programs_of, stored
@@ -62,7 +72,7 @@ class Kept(NamedTuple):
 
     u: int  # (p,), from this step to the next one; at 0, as in `given` of other programs
     x: int  # (n,), X
-    z: int  # (m,), infinite where missing: a belief must not be NaN
+    z: int  # (channels,), infinite where missing: a belief must not be NaN
     adjoint: int  # (t,), l before the update
     fresh: int  # 1 until the step was part of a pass
     sides: int  # (2 t,), which bounds hold the state and the disturbance after it: -1, 0 or 1
@@ -82,7 +92,7 @@ class Scratch(NamedTuple):
     cov: int  # (t, t)
     updated_d: int
     updated_cov: int
-    z: int  # (m,), NaN where missing
+    z: int  # (channels,), NaN where missing
     mean: int  # (n,), f(X)
     slope: int  # (t, t), F
     without: int  # (t, t), I - K H
@@ -106,14 +116,14 @@ def kept_places(shape: Shape) -> Kept:
     """Offsets of the numbers that a belief keeps of a step."""
     n, t = shape.n, shape.t
     square, constants = t * t, shape.constants
-    of_step = shape.inputs, n, shape.m, t, 1, 2 * t, shape.m**2, constants, square, constants, 1, shape.feed
+    of_step = shape.inputs, n, shape.channels, t, 1, 2 * t, shape.m**2, constants, square, constants, 1, shape.feed
     return Kept(*starts_of(*of_step))
 
 
 @cache
 def scratch_places(shape: Shape) -> Scratch:
     """Offsets of the results of a step."""
-    n, m, t, square = shape.n, shape.m, shape.t, shape.t * shape.t
+    n, m, t, square = shape.n, shape.channels, shape.t, shape.t * shape.t
     return Scratch(
         *starts_of(
             n, square, t, square, m, n, square, square, t, t, t, n, t, 1, 1, t, square, t, t, 2 * t * (t + 2)
@@ -140,7 +150,8 @@ class Works(NamedTuple):
 
 def tell(model, x, P, z):
     """Innovation, its covariance and log density, by the extended filter; NaN marks missing channels."""
-    return extended.update(model, x, P, z)[2:]
+    local, z = local_at(model, z, x)
+    return extended.update(local, x, P, z)[2:]
 
 
 def correct(model, x, d, P, z, fresh, loss):
@@ -148,6 +159,7 @@ def correct(model, x, d, P, z, fresh, loss):
 
     The weight follows from the residual at x; for a fresh step, without an estimate, from the innovation.
     """
+    model, z = local_at_measurement(model, z, x)
     measured = present(z)
     H, R = mask_missing(measured, model.H(x)), uncorrelated(measured, model.R)
     residual = mask_missing(measured, wrap(z - model.h(x), model.measurement_angles))
@@ -205,21 +217,24 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
 
         d, P = vector(at.d), square(at.cov, symmetric=True)
         updated_d, updated_P = vector(at.updated_d), square(at.updated_cov, symmetric=True)
-        z, after, before = memory.read("rows", at.z, m), vector(at.after), vector(at.before)
+        z, after, before = memory.read("rows", at.z, shape.channels), vector(at.after), vector(at.before)
         next_before, noise = vector(at.end + at.before), vector(at.noise)
         noise_cov = square(at.noise_cov, symmetric=True)
         mean, F, without = vector(at.mean, n), square(at.slope), square(at.without)
         next_d, next_P = vector(at.end + at.d), square(at.end + at.cov, symmetric=True)
         adjoint = vector(at.pull) + without.T @ after
         estimate, step, shift = vector(at.estimate, n), vector(at.step), d + P @ adjoint
-        half, jump, centred = step * 0.5, differences(model, mean, next_x), differences(model, vector(at.d, n), x)
-        arrival_P = reset_back(model, P, x, centred)
-        leaving = P @ memory.read("given", step_layout.adjoint, t) * -1.0
-        reached, reached_P = F @ updated_d + noise, sym(F @ updated_P @ F.T) + noise_cov
-        slopes = {}
-        if model.turns:  # from the tangent at f(X) to that at the next X
-            J = inverse_reset_slopes(next_x, jump, model.turns)
-            reached, reached_P, slopes = J @ reached, reset_back(model, reached_P, next_x, jump), {F: J @ F}
+        half, jump, begun = step * 0.5, differences(model, mean, next_x), vector(at.d, n)
+        centred, arrival_P = differences(model, begun, x), reset(model, P, begun, differences(model, x, begun))
+        left = move(model, x, P @ memory.read("given", step_layout.adjoint, t) * -1.0)
+        onwards, slopes = F, {}
+        if model.turns:  # the difference of the next X from f(X), by both
+            way = differences(model, next_x, mean)
+            onwards = inverse_reset_slopes(next_x, jump, model.turns) @ F
+            slopes = {F: reset_slopes(mean, way, model.turns) @ onwards}
+        reached, reached_P = onwards @ updated_d + noise, sym(onwards @ updated_P @ onwards.T) + noise_cov
+        if model.turns:
+            reached, reached_P = after_reset(model, reached, mean, way), reset(model, reached_P, mean, way)
         model.extras = {ACTING: memory.read("rows", row.extras, shape.feed)}
         results = tell(model, memory.x, memory.P, memory.z)
         model.extras = {ACTING: memory.read("given", step_layout.acting, shape.feed)}
@@ -241,7 +256,7 @@ def window_works(functions: Functions, shape: Shape, loss: str) -> Works:
             stored((move(model, x, half * -1.0), half), (estimate, step)),
             stored((F.T @ next_before,), (after,)),
             stored((noise + noise_cov @ next_before,), (vector(at.disturbance),)),
-            stored((move(model, x, leaving), reset(model, P, x, leaving)), (estimate, updated_P)),
+            stored((left, reset_back(model, P, left, differences(model, x, left))), (estimate, updated_P)),
         ]
 
     page = Page(extended.propagate, extended.add_process_noise, extended.update, own=OWN)

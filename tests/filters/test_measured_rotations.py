@@ -324,8 +324,7 @@ def test_a_pose_is_measured_whole():
 def test_what_cannot_measure_rotations_says_so():
     """In a line."""
     model = tracker_model()
-    takers = {*TAKE_ROTATIONS, *ENSEMBLES, *OTHERS} - {"mhe"}
-    for name in set(FILTERS) - {*takers, "fuzzy", "kf"}:
+    for name in set(FILTERS) - {*TAKE_ROTATIONS, *ENSEMBLES, *OTHERS, "fuzzy", "kf"}:
         with pytest.raises(
             ValueError, match="states and measurements must be numbers and angles here|must have an affine"
         ):
