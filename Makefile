@@ -28,7 +28,7 @@ ifeq ($(wildcard $(VENV)/[Ll]ib*/python*/site-packages/__editable__.thruster_env
 $(shell rm -f $(BASE) $(TEST) $(BENCH) $(DOCS))
 endif
 endif
-TIDY := $(BIN)/python -m thruster_env.core.modules
+TIDY := $(BIN)/python -c 'from thruster_env.core import modules; modules.tidy()'
 
 .PHONY: help demo test test-slow test-all bench docs fuzz lint clean
 .NOTPARALLEL:

@@ -226,6 +226,7 @@ def remove_leftovers(site: Path, checkout: Path) -> list[Path]:
     return removed
 
 
-if __name__ == "__main__":
+def tidy() -> None:
+    """Remove the leftovers of this environment, for the Makefile, which runs in the checkout."""
     for folder in remove_leftovers(Path(sysconfig.get_path("purelib")), Path.cwd()):
         print(f"removed {folder}, which an earlier installation left behind")

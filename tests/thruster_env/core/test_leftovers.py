@@ -71,4 +71,4 @@ def test_make_installs_again_where_a_copy_has_taken_the_place_of_the_checkout(tm
     assert "pip" not in planned()
     installed.unlink()  # as `pip install .` does
     again = planned()
-    assert "--no-build-isolation -e" in again and "-m thruster_env.core.modules" in again
+    assert "--no-build-isolation -e" in again and "modules.tidy()" in again
