@@ -68,7 +68,7 @@ def pytest_configure(config):
 def undrawn(monkeypatch):
     """Pictures of reports have their caption and text only: to draw them takes most of a page's time."""
     monkeypatch.setattr(
-        "tuning.reporting.search_figures.figure_svg", lambda _, name: (f'<svg data-name="{name}"></svg>', "")
+        "tuning.reporting.page.figure_svg", lambda _, name: (f'<svg data-name="{name}"></svg>', "")
     )
 
 

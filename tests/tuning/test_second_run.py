@@ -59,7 +59,7 @@ def posterior_variances(*given, **named):
     found["bounds"] += 1
     return computed(*given, **named)
 bound.posterior_variances = posterior_variances
-import tuning.reporting.search_figures as sketchbook
+import tuning.reporting.page as sketchbook
 from tuning.cli.main import main
 sketchbook.figure_svg = lambda *_: ("<svg></svg>", "")  # to draw takes most of a report's time
 for words in json.loads(sys.argv[1]):

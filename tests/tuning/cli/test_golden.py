@@ -57,7 +57,7 @@ STEPS = {  # in this order, in one folder: what a command writes, the next ones 
     "train-estimator": ["train-estimator --report page.txt"],
     "score": ["score --preset t200 nowhere"],
 }
-DRAW = "tuning.reporting.search_figures.figure_svg"  # slow
+DRAW = "tuning.reporting.page.figure_svg"  # slow
 CLOCK = SimpleNamespace(perf_counter=lambda: 0.0, process_time=lambda: 0.0)
 CLOCKS = ("evaluation.compare", "search.study", "search.trials", "methods.task", "identification.identify")
 
