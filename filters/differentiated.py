@@ -45,7 +45,7 @@ from thruster_env.model.shape import (
     constants_reader,
     starts_of,
 )
-from thruster_env.model.traced import MOST
+from thruster_env.model.traced import most_operations
 
 LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # summed over steps
 EXTENDED = ExtendedKalmanFilter.page
@@ -197,7 +197,7 @@ def recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page,
     try:
         model = Equations(functions, memory, constants_move=wanted.constants, trace=True)
         stages = stages_of(memory, model, wanted, page)
-        compiled = [as_programs(stage, memory.length, MOST) for stage in stages]
+        compiled = [as_programs(stage, memory.length, most_operations(shape)) for stage in stages]
         works = [callable_of(program, AT_ONCE) for programs in compiled for program in programs[:2]]
         at_once = AT_ONCE
     except Exception:  # a user's function cannot be traced, whatever it raises: it is called instead

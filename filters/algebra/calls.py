@@ -28,7 +28,7 @@ from thruster_env.core import matrices as matrix_functions
 from thruster_env.core.angles import NAMES, short_way
 from thruster_env.core.sources import Source, entrywise, is_array, matrix_of, tuple_of, written_out
 from thruster_env.graphs.programs import ARRAYS, Place
-from thruster_env.model.traced import MOST
+from thruster_env.model.traced import MOST_TURNING
 
 
 def arguments_of(matrix: Matrix) -> tuple[Matrix, ...]:
@@ -64,7 +64,7 @@ def _function(
     if operation not in _FUNCTIONS and operation.compute.__module__ == tangents.__name__:
         raise ValueError(
             "a filter of rotations must have functions that can be traced, and a prediction and an update of at "
-            f"most {MOST} operations each, but this one has not: use 'ekf', fewer states, measurements or "
+            f"most {MOST_TURNING} operations each, but this one has not: use 'ekf', fewer states, measurements or "
             "iterations, and loops of known lengths"
         )
     if operation not in _FUNCTIONS:

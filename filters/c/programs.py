@@ -34,7 +34,7 @@ from thruster_env.graphs.graphs import Graph, TooLarge
 from thruster_env.graphs.programs import BY_MEMBERS, Place, Program, program_of, work_names
 from thruster_env.model.shape import LANES, Shape, padded
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.traced import MOST, Traced
+from thruster_env.model.traced import Traced, most_operations
 
 KEYWORDS = frozenset(  # of C99 to C23 and C++20, and tokens that C++ writes as words
     "alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class "
@@ -171,7 +171,12 @@ def _row_programs(paged: FilterWithPage) -> FilterPrograms:
     ]
     means = ["filter->x"] * 2 + ["x" if points else "filter->x"] + ["filter->x"] * 2
     start, represent, propagate, add_process_noise, update = (
-        _program({Place("rows", at): matrix for at, matrix in stage.items()}, lies, numbers, Graph(MOST))
+        _program(
+            {Place("rows", at): matrix for at, matrix in stage.items()},
+            lies,
+            numbers,
+            Graph(most_operations(shape)),
+        )
         for stage, mean, argument in zip(stages, means, "uuuuz", strict=True)
         for lies in [_where(shape, mean, argument, extra_parts, points)]
     )
@@ -192,7 +197,7 @@ def _member_programs(paged: EnsembleFilter) -> FilterPrograms:
     extra_parts = [(extra.operation.at, extra.shape, f"filter->{name}") for name, extra in memory.extras.items()]
     represent = Program([], [], [])
     start, propagate, add_process_noise, update, summarise = (
-        _program(dict(stages[name].stores[0]), lies, numbers, Graph(MOST, size))
+        _program(dict(stages[name].stores[0]), lies, numbers, Graph(most_operations(shape), size))
         for name, argument in (
             ("start", "u"),
             ("propagate", "u"),

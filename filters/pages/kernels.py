@@ -39,7 +39,7 @@ from thruster_env.graphs.programs import (
     program_of,
 )
 from thruster_env.model.shape import LANES, Functions, Shape, constants_reader
-from thruster_env.model.traced import MOST
+from thruster_env.model.traced import MOST, most_operations
 
 OF_PARAMETER = ("change", "move")  # arrays that differ between parameters
 FREE = ("given", "constant", *CONDITIONS)  # operations whose results are in memory, or cannot be stored as floats
@@ -202,7 +202,8 @@ def programs_of(
     try:
         memory, model = _memory_and_model(page, functions, shape, trace=True)
         # The update, the largest stage, comes first: if it is too large, no time is spent on the others.
-        programs = [as_programs(stage, 0, MOST).values for stage in stages(memory, model)[::-1]][::-1]
+        most = most_operations(shape)
+        programs = [as_programs(stage, 0, most).values for stage in stages(memory, model)[::-1]][::-1]
         works = [callable_of(program, 1, OF_STEPS) for program in programs]
         return Programs(memory, works, tuple(callable_of(program, LANES, OF_STEPS) for program in programs))
     except Exception:  # whatever a user's function raises if it gets Numbers: then it is called instead

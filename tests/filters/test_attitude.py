@@ -17,6 +17,7 @@ from filters.bounds import path_bound
 from filters.c.project import c_filter, write_filter, write_project
 from filters.consistency.report import consistency_report
 from filters.estimators.foreign import Estimator, ForeignFilter
+from filters.named import model_named
 from filters.registry import FILTERS
 from filters.sensitivity import ModelSlopes, sensitivity, state_score
 from filters.starts import begun_at
@@ -520,9 +521,39 @@ def until_small(x, u, c):
 def test_a_model_that_is_too_large_or_cannot_be_traced_is_refused_by_a_rule():
     """Operations on rotations are parts of programs alone."""
     with pytest.raises(
-        ValueError, match="a filter of rotations must have functions that can be traced, and .* 30000"
+        ValueError, match="a filter of rotations must have functions that can be traced, and .* 300000"
     ):
         filters.ExtendedKalmanFilter(model=attitude_model().replace(transition=until_small)).kernels()
+
+
+def test_tables_and_pictures_of_runs_have_angles_in_degrees(data):
+    _, u, z = data
+    estimates = filters.run(filters.ExtendedKalmanFilter(model=attitude_model()), inputs=u[0], measurements=z[0])
+    table, q = estimates.to_frame(), estimates.means[:, :4]
+    yaw = Turned.from_quat(q, scalar_first=True).as_euler("ZYX", degrees=True)[:, 0]
+    np.testing.assert_allclose(table["yaw_deg"], yaw, atol=1e-9)
+    assert (table["std_yaw_deg"] > 0.0).all() and table.index.name == "time_s"
+    assert len(estimates.plot().axes) > 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ekf", "iekf"])
+def test_attitude_by_name_is_smoothed(name):
+    """Its twelve errors need more operations than models of numbers may have."""
+    model = model_named("attitude")(dt=0.01)
+    rng, world = np.random.default_rng(0), Turned.from_rotvec([0.2, -0.1, 0.5])
+    still = np.zeros(model.n)
+    still[:4] = world.as_quat(scalar_first=True)
+    z = np.array(model.observe(still, model.constants))
+    z = z + rng.normal(size=(200, 6)) * np.sqrt(np.diag(model.measurement_noise_cov))
+    data = {"inputs": np.zeros((199, 3)), "measurements": z}
+    filter_ = filters.make_filter(name, model)
+
+    def error(estimates):
+        return (world.inv() * Turned.from_quat(estimates.means[20:, :4], scalar_first=True)).magnitude()
+
+    filtered, smoothed = error(filters.run(filter_, **data)), error(filters.smooth(filter_, **data))
+    assert np.sqrt(np.mean(smoothed**2)) < np.sqrt(np.mean(filtered**2)) < np.deg2rad(5.0)
 
 
 def test_every_other_path_refuses_them():
@@ -531,7 +562,6 @@ def test_every_other_path_refuses_them():
     data = {"inputs": np.zeros((2, 3)), "measurements": np.zeros((3, 6))}
     batch = {name: np.tile(part, (2, 1, 1)) for name, part in data.items()}
     refusals = (
-        lambda: filters.run(filter_, **data).to_frame(),
         lambda: filters.smooth(filters.EnsembleKalmanFilter(model=model), **data),
         lambda: filters.EnsembleTransformFilter(model=model, rotations=1).kernels(),
         lambda: c_filter(filters.EnsembleKalmanFilter(model=model), "a"),

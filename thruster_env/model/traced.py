@@ -39,7 +39,13 @@ from thruster_env.graphs.tracing import traced
 from thruster_env.model.shape import Functions, Shape, constants_are_array
 
 MOST = 30_000  # operations of a stage; with more, programs without calls take longer to compile than calls
+MOST_TURNING = 300_000  # of a model with rotations, directions or poses, whose steps have no calls
 POINTS = ((0.1, 0.5), (1.0, 1.0), (1.0, 2.5), (10.0, 4.0))  # magnitudes and phases, where graphs are compared
+
+
+def most_operations(shape: Shape) -> int:
+    """How many operations a program of a filter's stage may have."""
+    return MOST_TURNING if shape.turns or shape.measured_turns else MOST
 
 
 @lru_cache(maxsize=64)

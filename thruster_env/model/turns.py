@@ -204,8 +204,8 @@ def refuse_rotations(model: Any) -> None:
         what = " and ".join(["states"] * bool(model.turns) + ["measurements"] * bool(model.measured_turns))
         raise ValueError(
             f"{what} must be numbers and angles here, but {names} {'is' if len(turns) == 1 else 'are'} of "
-            f"{kinds}: 'ekf', 'iekf', 'ukf', 'ckf', their kin, 'enkf', 'pf' and 'imm' take these, in filters.run, "
-            "sessions, C, EstimateState and problems; tensors do not"
+            f"{kinds}: filters.run, sessions, C, EstimateState and problems take these for 'ekf', 'iekf', 'ukf', "
+            "'ckf', their kin, 'enkf', 'pf' and 'imm'"
         )
 
 
