@@ -209,7 +209,7 @@ class Filter:
                     f"but got another {name}: make the filter for a model with it"
                 )
 
-    def session(self, gate: float | None = None) -> Running:
+    def session(self, gate: float | None = None, most: int | None = None) -> Running:
         """A session: this filter running in place on one belief, some ten times as fast as `predict` and `update`.
 
             session.start()
@@ -218,11 +218,12 @@ class Filter:
             session.mean, session.cov
 
         With a gate, a channel whose innovation is beyond so many standard deviations of S is left out of a step,
-        as if it were missing; `rejected` counts these, (m,).
+        as if it were missing; `rejected` counts these, (m,). After `most` in a row, the next ones count
+        until one is within the gate again, as the channel has jumped.
 
-        Raises ValueError for a gate that is not a positive number.
+        Raises ValueError for a gate that is not a positive number, or `most` below 1.
         """
-        return Session(self) if gate is None else GatedSession(self, gate)
+        return Session(self) if gate is None else GatedSession(self, gate, most)
 
     def live(self, **options: Any) -> Live:
         """This filter on real clocks, with steps of any length and each sensor at its own times; see `Live`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from math import isfinite, prod
+from math import inf, isfinite, prod
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -20,7 +20,7 @@ from filters.engine.belief import (
     vector_like,
 )
 from filters.engine.compile import PREDICT, REFUSED, START, UPDATE, new_memory, operation_on
-from thruster_env.core.checks import covariance, finite, positive
+from thruster_env.core.checks import at_least, covariance, finite, positive
 from thruster_env.logs.log import sample_time_place
 from thruster_env.model.continuous import same_dt
 from thruster_env.model.shape import with_root
@@ -438,18 +438,21 @@ class Session:
 class GatedSession(Session):
     """A session whose steps leave out channels with |v_i| > gate sqrt(S_ii), as if they were missing.
 
+    With `most`, the next measurements of a channel count after so many in a row were left out: it has jumped.
+
     Attributes:
         rejected: how often each channel was left out so far, (m,).
 
     Source: Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation, 3.6.
     """
 
-    def __init__(self, filter_: Filter, gate: float):
+    def __init__(self, filter_: Filter, gate: float, most: int | None = None):
         super().__init__(filter_)
-        self.gate = positive("gate", gate)
+        self.gate, self.most = positive("gate", gate), inf if most is None else at_least("most", most, 1)
         if not filter_.has_covariance:
             raise ValueError(f"a gate needs a filter with a covariance, but {filter_.name!r} has none")
         self.rejected = np.zeros(len(self.innovation), dtype=int)
+        self._in_a_row = np.zeros(len(self.innovation), dtype=int)
         self._kept = tuple(part.copy() for part in self._memory)
 
     def step(self, u, z) -> None:
@@ -460,6 +463,8 @@ class GatedSession(Session):
             saved[...] = part
         self.divergences = self._operate(UPDATE)
         far = np.abs(self.innovation) > self.gate * np.sqrt(self.innovation_cov.diagonal())
+        self._in_a_row[:] = np.where(far, self._in_a_row + 1, np.where(self.innovation == 0.0, self._in_a_row, 0))
+        far &= self._in_a_row <= self.most
         if far.any():
             for saved, part in zip(self._kept, self._memory, strict=True):
                 part[...] = saved
@@ -469,11 +474,11 @@ class GatedSession(Session):
 
     def __getstate__(self) -> tuple:
         """The state of a session, the gate, and the counts."""
-        return super().__getstate__(), self.gate, self.rejected
+        return super().__getstate__(), self.gate, self.most, self.rejected, self._in_a_row
 
     def __setstate__(self, state: tuple) -> None:
-        of_session, gate, rejected = state
+        of_session, gate, most, rejected, in_a_row = state
         filter_, divergences, arrays = of_session
-        GatedSession.__init__(self, filter_, gate)
+        GatedSession.__init__(self, filter_, gate, None if most == inf else most)
         self._go_on(divergences, arrays)
-        self.rejected[:] = rejected
+        self.rejected[:], self._in_a_row[:] = rejected, in_a_row

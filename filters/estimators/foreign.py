@@ -396,7 +396,7 @@ class ForeignFilter(Filter):
     def _no_filter(self) -> ValueError:
         return ValueError(f"this needs a filter of filters.FILTERS, but got the estimator {self.name!r}")
 
-    def session(self, gate: float | None = None) -> EstimatorSession:
+    def session(self, gate: float | None = None, most: int | None = None) -> EstimatorSession:
         """The estimator on one trajectory; ValueError for a gate, which it would need to have itself."""
         if gate is not None:
             raise ValueError(f"a gate needs a filter of filters.FILTERS, but got {self.name!r}")

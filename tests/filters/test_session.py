@@ -230,6 +230,11 @@ def test_a_gate_leaves_out_channels_that_are_too_far(name):
         one.step([0.3], [0.2, 80.0])
     np.testing.assert_array_equal(other.mean, session.mean)
     assert other.rejected.tolist() == [1, 1]
+    follows = filter_.session(gate=4.0, most=2)
+    follows.start((3, 4), [0.0, 0.0])
+    for z in ([50.0, 0.1], [np.nan, 0.1], [50.0, 0.1], [50.0, 0.1]):
+        follows.step([0.3], z)
+    assert follows.rejected.tolist() == [2, 0] and abs(follows.mean[0]) > 5.0
     with pytest.raises(ValueError, match="gate must be positive, but got 0"):
         filter_.session(gate=0.0)
     with pytest.raises(ValueError, match="a gate needs a filter with a covariance, but 'open-loop'"):

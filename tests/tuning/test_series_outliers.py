@@ -62,6 +62,30 @@ def test_bursts_and_outliers_among_the_first_numbers_are_left_out():
     assert rows_left_out(fit) == [0, 2, *range(100, 106), *range(300, 304)] and not fit.jumps
 
 
+def test_few_outliers_are_left_out_whichever_model_and_numbers_they_come_with():
+    """Beside a gap or a jump, many that hide each other, of rounded numbers, and of a model that does not fit."""
+    z, times = walk(), np.arange(ROWS)
+    gap, jump = z.copy(), z.copy()
+    gap[100] += 50.0
+    gap[101:125] = np.nan
+    jump[300:] += 8.0
+    jump[306] += 100.0
+    rounded = np.round(60.0 + walk(7))
+    sine = 100.0 + 20.0 * np.sin(0.02 * times) + 0.3 * np.random.default_rng(1).normal(size=ROWS)
+    doubled = np.random.default_rng(2).random(ROWS) < 0.02
+    many = np.random.default_rng(3).random(ROWS) < 0.15
+    for numbers, off, most in (
+        (gap, times == 100, 0.11),
+        (jump, times == 306, 0.12),
+        (np.where(doubled, 2.0 * rounded, rounded), doubled, 0.3),
+        (np.where(many, 2.0 * rounded, rounded), many, 0.3),
+        (np.where(doubled, 2.0 * sine, sine), doubled, 0.11),
+    ):
+        fit = tuning.fit(numbers, dt=0.1, model="constant")
+        rows = set(rows_left_out(fit))
+        assert rows >= set(np.flatnonzero(off)) and len(rows) <= off.sum() + 1 and fit.r < most
+
+
 def test_an_axis_and_unequal_steps_have_outliers_of_their_own():
     rng = np.random.default_rng(1)
     times = np.cumsum(rng.uniform(0.05, 0.15, size=ROWS))
@@ -70,13 +94,16 @@ def test_an_axis_and_unequal_steps_have_outliers_of_their_own():
     fit = tuning.fit(z, times=times, model="constant")
     assert np.argwhere(~np.isnan(fit.left_out)).tolist() == [[50, 0], [400, 1], [401, 1]]
     assert 0.07 < fit.r < 0.11
+    assert "600 numbers" in str(fit) and "3 outliers left out" in str(fit) and "missing" not in str(fit)
 
 
 def test_a_record_that_does_not_return_jumps():
     z = walk()
     z[250:] += 8.0
     fit = tuning.fit(z, dt=0.1, model="constant")
-    assert [row for row, _ in fit.jumps] == [250] and fit.left_out is None
+    (row, height), *further = fit.jumps
+    assert row == 250 and not further and fit.left_out is None
+    assert height == pytest.approx(8.0 / math.sqrt(fit.estimates.innovation_covs[0, 249, 0, 0]), rel=0.2)
     assert "The record jumps at row 250 (25 s), by " in " ".join(str(fit).split())
 
 
@@ -106,12 +133,14 @@ def test_lines_for_filterpy_leave_out_what_a_session_with_a_gate_does(fit):
     exec(setup, names)
     kf = names["kf"]
     kf.update(z[0])
-    for number in z[1:]:
+    for k, number in enumerate([*z[1:], *[100.0] * 60]):  # which jumps
         session.step([], [number])
-        exec(step.split("\n", 1)[1], {**names, "z": number})
+        exec(step.split("\n", 1)[1], names | {"z": number}, names)
         np.testing.assert_allclose(kf.x[:, 0], session.mean, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(session.mean, fit.estimates.means[0, -1], rtol=1e-9)
-    assert session.rejected == [len(rows_left_out(fit))]
+        if k == ROWS - 2:
+            np.testing.assert_allclose(session.mean, fit.estimates.means[0, -1], rtol=1e-9)
+            assert session.rejected == [len(rows_left_out(fit))]
+    assert session.mean == pytest.approx(100.0, rel=1e-3)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="the lines of C need a compiler")
@@ -127,6 +156,6 @@ def test_lines_for_a_controller_leave_outliers_out_and_follow_a_jump(fit, tmp_pa
         states.append(library.state())
     off = np.array(states[50:]) - fit.estimates.means[0, 50:, 0]
     assert math.sqrt(float(np.mean(off**2))) < 0.02  # the gain is constant; the deviation of an estimate is 0.16
-    for _ in range(40):
-        library.filter(100.0)
+    for number in [math.nan] * 20 + [100.0] * 60:
+        library.filter(number)
     assert library.state() == pytest.approx(100.0, rel=1e-3)

@@ -28,7 +28,7 @@ from tuning.likelihood.ascent import climb
 from tuning.series.column import Column, seconds_text
 from tuning.series.fit import CANDIDATES, Candidate, Choice, Number, behind, choose, filtered
 from tuning.series.likelihood import ColumnLikelihood, R, model_of
-from tuning.series.paste import ARDUINO, lines_of
+from tuning.series.paste import ARDUINO, BURST, lines_of
 
 if TYPE_CHECKING:
     import pandas
@@ -326,7 +326,7 @@ class SeriesFit(Result):
                 f"{who} ({where}), beyond {self.gate:g} standard deviations of the prediction: Q and R are those "
                 "of the others.",
                 f"So a filter has to leave out outliers, too, as the lines of --code do, fit.filter.session("
-                f"gate={self.gate:g}), and the filter ekf-robust.",
+                f"gate={self.gate:g}, most={BURST}), and the filter ekf-robust.",
             ]
         if self.jumps:
             row, height = max(self.jumps, key=lambda jump: abs(jump[1]))
@@ -373,10 +373,8 @@ class SeriesFit(Result):
         """Half a page for the terminal: the model, its numbers with intervals, and what they mean."""
         column, first = self.column, []
         count = int(column.measured.any(axis=1).sum())
-        outliers = 0
-        if self.left_out is not None:
-            outliers = int((~np.isnan(self.left_out) & ~column.measured).any(axis=1).sum())
-        missing = len(column.values) - count - outliers
+        off = np.zeros(column.measured.shape, bool) if self.left_out is None else ~np.isnan(self.left_out)
+        outliers, missing = int(off.any(axis=1).sum()), int((~(column.measured | off)).all(axis=1).sum())
         names = ", ".join(quantity.short_label for quantity in column.quantities)
         apart, step = f"one each {_step_text(column.dt)}", "per step"
         if column.stamps is not None:

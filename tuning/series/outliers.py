@@ -34,6 +34,7 @@ MOST = 0.25  # share of the numbers that may be outliers
 RETURNED = 0.7  # of an outlier's height, above which the number after it has not returned
 ROUNDS = 8  # of leaving out and fitting one model again
 OF_MEDIANS = 8.0  # medians of the distance from neighbours, beyond which a number is far from them
+SMALL = 0.33  # median of normalised innovations about their median, half of that of normal noise
 SETTLING = 500  # rows after which a filter has settled
 CHOICES = 2  # of the model again, without outliers
 REGULAR = 0.1  # deviation of the times between peaks, in their mean, below which they are signal
@@ -58,7 +59,8 @@ def without_outliers(column: Column, fit: Callable[[Column], SeriesFit]) -> Seri
 
     All numbers count if more than `MOST` of them are outliers, if outliers come at regular times, if the others
     do not vary, or if the model does not fit these: then it predicts too poorly to tell outliers from a course
-    that it misses.
+    that it misses, but for those also far from the median of their neighbours,
+    unless most of a stretch are: that has another variance.
 
     Args:
         column: the numbers.
@@ -66,40 +68,70 @@ def without_outliers(column: Column, fit: Callable[[Column], SeriesFit]) -> Seri
     """
     of_all = fit(column)
     far = far_of_all = far_from(of_all.chosen, of_all.level, column)
-    if not far.outliers.any():
+    if not (far.outliers.any() or far.jumps or _hides_many(of_all)):
+        return of_all
+    off = far_from_medians(column)
+    answer, first = of_all, far.outliers | off
+    if not first.any():
         return replace(of_all, jumps=far.jumps)
-    answer, first = of_all, far.outliers | far_from_medians(column)
     try:
         for _ in range(CHOICES):
-            outliers = _settled(answer.chosen, column, first)
-            _check_irregular(column.times[outliers.any(axis=1)])
-            answer = fit(column.without(outliers))
-            far = far_from(answer.chosen, answer.level, column)
+            outliers = _settled(answer.chosen, column, first, off)
+            answer, far = _fit_without(outliers, column, fit, off)
             first = far.outliers
             if (first == outliers).all():
                 break
-        if not answer.is_wrong:
-            values = np.where(outliers, column.table, np.nan) if outliers.any() else None
-            return replace(answer, left_out=values, gate=far.gate, jumps=far.jumps)
-        reason = "without them no model that was tried fits"
+        certain = outliers & off
+        if answer.is_wrong and certain.any() and not _are_together(off):
+            outliers = certain
+            answer, far = _fit_without(outliers, column, fit, off)
+        elif answer.is_wrong:
+            raise NoOutliersError("without them no model that was tried fits")
+        if not outliers.any():
+            return replace(of_all, jumps=far_of_all.jumps)
+        values = np.where(outliers, column.table, np.nan)
+        return replace(answer, left_out=values, gate=far.gate, jumps=far.jumps)
     except NoOutliersError as error:
         reason = str(error)
     except ValueError:  # of the fit
         reason = "without them the others do not vary"
-    count = int(far_of_all.outliers.sum())
+    answer, what = replace(of_all, jumps=far_of_all.jumps), "the prediction"
+    if not far_of_all.outliers.any():
+        if far.jumps:
+            return answer
+        what = "their neighbours"
+    count = int((far_of_all.outliers if far_of_all.outliers.any() else off).sum())
     numbers = "1 number is" if count == 1 else f"{count} numbers are"
-    peaks = f"{numbers} far from the prediction, but part of the fit: {reason}."
-    return replace(of_all, jumps=far_of_all.jumps, peaks=peaks)
+    return replace(answer, peaks=f"{numbers} far from {what}, but part of the fit: {reason}.")
+
+
+def _fit_without(
+    outliers: np.ndarray, column: Column, fit: Callable[[Column], SeriesFit], off: np.ndarray
+) -> tuple[SeriesFit, Far]:
+    """The fit without outliers, and what is far from that, unless they come at regular times."""
+    rows = np.flatnonzero(outliers.any(axis=1))
+    _check_irregular(rows, column.times[rows])
+    answer = fit(column.without(outliers))
+    return answer, far_from(answer.chosen, answer.level, column, off)
+
+
+def _hides_many(fit: SeriesFit) -> bool:
+    """Whether so many outliers made S so large that none of them is far: then most innovations are small.
+
+    Of normal noise, half of them are within 0.67 standard deviations of their median.
+    """
+    variances = np.diagonal(fit.estimates.innovation_covs[0], axis1=1, axis2=2)
+    normalised = (fit.estimates.innovations[0] / np.sqrt(variances))[fit.column.counted(fit.model)]
+    return bool(np.median(np.abs(normalised - np.median(normalised))) < SMALL)
 
 
 class NoOutliersError(ValueError):
     """Numbers far from their prediction are no outliers, for a reason."""
 
 
-def _check_irregular(times: np.ndarray) -> None:
-    """Raise NoOutliersError for peaks at regular times [s]."""
-    apart = np.diff(times)
-    apart = apart[apart > 0.5 * apart.mean()] if len(apart) else apart  # of bursts, one for each
+def _check_irregular(rows: np.ndarray, times: np.ndarray) -> None:
+    """Raise NoOutliersError for peaks in rows at regular times [s]."""
+    apart = np.diff(times[np.diff(rows, prepend=-2) > 1])  # of bursts, the first of each
     if len(apart) >= 6 and apart.std() < REGULAR * apart.mean():
         raise NoOutliersError(f"they come each {seconds_text(float(apart.mean()))}, so they are signal")
 
@@ -109,16 +141,25 @@ def far_from_medians(column: Column) -> np.ndarray:
     far = np.zeros(column.table.shape, dtype=bool)
     for axis, measured in enumerate(column.measured.T):
         z = column.table[measured, axis]
-        windows = sliding_window_view(np.pad(z, BURST // 2, mode="edge"), 2 * (BURST // 2) + 1)
+        windows = sliding_window_view(np.pad(z, BURST, mode="reflect"), 2 * BURST + 1)
         off = np.abs(z - np.median(windows, axis=1))
-        far[measured, axis] = off > OF_MEDIANS * np.median(off)
+        scale = float(np.median(off))
+        if scale == 0.0 and off.any():  # of rounded numbers that stay: a digit
+            scale = float(off[off > 0.0].min())
+            off *= (off > OF_MEDIANS * scale).mean() < MOST
+        far[measured, axis] = off > OF_MEDIANS * scale
     return far
 
 
-def _settled(candidate: Candidate, column: Column, outliers: np.ndarray) -> np.ndarray:
+def _are_together(off: np.ndarray) -> bool:
+    """Whether most numbers of a stretch are far from their median."""
+    return any(np.convolve(axis, np.ones(4 * BURST)).max() > 2 * BURST for axis in off.T)
+
+
+def _settled(candidate: Candidate, column: Column, outliers: np.ndarray, off: np.ndarray) -> np.ndarray:
     """The outliers of one model, fitted without them again and again until they stay the same, (K, axes).
 
-    It begins without `outliers`, (K, axes).
+    It begins without `outliers`, (K, axes); `off` are those far from the median of their neighbours.
 
     Raises:
         NoOutliersError: if more than `MOST` of the numbers are outliers.
@@ -128,15 +169,16 @@ def _settled(candidate: Candidate, column: Column, outliers: np.ndarray) -> np.n
         if outliers.sum() > MOST * column.measured.sum():
             raise NoOutliersError(f"there are more than {100.0 * MOST:.0f} % of them")
         fitted = most_likely(model, column.without(outliers))
-        before, outliers = outliers, far_from(fitted.candidate, fitted.mean, column).outliers
+        before, outliers = outliers, far_from(fitted.candidate, fitted.mean, column, off).outliers
         if (before == outliers).all():
             break
     return outliers
 
 
-def far_from(candidate: Candidate, level: np.ndarray | None, column: Column) -> Far:
+def far_from(candidate: Candidate, level: np.ndarray | None, column: Column, off: np.ndarray | None = None) -> Far:
     """Outliers and jumps of a column under a fitted model; `level` is the mean about which it varies, if any.
 
+    Until the filter has followed a jump, outliers are those far from the median of their neighbours, `off`.
     Outliers among the first numbers, from which the filter learns its state, are those of the record backwards:
     all named models are the same in both directions.
     """
@@ -144,16 +186,22 @@ def far_from(candidate: Candidate, level: np.ndarray | None, column: Column) -> 
     begin, outliers = column.rows(0, SETTLING).backwards, np.zeros(column.table.shape, dtype=bool)
     backwards = _far(candidate, level, begin, outliers[:SETTLING]).outliers[::-1]
     outliers[:first] = backwards[:first]
-    return _far(candidate, level, column, outliers)
+    return _far(candidate, level, column, outliers, off)
 
 
-def _far(candidate: Candidate, level: np.ndarray | None, column: Column, outliers: np.ndarray) -> Far:
+def _far(
+    candidate: Candidate,
+    level: np.ndarray | None,
+    column: Column,
+    outliers: np.ndarray,
+    off: np.ndarray | None = None,
+) -> Far:
     named, values = named_model(candidate.name), candidate.values
     model = model_of(named, column, values, level)
     signal = named.signal(_signal_values(candidate))
     counted = column.counted(model)
     gate = math.ceil(-10.0 * float(ndtri(0.5 * LEVEL / max(counted.sum(), 1)))) / 10.0
-    settled, heights = outliers.copy(), np.zeros(counted.shape)
+    settled, heights, relative = outliers.copy(), np.zeros(counted.shape), np.zeros(counted.shape)
     outliers = outliers.copy()
     jumps = list[tuple[int, float]]()
     for _ in range(4 * BURST):
@@ -167,13 +215,22 @@ def _far(candidate: Candidate, level: np.ndarray | None, column: Column, outlier
                     continue
                 height, next_far = heights[begin, axis], end < len(far) and far[end, axis]
                 stays = end < len(far) and not next_far and innovations[end, axis] / height > RETURNED
-                if stays or end - begin > BURST:
-                    outliers[begin:end, axis], settled[begin : end + BURST, axis] = False, True
-                    far[begin : end + BURST, axis] = False
-                    jumps.append((begin, float(height / deviations[begin, axis])))
+                if stays or outliers[begin:end, axis].sum() > BURST:
+                    settled[begin : end + BURST, axis], far[begin : end + BURST, axis] = True, False
+                    while end < len(far) and (settled[end, axis] or outliers[end, axis]):
+                        end += 1  # what was far after it was so because of it
+                    outliers[begin:end, axis] = False
+                    if off is not None:
+                        after = column.table[begin:end, axis]
+                        apart = np.abs(after - np.nanmedian(after)) > 0.5 * abs(height)
+                        outliers[begin:end, axis] = off[begin:end, axis] & apart
+                    jumps.append((begin, float(relative[begin, axis])))
             rows = np.flatnonzero(far[:, axis])
-            rows = rows[np.diff(rows, prepend=-2 * BURST) > BURST]  # those after it may be far because of it
+            order = np.cumsum(column.measured[:, axis])[rows]
+            alone = np.diff(order, prepend=-2 * BURST) > BURST  # those after it may be far because of it
+            rows = rows[alone if off is None else alone | off[rows, axis]]
             outliers[rows, axis], heights[rows, axis] = True, innovations[rows, axis]
+            relative[rows, axis] = innovations[rows, axis] / deviations[rows, axis]
             far[:, axis] = False
             far[rows, axis] = True
         if not far.any():

@@ -38,7 +38,7 @@ def lines_of(language: str, model: AffineModel, gain: np.ndarray, dt: float, gat
 def _python(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
     a, _, _, c, d = model.matrices()
     session = f"""
-session = filter_.session(gate={gate})  # it leaves outliers out
+session = filter_.session(gate={gate}, most={BURST})  # it leaves outliers out, at most {BURST} in a row
 session.start()
 # session.update(z[0]), then session.step([], z) for each further one: session.mean, session.cov"""
     return f"""import numpy as np
@@ -58,11 +58,14 @@ filter_ = filters.make_filter("kf", filters.affine_model(
 
 def _filterpy(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
     a, _, _, c, d = model.matrices()
-    far, or_far = "", ""
+    begin, far, or_far = "", "", ""
     if gate is not None:
         deviations = "np.sqrt(np.diag(kf.H @ kf.P @ kf.H.T + kf.R))"
-        far = f"far = abs(np.reshape(z{_less(d)}, (-1, 1)) - kf.H @ kf.x)[:, 0] > {gate} * {deviations}\n"
-        or_far = " or far.any()"
+        begin = f"in_a_row = np.zeros({model.m})  # outliers; after {BURST} the level is another one\n"
+        far = f"""far = abs(np.reshape(z{_less(d)}, (-1, 1)) - kf.H @ kf.x)[:, 0] > {gate} * {deviations}
+in_a_row = np.where(np.isnan(z), in_a_row, np.where(far, in_a_row + 1, 0))
+"""
+        or_far = f" or (far & (in_a_row <= {BURST})).any()"
     return f"""import numpy as np
 from filterpy.kalman import KalmanFilter
 
@@ -73,7 +76,7 @@ kf.Q = np.array({_rows(model.process_noise_cov)})
 kf.R = np.array({_rows(model.measurement_noise_cov)})
 kf.x = np.array([{_numbers(model.prior_mean)}]).T
 kf.P = np.array({_rows(model.prior_cov)})
-# the first measurement updates the state at once: kf.update(z[0]{_less(d)}), then for each further one
+{begin}# the first measurement updates the state at once: kf.update(z[0]{_less(d)}), then for each further one
 kf.predict()
 {far}kf.update(None if np.isnan(z).any(){or_far} else z{_less(d)})"""
 
@@ -100,21 +103,27 @@ def _matlab(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
     a, _, _, c, d = model.matrices()
     z, offset = "z(:, k)" if model.m > 1 else "z(k)", _matlab_rows(d[:, None]) if model.m > 1 else _number(d[0])
     less = f" - {offset}" if d.any() else ""
-    near = "" if gate is None else f" && all(abs(v) <= {gate}*sqrt(diag(S)))"
+    begin, far, near = "", "", ""
+    if gate is not None:
+        begin = f"in_a_row = zeros({model.m}, 1);  % outliers in a row; after {BURST} the level is another one\n"
+        far = f"""    far = abs(v) > {gate}*sqrt(diag(S));
+    in_a_row = far.*(in_a_row + 1) + isnan(v).*in_a_row;
+"""
+        near = f" && ~any(far & in_a_row <= {BURST})"
     return f"""F = {_matlab_rows(a)};
 H = {_matlab_rows(c)};
 Q = {_matlab_rows(model.process_noise_cov)};
 R = {_matlab_rows(model.measurement_noise_cov)};
 x = {_matlab_rows(model.prior_mean[:, None])};
 P = {_matlab_rows(model.prior_cov)};
-for k = 1:{"size(z, 2)" if model.m > 1 else "numel(z)"}
+{begin}for k = 1:{"size(z, 2)" if model.m > 1 else "numel(z)"}
     if k > 1
         x = F*x;
         P = F*P*F' + Q;
     end
     v = {z} - H*x{less};
     S = H*P*H' + R;
-    if ~any(isnan(v)){near}
+{far}    if ~any(isnan(v)){near}
         K = P*H'/S;
         x = x + K*v;
         P = (eye({model.n}) - K*H)*P*(eye({model.n}) - K*H)' + K*R*K';
@@ -155,9 +164,10 @@ def _arduino(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
     if gate is not None:  # v = 0 for outliers, but after some in a row the level is another one
         s = np.diag(model.measurement_noise_cov) / (1.0 - np.einsum("ji,ij->j", c, gain))
         for j, (difference, limit) in enumerate(zip(v, gate * np.sqrt(s), strict=True)):
+            is_missing = f"if ({difference} != {difference}) {difference} = 0.0; else"
             is_near = f"{difference} < {_c(limit)} && {difference} > -{_c(limit)}"
             skip = f"{{ far{j + 1}++; {difference} = 0.0; }}"
-            lines.append(f"  if ({is_near}) far{j + 1} = 0; else if (far{j + 1} < {BURST}) {skip}")
+            lines.append(f"  {is_missing} if ({is_near}) far{j + 1} = 0; else if (far{j + 1} < {BURST}) {skip}")
     lines += [
         f"  {x} = {_products(np.array([1.0, *row]), [before, *v])};"
         for x, before, row in zip(names, p, gain, strict=True)
