@@ -40,7 +40,7 @@ from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.logs.columns import OUTPUT, STATE, plain, suffix
 from thruster_env.logs.findings import GAP, OUTLIER, SPOILING, sentences
 from thruster_env.model import rotations
-from thruster_env.model.euler import EulerAngle
+from thruster_env.model.euler import EulerAngle, euler_outputs
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.simulate import inputs_until
 
@@ -470,9 +470,9 @@ def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: 
     the innovations marks the first alarm of an episode, which is shaded.
     """
     model, references, colour = estimate.model, compared(estimate), colour_of(estimate.filter.name)
-    values = [f"{STATE}:{quantity.symbol}" for quantity in model.states] + [
-        f"{OUTPUT}:{symbol}" for symbol in model.outputs
-    ]
+    attitude = [f"{OUTPUT}:{symbol}" for symbol in euler_outputs(model.turns, model.states)]
+    outputs = [key for symbol in model.outputs if (key := f"{OUTPUT}:{symbol}") not in attitude]
+    values = [*attitude, *(f"{STATE}:{quantity.symbol}" for quantity in model.states), *outputs]
     turned = {
         f"{STATE}:{state.symbol}" for turn in model.turns for state in model.states[turn.quaternion]
     }  # of which roll, pitch and yaw say more
