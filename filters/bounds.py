@@ -39,7 +39,6 @@ from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.traced import called_function
 from thruster_env.model.turns import (
     refuse_measured,
-    refuse_rotations,
     slopes_of_stored,
     slopes_of_tangent,
     tangent_of,
@@ -137,12 +136,12 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
         missing: whether each measurement is missing, (B, K + 1, m); none if None.
 
     Returns:
-        P_k for every sequence and step, (B, K + 1, n, n); index 0 is after the first measurement. NaN for a
-        sequence along which it is too large for float64.
+        P_k for every sequence and step, (B, K + 1, n, n), of rotations (B, K + 1, t, t) in their tangent; index 0
+        is after the first measurement. NaN for a sequence along which it is too large for float64.
     """
-    refuse_rotations(model)
+    refuse_measured(model, "a bound")
     inputs = np.ascontiguousarray(as_floats(inputs))
-    keys, nothing = np.zeros((len(inputs), 2)), np.zeros((model.n, model.n))
+    keys, nothing = np.zeros((len(inputs), 2)), np.zeros((model.t, model.t))
     rounding = 1e-30 * model.measurement_noise_cov  # none at all is no covariance of a measurement
     calm = model.replace(process_noise_cov=nothing, prior_cov=nothing, measurement_noise_cov=rounding)
     measured = simulate(calm, keys, inputs).measurements

@@ -13,7 +13,6 @@ from scipy.linalg import sqrtm
 from scipy.spatial.transform import Rotation as Turned
 
 import filters
-from filters.bounds import path_bound
 from filters.c.project import c_filter, write_filter, write_project
 from filters.consistency.report import consistency_report
 from filters.estimators.foreign import Estimator, ForeignFilter
@@ -557,7 +556,7 @@ def test_attitude_by_name_is_smoothed(name):
 
 
 def test_every_other_path_refuses_them():
-    """Smoothers, tensors, C, gradients, bounds, simulation, envs and models made of a model."""
+    """Smoothers, tensors, C, gradients and models made of a model."""
     model, filter_ = attitude_model(), filters.ExtendedKalmanFilter(model=attitude_model())
     data = {"inputs": np.zeros((2, 3)), "measurements": np.zeros((3, 6))}
     batch = {name: np.tile(part, (2, 1, 1)) for name, part in data.items()}
@@ -569,7 +568,6 @@ def test_every_other_path_refuses_them():
         lambda: ForeignFilter(model=model, estimator=Estimator()),
         lambda: filters.torch(filter_),
         lambda: write_project(filter_, "a folder"),
-        lambda: path_bound(model, data["inputs"][None]),
         lambda: filters.linearize(model, model.prior_mean, np.zeros(3)),
         lambda: filters.augmented_model(model, {0: filters.Unknown(0.1)}),
         lambda: filters.transformed_model(model, {"b_x": (-1.0, 1.0)}),

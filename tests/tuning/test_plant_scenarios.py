@@ -67,7 +67,7 @@ def brought(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name", slow_but([*SCENARIOS, "auv:dvl_dropout", "auv:estimated_current", "auv:papers"], QUICK)
+    "name", slow_but([*SCENARIOS, "auv:dvl_dropout", "auv:estimated_current", "auv:loop", "auv:papers"], QUICK)
 )
 def test_data_are_those_of_an_env_of_the_plant_with_the_same_seed(name):
     scenario = ALL[name].replace(**SHORT)

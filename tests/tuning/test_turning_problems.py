@@ -17,7 +17,9 @@ from thruster_env.model.simulate import simulate
 from thruster_env.model.turns import Rotation
 from tuning.evaluation.evaluate import check_consistency, evaluate
 from tuning.logs.problem import of_gyroscope
+from tuning.plants.auv import SCENARIOS as VEHICLES
 from tuning.problems.check import checked_problem
+from tuning.problems.find import read_scenario
 from tuning.problems.model_problem import ModelProblem, log_of
 
 DT, UP, NORTH = 0.1, (0.0, 0.0, 1.0), (0.0, 0.6, -0.8)
@@ -198,3 +200,41 @@ def test_the_trap_of_a_free_gyroscope():
     assert of_gyroscope(["dip"], wrong, [log]) == []
     (sentence,) = of_gyroscope(["gyroscope", "dip"], wrong, [log])
     assert sentence.startswith("Beware of gyroscope: innovations of acc_")
+
+
+def of_oracle(scenario, runs):
+    """The EKF that knows Q and R, on the seeds 0, 1, ..."""
+    return evaluate(
+        make_filter("ekf", scenario.model(**scenario.true)), scenario.data(range(runs)), scenario.scale
+    )
+
+
+def test_the_vehicle_loops_in_a_scenario():
+    """Its nose points up, then it lies on its back; the filter is consistent, near the bound along the path."""
+    scenario = VEHICLES["auv:loop"].replace(steps=180)
+    data = scenario.data(range(12))
+    q = np.moveaxis(data.states[..., 6:10], -1, 0)
+    assert (rotations.to_world(q, (1.0, 0.0, 0.0))[2].min(axis=1) < -0.99).all()
+    assert (rotations.to_world(q, UP)[2].min(axis=1) < -0.2).all()
+    evaluation = of_oracle(scenario, 12)
+    assert 10.0 < evaluation.nees.value < 14.5
+    rmse = [interval.value for interval in evaluation.rmse]
+    np.testing.assert_allclose(rmse[:6], scenario.bound(data)[:6], rtol=0.12)
+    with pytest.raises(ValueError, match="sensors must be one of"):
+        scenario.replace(attitude="euler").data([0])
+    with pytest.raises(ValueError, match="states of an attitude 'quaternion' must be one of motion, navigation"):
+        scenario.replace(states="current")
+
+
+@pytest.mark.slow
+def test_both_forms_of_the_vehicle_have_the_same_errors(tmp_path):
+    """On the same seeds, where pitch stays small: attitude, NEES and NIS; a file's scale is of nine errors."""
+    base = 'plant = "auv"\nbase = "auv:motion"\nattitude = "quaternion"\n'
+    (tmp_path / "turning.toml").write_text(base + "steps = 150\nfirst_scored_step = 50\n")
+    assert len(read_scenario(tmp_path / "turning.toml").scale) == 9
+    euler = VEHICLES["auv:navigation"].replace(steps=300)
+    first, second = (of_oracle(euler.replace(attitude=attitude), 12) for attitude in ("euler", "quaternion"))
+    pairs = [(part.nees.value, part.nis.value, part.output_rmse["U"].value) for part in (first, second)]
+    np.testing.assert_allclose(*pairs, rtol=3e-3)
+    angles = np.rad2deg(np.sqrt(sum(interval.value**2 for interval in first.rmse[6:9])))
+    assert second.output_rmse["q_angle"].value == pytest.approx(angles, rel=0.02)

@@ -528,7 +528,7 @@ def _timing(instrument: Instrument, dt: float) -> tuple[Effect, ...]:
 # A vehicle as data for JSON, for files that record their plant.
 
 
-ESSENTIAL = "preset", "parameters", "dt", "sensors", "propeller_torque"
+ESSENTIAL = "preset", "parameters", "dt", "sensors", "propeller_torque", "attitude"
 BOUNDS_AND_NOISE = "max_thrust", "max_plane", "process_noise_cov", "measurement_noise_cov"
 DISTURBANCES = "sensor_effects", "current", "propeller_lag", "plane_lag"
 ENTRIES = Entries(ESSENTIAL, (*ESSENTIAL, *BOUNDS_AND_NOISE, *DISTURBANCES), VehicleParameters._fields)
@@ -547,4 +547,4 @@ def check_same_plant(tuned_for: Mapping, plant: Plant, file: str | Path) -> list
         plant: where it is to be used.
         file: its path.
     """
-    return check_same(ENTRIES, tuned_for, plant_data(plant), file)
+    return check_same(ENTRIES, {"attitude": EULER, **tuned_for}, plant_data(plant), file)  # older files have none

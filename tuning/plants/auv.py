@@ -21,9 +21,12 @@ from thruster_env.auv.equations import simulate
 from thruster_env.auv.model import MODELS, model_of_plant, state_range
 from thruster_env.auv.paths import MANOEUVRES
 from thruster_env.auv.plant import (
+    ATTITUDES,
     DEFAULT_DT,
+    DEFAULT_MAX_THRUST,
     DEFAULT_PROCESS_NOISE,
     DEFAULT_PROPELLER_TORQUE,
+    EULER,
     MAX_CHANNELS,
     STATES,
     Plant,
@@ -32,6 +35,7 @@ from thruster_env.auv.plant import (
 from thruster_env.core.checks import one_of, positive, short_repr, vector
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.effects.effects import set_field
+from thruster_env.model.turns import tangent_of
 from tuning.problems.data import Data
 from tuning.problems.excitation import EXCITATIONS, Excitation, Levels
 from tuning.problems.find import find_in
@@ -100,6 +104,9 @@ class Scenario(PlantScenario):
         current: three velocities [m/s], or signals by direction.
         propeller_lag: time constant of the thrust [s], unknown to filters.
         plane_lag: time constant of both planes [s], unknown to filters.
+        max_thrust: thrusts are clipped to 0 and this [N].
+        attitude: "euler", or "quaternion" for a `Rotation` in the place of roll, pitch and yaw: "motion" has then
+            9 errors, and "navigation" 12, of which the scale is.
     """
 
     plant_kind = "auv"
@@ -118,12 +125,16 @@ class Scenario(PlantScenario):
     current: Sequence | Mapping = field(default_factory=dict)
     propeller_lag: float = 0.0
     plane_lag: float = 0.0
+    max_thrust: float = DEFAULT_MAX_THRUST
+    attitude: str = EULER
 
     __hash__ = PlantScenario.__hash__
 
     def own_checks(self) -> dict:
         """Noise, and the scale of the model's states."""
-        one_of("states", self.states, tuple(MODELS))
+        one_of("attitude", self.attitude, ATTITUDES)
+        known = tuple(MODELS) if self.attitude == EULER else ("motion", "navigation")
+        one_of("states" if self.attitude == EULER else "states of an attitude 'quaternion'", self.states, known)
         checked = {
             "scale": self.checked_scale(self.count),
             "process_noise_cov": vector("process_noise_cov", self.process_noise_cov, len(STATES)).tolist(),
@@ -131,7 +142,7 @@ class Scenario(PlantScenario):
         variances = self.measurement_noise_cov
         if variances is None:  # those of the instruments, so that the scenario lists them
             checked["measurement_noise_cov"] = np.diag(
-                make_plant(sensors=self.sensors).measurement_noise_cov
+                make_plant(sensors=self.sensors, attitude=self.attitude).measurement_noise_cov
             ).tolist()
             return checked
         if not isinstance(variances, list | tuple) or not 1 <= len(variances) <= MAX_CHANNELS:
@@ -141,8 +152,8 @@ class Scenario(PlantScenario):
 
     @property
     def count(self) -> int:
-        """Number n of the model's states."""
-        return MODELS[self.states].count
+        """Number of errors of the model's state: n, but 9 of "motion" with a quaternion, which has yaw."""
+        return max(MODELS[self.states].count, 6 if self.attitude == EULER else 9)
 
     @property
     def held(self) -> dict:
@@ -174,13 +185,14 @@ class Scenario(PlantScenario):
         noise.
         """
         exact, missing = model_of_plant(self.plant, states=self.states), np.isnan(data.seen.measurements)
-        total, scored, inputs = np.zeros(exact.n), data.scored, data.seen.inputs
+        total, scored, inputs = np.zeros(exact.t), data.scored, data.seen.inputs
+        angles = [error.angle for error in tangent_of(exact)]
         for first in range(0, len(data.seeds), RUNS_AT_ONCE):
             block = slice(first, first + RUNS_AT_ONCE)
             covs = path_bound(exact, inputs[block], missing[block])
             covs = covs[:, data.late] if data.counted is None else covs[scored[block]][None]
             variances = np.einsum("bkii->bki", covs)
-            total = total + wrapped_variances(variances, exact.shape.state_angles).sum(axis=(0, 1))
+            total = total + wrapped_variances(variances, angles).sum(axis=(0, 1))
         return np.sqrt(total / scored.sum())
 
     def make(self, seeds: tuple[int, ...]) -> Data:
@@ -192,8 +204,8 @@ class Scenario(PlantScenario):
         if self.states == "velocities":
             inputs = np.concatenate([commands, simulation.states[:, :-1, 6:8]], axis=2)
         all_states = np.concatenate([simulation.states, simulation.current], axis=2)
-        states = np.ascontiguousarray(all_states[..., : self.count])
         model = self.model()
+        states = np.ascontiguousarray(all_states[..., : model.n])
         outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
         measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # NaN: missing
         return Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
@@ -275,6 +287,31 @@ SCENARIOS: dict[str, Scenario] = {
             sensors="default",
             scale=NAVIGATION_SCALE,
             **MINUTE,
+        ),
+        Scenario(
+            name="auv:loop",
+            about="over the top: full thrust, nose up, with a quaternion and directions of gravity and field",
+            states="navigation",
+            sensors="vectors",
+            attitude="quaternion",
+            max_thrust=8.0,
+            excitation=Levels(low=(7.0, -0.26, 0.0), high=(8.0, -0.25, 0.0), shortest=60, longest=160),
+            steps=600,
+            first_scored_step=100,
+            scale=(
+                0.005464,
+                0.004079,
+                0.004273,
+                0.002325,
+                0.002198,
+                0.002109,
+                0.001813,
+                0.0009658,
+                0.001057,
+                0.01515,
+                0.01503,
+                0.004473,
+            ),
         ),
         Scenario(
             name="auv:usbl",

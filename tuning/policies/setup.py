@@ -24,7 +24,7 @@ from thruster_env.auv.env import SegorogeniAUVDepthEnv, SegorogeniAUVPathEnv
 from thruster_env.auv.model import MODEL_ARGUMENTS as AUV_MODEL_ARGUMENTS
 from thruster_env.auv.model import auv_model
 from thruster_env.auv.paths import DepthAndCourse
-from thruster_env.auv.plant import CRUISE_SPEED, STATES
+from thruster_env.auv.plant import CRUISE_SPEED, EULER, STATES
 from thruster_env.auv.plant import Plant as VehiclePlant
 from thruster_env.auv.plant import make_plant as make_vehicle
 from thruster_env.core.checks import at_least, one_of, positive, short_repr
@@ -253,7 +253,7 @@ THRUSTER = Thruster()
 
 
 def _may_learn(scenario: VehicleScenario) -> bool:
-    return scenario.dt >= SHORTEST_STEP and scenario.states != "velocities"
+    return scenario.dt >= SHORTEST_STEP and scenario.states != "velocities" and scenario.attitude == EULER
 
 
 class Vehicle(TrainingPlant):
@@ -295,8 +295,8 @@ class Vehicle(TrainingPlant):
     def check_scenario(self, scenario: PlantScenario) -> None:
         """Raise ValueError unless a scenario is one of the vehicle, with attitude in its model."""
         if not isinstance(scenario, VehicleScenario) or not _may_learn(scenario):
-            rule = f"scenario must be the vehicle's, with roll and pitch as states and dt from {SHORTEST_STEP} s"
-            raise ValueError(f"{rule}, but got {scenario.name!r}")
+            rule = "scenario must be the vehicle's, with roll and pitch, no quaternion, as states"
+            raise ValueError(f"{rule} and dt from {SHORTEST_STEP} s, but got {scenario.name!r}")
 
     def model(self, **arguments) -> StateSpaceModel:
         """What a filter assumes: `thruster_env.auv.model.auv_model`."""

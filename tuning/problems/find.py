@@ -90,7 +90,7 @@ def read_scenario(path: str | Path) -> PlantScenario:
     def make() -> PlantScenario:
         base = find_in(room.SCENARIOS, room.Scenario, content.pop(BASE, room.NOMINAL))
         changes = {"about": "", **content, "name": str(path)}
-        scenario = _checked(base.replace(**changes, scale=base.scale if scale is None else scale))
+        scenario = _checked(base.replace(**changes, scale=scale))
         if scale is not None:
             return scenario
         return scenario.replace(scale=tuple(scenario.computed_scale(FILE_SEQUENCES)))

@@ -59,7 +59,7 @@ class PlantScenario(Problem):
         scale_sequences: input sequences for the scale of a built-in scenario.
         name: its name; that of its file if it was read from one.
         about: one line for tables and help.
-        scale: by which the score divides the error of each state, fixed numbers.
+        scale: by which the score divides the error of each state, fixed numbers; None for 1.
         process_noise_cov: the plant's Q, one variance per step for each state; covariances do not scale with dt.
         measurement_noise_cov: the plant's R, one variance for each channel.
         parameter_factors: factors on the plant's parameters in the filter's model.
@@ -75,7 +75,7 @@ class PlantScenario(Problem):
     scale_sequences: ClassVar[int] = FILE_SEQUENCES
     name: str
     about: str = ""
-    scale: Sequence[float]
+    scale: Sequence[float] | None
     process_noise_cov: Sequence[float]
     measurement_noise_cov: float | Sequence[float] | None
     parameter_factors: Mapping[str, float] = field(default_factory=dict)
@@ -103,8 +103,8 @@ class PlantScenario(Problem):
         raise NotImplementedError
 
     def checked_scale(self, states: int) -> list[float]:
-        """The scale as one positive number a state; ValueError for another."""
-        scale = vector("scale", self.scale, states)
+        """The scale as one positive number a state, 1 if it is None; ValueError for another."""
+        scale = np.ones(states) if self.scale is None else vector("scale", self.scale, states)
         if not (scale > 0).all():
             raise ValueError(f"scale must be positive in every state, but got {scale.tolist()}")
         return scale.tolist()
@@ -210,7 +210,10 @@ class PlantScenario(Problem):
     def digest(self) -> str:
         """The first part of a SHA-256 of all fields but `name` and `about`."""
         content = {entry.name: plain(getattr(self, entry.name)) for entry in fields(self)}
-        content |= {"excitation": self.excitation.as_mapping(), "scale": [f"{part:.6g}" for part in self.scale]}
+        content |= {
+            "excitation": self.excitation.as_mapping(),
+            "scale": [f"{part:.6g}" for part in self.scale or ()],
+        }
         del content["name"], content["about"]
         return hashlib.sha256(json.dumps(content, sort_keys=True, default=repr).encode()).hexdigest()[:12]
 

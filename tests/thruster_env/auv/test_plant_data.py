@@ -31,6 +31,7 @@ def test_other_noise_and_disturbances_are_warned_of():
         ({"preset": "remus100"}, "tuned for preset segorogeni .here remus100"),
         ({"dt": 0.02}, "tuned for dt 0.05 .here 0.02"),
         ({"sensors": "papers"}, "tuned for sensors u, v, w, p, q, r, phi, theta, psi, z .here u, v, w, r"),
+        ({"attitude": "quaternion"}, "tuned for attitude euler .here quaternion"),
         ({"propeller_torque": None}, "tuned for propeller_torque -0.006 .here None"),
     ],
 )

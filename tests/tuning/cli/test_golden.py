@@ -59,7 +59,7 @@ STEPS = {  # in this order, in one folder: what a command writes, the next ones 
 }
 DRAW = "tuning.reporting.page.figure_svg"  # slow
 CLOCK = SimpleNamespace(perf_counter=lambda: 0.0, process_time=lambda: 0.0)
-CLOCKS = ("evaluation.compare", "search.study", "search.trials", "methods.task", "identification.identify")
+CLOCKS = ("evaluation.compare", "search.study", "search.trials", "methods.task", "likelihood.identify")
 
 
 def masked(text):
@@ -181,6 +181,7 @@ if __name__ == "__main__":
     with pytest.MonkeyPatch.context() as of_main, tempfile.TemporaryDirectory() as scratch:
         of_main.setattr(console, "_width", int(WIDTH))
         os.chdir(scratch)
-        for name, text in (*helps(), *(outcomes(of_main) if sys.argv[1:] != ["help"] else ())):
+        texts = [] if sys.argv[1:] == ["help"] else outcomes(of_main)  # a run sets sys.argv
+        for name, text in (*helps(), *texts):
             (GOLDEN / name).parent.mkdir(parents=True, exist_ok=True)
             (GOLDEN / name).write_text(text)
