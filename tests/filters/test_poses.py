@@ -170,5 +170,5 @@ def test_what_is_no_direction_or_pose_is_refused():
         camera().replace(prior_mean=[1.0, *[0.0] * 6, 0.0, 0.0, 2.0])
     with pytest.raises(ValueError, match="'camera' must begin with a quaternion"):
         camera().replace(prior_mean=[2.0, *[0.0] * 6, 0.0, 0.0, 1.0])
-    with pytest.raises(ValueError, match="'camera' and 'field' are of poses and directions: 'ekf'"):
-        filters.ParticleFilter(model=camera()).kernels()
+    with pytest.raises(ValueError, match="'camera' and 'field' are of poses and directions: filters.run"):
+        filters.AuxiliaryParticleFilter(model=camera()).kernels()

@@ -120,9 +120,9 @@ def test_inflation_that_adapts_keeps_a_small_ensemble_on_the_ring_which_is_lost_
 
 
 def row_of_page(table, first_cells):
-    """The numbers of a row of a table of docs/benchmarks.md: those of each cell behind the first ones."""
+    """The numbers of a row of a table of docs/benchmarks.md, or of one that no script computes."""
     page = (Path(__file__).parents[3] / "docs" / "benchmarks.md").read_text()
-    part = page.partition(f"<!-- table {table} -->")[2].partition("<!-- end -->")[0]
+    part = page.partition(f"<!-- table {table} -->")[2].partition("<!-- end -->")[0] or page
     (line,) = [line for line in part.splitlines() if line.startswith(f"| {first_cells} |")]
     return [[float(one) for one in re.findall(r"\d+\.\d+", cell)] for cell in line.split("|")[1:-1]]
 
