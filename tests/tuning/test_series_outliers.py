@@ -113,6 +113,10 @@ def test_a_record_that_does_not_return_jumps():
         (walk() + np.where(np.arange(ROWS) % 25 == 0, 8.0, 0.0), "they come each 2.5 s, so they are signal"),
         (np.where(np.random.default_rng(2).random(ROWS) < 0.03, 1.0, 0.0), "without them the others do not vary"),
         (with_outliers(walk(), share=0.35)[0], "there are more than 25 % of them"),
+        (
+            np.where(np.arange(ROWS) < 500, 0.05, 1.0) * np.random.default_rng(4).normal(size=ROWS),
+            "they are most numbers of a stretch, which has another variance",
+        ),
     ],
 )
 def test_peaks_that_are_no_outliers_count(z, reason):

@@ -57,10 +57,10 @@ class Far(NamedTuple):
 def without_outliers(column: Column, fit: Callable[[Column], SeriesFit]) -> SeriesFit:
     """The fit without the outliers, which it names.
 
-    All numbers count if more than `MOST` of them are outliers, if outliers come at regular times, if the others
-    do not vary, or if the model does not fit these: then it predicts too poorly to tell outliers from a course
-    that it misses, but for those also far from the median of their neighbours,
-    unless most of a stretch are: that has another variance.
+    All numbers count if more than `MOST` of them are outliers, if outliers come at regular times, if they are most
+    of a stretch, if the others do not vary, or if the model does not fit these: it predicts too poorly then to
+    tell outliers from a course that it misses, but for those also far from their neighbours, unless most
+    of a stretch are: that has another variance.
 
     Args:
         column: the numbers.
@@ -108,9 +108,11 @@ def without_outliers(column: Column, fit: Callable[[Column], SeriesFit]) -> Seri
 def _fit_without(
     outliers: np.ndarray, column: Column, fit: Callable[[Column], SeriesFit], off: np.ndarray
 ) -> tuple[SeriesFit, Far]:
-    """The fit without outliers, and what is far from that, unless they come at regular times."""
+    """The fit without outliers, and what is far from that, unless they are signal."""
     rows = np.flatnonzero(outliers.any(axis=1))
     _check_irregular(rows, column.times[rows])
+    if _are_together(outliers):
+        raise NoOutliersError("they are most numbers of a stretch, which has another variance")
     answer = fit(column.without(outliers))
     return answer, far_from(answer.chosen, answer.level, column, off)
 
