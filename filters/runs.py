@@ -18,7 +18,7 @@ from thruster_env.core.checks import FEW, at_least
 from thruster_env.core.modules import to_install
 from thruster_env.logs.log import Log
 from thruster_env.model.continuous import same_dt
-from thruster_env.model.turns import refuse_measured, stored_covs
+from thruster_env.model.turns import stored_covs
 
 if TYPE_CHECKING:
     import pandas
@@ -71,10 +71,9 @@ class WithTables:
 
     def _of_log(self, run: int) -> LogEstimate:
         """A trajectory as the estimate of a log."""
-        from filters.logs.estimate import LogEstimate
+        from filters.logs.estimate import LogEstimate, of_measured
 
         data, model = self.data, self.data.filter.model
-        refuse_measured(model, "a table or a picture")
         run = at_least("run", run, 0, len(data.keys) - 1)
         steps, z = np.diff(data.times) if len(data.times) > 1 else np.ones(1), data.measurements[run, data.rows]
         stamps = None if same_dt(float(steps.min()), float(steps.max())) else data.times - data.times[0]
@@ -94,7 +93,7 @@ class WithTables:
             filter_,
             means,
             stored_covs(means, covs, plain.turns),
-            np.where(np.isnan(z), np.nan, innovations),
+            of_measured(innovations, z, plain.measured_turns),
             innovation_covs,
             likelihoods,
             int(np.max(filtered.divergences)),

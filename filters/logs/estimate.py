@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,8 +23,9 @@ from thruster_env.core.streams import filter_keys
 from thruster_env.env.model_env import ReplayEnv
 from thruster_env.logs.log import Log, seen_by
 from thruster_env.model.continuous import ContinuousModel
+from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import refuse_measured, stored_covs
+from thruster_env.model.turns import Turn, error_quantities, innovation, stored_covs
 
 SKIPPED = 50  # first rows that do not count, in which a filter settles
 STEP = 1e-4  # of the slopes of outputs, in standard deviations
@@ -78,7 +79,7 @@ class LogEstimate(NamedTuple):
     filter: Filter
     means: np.ndarray  # (K + 1, n)
     covs: np.ndarray  # (K + 1, n, n)
-    innovations: np.ndarray  # (K + 1, m), NaN where nothing was measured
+    innovations: np.ndarray  # (K + 1, m), of rotations in their tangent; NaN where nothing was measured
     innovation_covs: np.ndarray  # (K + 1, m, m)
     log_likelihoods: np.ndarray  # (K + 1,), NaN for filters without a covariance
     divergences: int  # restarts from the prior
@@ -90,6 +91,11 @@ class LogEstimate(NamedTuple):
     def model(self) -> StateSpaceModel:
         """The filter's model."""
         return self.filter.model
+
+    @property
+    def innovation_quantities(self) -> list[Quantity]:
+        """The quantities of the m innovations: s_1, s_2, s_3 [rad] of a measured rotation s_w ... s_z."""
+        return error_quantities(self.log.measured, self.model.measured_turns)
 
     @property
     def stds(self) -> np.ndarray:
@@ -107,6 +113,12 @@ class LogEstimate(NamedTuple):
             ends = [self.model.output(symbol, self.means + sign * step) for sign in (1, -1)]
             slopes[:, i] = difference(ends[0][:, None], ends[1][:, None], (angle,))[:, 0] / (2 * step[:, i])
         return here, np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", slopes, self.covs, slopes), 0.0))
+
+
+def of_measured(innovations: np.ndarray, measurements: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
+    """Innovations (K + 1, m) of measurements with parts `turns`, NaN where a number of a part is missing."""
+    rows = measurements.T
+    return np.where(np.isnan(np.stack(innovation(rows, rows, turns), axis=-1)), np.nan, innovations)
 
 
 def estimate(
@@ -178,7 +190,6 @@ def estimate_with(
         seed: likewise.
         noise: of a log on its own stamps, Q by the length of a step [s]; None for one in proportion to it.
     """
-    refuse_measured(filter_.model, "a log")
     smoother = smoother or lag is not None
     measurements = seen_by(filter_.model, log.measurements)
     data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], measurements[None]
@@ -201,7 +212,7 @@ def estimate_with(
         filter_,
         means[0],
         stored_covs(means, covs, filter_.model.turns)[0],
-        np.where(np.isnan(measurements), np.nan, estimates.innovations[0]),
+        of_measured(estimates.innovations[0], measurements, filter_.model.measured_turns),
         estimates.innovation_covs[0],
         likelihoods if filter_.has_covariance else np.full_like(likelihoods, np.nan),
         int(estimates.divergences[0]),

@@ -43,6 +43,7 @@ from thruster_env.model import rotations
 from thruster_env.model.euler import EulerAngle, euler_outputs
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.simulate import inputs_until
+from thruster_env.model.turns import refuse_measured
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -112,7 +113,9 @@ def findings(estimate: LogEstimate, skip: int | None = None) -> LogFindings:
         nis = float((np.where(present, e, 0.0) ** 2).sum() / count)
         band = float(chdtri(count, 0.975) / count), float(chdtri(count, 0.025) / count)
         white = whiteness_of(e[None], present[None]) if len(e) > LAGS else None
-    predictions = [_residual(quantity, -innovations[:, j]) for j, quantity in enumerate(log.measured)]
+    predictions = [
+        _residual(quantity, -innovations[:, j]) for j, quantity in enumerate(estimate.innovation_quantities)
+    ]
     references = [
         _residual(*_in_degrees(quantity, estimate, reference_errors(estimate, key)[first:]))
         for key, (quantity, _) in compared(estimate).items()
@@ -229,10 +232,10 @@ def verdict(estimate: LogEstimate, log_findings: LogFindings) -> list[str]:
     if all(isnan(residual.rmse) for residual in log_findings.predictions):
         silent = "This estimator gives no innovation, so there is no NIS, no whiteness and no likelihood."
         return [*messages, silent]
-    names = [quantity.name for quantity in estimate.log.measured]
-    blown = blow_up_sentence(
-        estimate.innovations[log_findings.first :], estimate.log.measurements, names, estimate.log.dt
-    )
+    names = [quantity.name for quantity in estimate.innovation_quantities]
+    firsts = [turn.stored for turn in estimate.model.measured_turns]  # other numbers are as many as errors
+    measurements = np.delete(estimate.log.measurements, firsts, axis=1)
+    blown = blow_up_sentence(estimate.innovations[log_findings.first :], measurements, names, estimate.log.dt)
     if blown:
         return [*messages, blown]
     if isnan(log_findings.mean_nis):
@@ -279,7 +282,7 @@ def feedthrough_sentences(estimate: LogEstimate, first: int = 0) -> list[str]:
         f"Changes of the input in the same row explain {100.0 * now:.0f} % of those of the innovations of "
         f"{quantity.name}: measurements follow the input of the same instant, so {remedy} (or a controller's "
         "answer to them is recorded in their row)."
-        for quantity, (now, before) in zip(log.measured, shares, strict=True)
+        for quantity, (now, before) in zip(estimate.innovation_quantities, shares, strict=True)
         if count and now >= FOLLOWS and now > before
     ]
 
@@ -326,10 +329,11 @@ def alarms_of(estimate: LogEstimate, monitor: Monitor, first: int = 0, *, isolat
         isolate: whether to run the filter without each channel, too, and count the alarms of the others.
 
     Raises:
-        ValueError: for a filter without a covariance, and to isolate the only channel.
+        ValueError: for a filter without a covariance, measured rotations, and to isolate the only channel.
     """
     if not estimate.filter.has_covariance:
         raise ValueError(f"a monitor needs a filter with a covariance, but {estimate.filter.name!r} has none")
+    refuse_measured(estimate.model, "a log with a monitor")
     measurements = estimate.log.measurements
     without = None
     if isolate:
@@ -398,7 +402,8 @@ def columns_of(estimate: LogEstimate, alarms: LogAlarms | None = None) -> dict[s
         named, values = _in_degrees(output.quantity._replace(symbol=symbol), estimate, estimate.output(symbol))
         columns[header_of("", named)], columns[header_of("std", named)] = values
     deviations = np.sqrt(np.maximum(np.einsum("kii->ki", estimate.innovation_covs), 0.0))
-    for quantity, values, std in zip(log.measured, estimate.innovations.T, deviations.T, strict=True):
+    channels = estimate.innovation_quantities
+    for quantity, values, std in zip(channels, estimate.innovations.T, deviations.T, strict=True):
         columns[header_of("innovation", quantity)], columns[header_of("innovation_std", quantity)] = values, std
     if alarms is not None:
         for channel, quantity in enumerate(log.measured):
@@ -478,7 +483,8 @@ def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: 
     }  # of which roll, pitch and yaw say more
     plotted = sorted(values, key=lambda key: (key not in references, key in turned))[:MOST_PANELS]
     plotted = [key for key in values if key in plotted] if states else []
-    heights = [TALL] * len(plotted) + [LOW if plotted else TALL] * len(estimate.log.measured)
+    channels = estimate.innovation_quantities
+    heights = [TALL] * len(plotted) + [LOW if plotted else TALL] * len(channels)
     figure = new_figure((WIDTH, sum(heights) + ROOM))
     axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
     tidy(axes)
@@ -502,7 +508,7 @@ def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: 
         _band(axis, own_times, mean, std, colour)
         axis.plot(own_times, mean, color=colour, linewidth=1.0, label=what)
         axis.set_ylabel(label.plot_label.replace(" $", "\n$"))
-    for j, (axis, quantity) in enumerate(zip(axes[len(plotted) :], estimate.log.measured, strict=True)):
+    for j, (axis, quantity) in enumerate(zip(axes[len(plotted) :], channels, strict=True)):
         std = np.sqrt(np.maximum(estimate.innovation_covs[:, j, j], 0.0))
         _band(axis, times, np.zeros_like(std), std, colour)
         _limit(axis, np.zeros_like(std), std, estimate.innovations[:, j])
@@ -538,7 +544,8 @@ def _measurements_of(estimate: LogEstimate, values: np.ndarray) -> list[np.ndarr
     except (ValueError, ArithmeticError):  # of estimates at which h has no value, where Python raises
         return []
     same = np.isclose(expected, values[rows, None], rtol=1e-9, atol=1e-12, equal_nan=True).all(axis=0)
-    return [estimate.log.measurements[:, j] for j in np.flatnonzero(same)]
+    signed = {j for turn in model.measured_turns for j in range(turn.stored, turn.stored + turn.size + 1)}
+    return [estimate.log.measurements[:, j] for j in np.flatnonzero(same) if j not in signed]
 
 
 def _band(axis, times: np.ndarray, middle: np.ndarray, std: np.ndarray, colour: str) -> None:

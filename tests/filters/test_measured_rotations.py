@@ -11,6 +11,9 @@ from scipy.spatial.transform import Rotation as Turned
 
 import filters
 from filters.c.project import c_filter
+from filters.logs.estimate import estimate
+from filters.logs.findings import alarms_of, findings, verdict
+from filters.monitoring import Monitor
 from filters.registry import FILTERS
 from filters.sensitivity import likelihood
 from filters.starts import begun_at
@@ -319,6 +322,40 @@ def test_a_pose_is_measured_whole():
     belief, innovation = filter_.update(filter_.init(), z)
     np.testing.assert_allclose(innovation.value, d, atol=1e-13)
     np.testing.assert_allclose(belief.mean, poses.exponential(0.5 * d), atol=1e-13)
+
+
+def test_a_log_has_the_estimates_of_a_batch_for_either_sign(data, extended):
+    """NIS and tables count innovations of the tangent; lengths and signs of columns are repaired."""
+    gyro, z = data
+    seen = z.copy()
+    seen[7, 2] = np.nan
+    model = tracker_model().replace(prior_mean=begun_at(tracker_model(), z[:1])[0])
+    batch = filters.run(filters.ExtendedKalmanFilter(model=model), inputs=gyro, measurements=seen)
+    symbols = [quantity.symbol for quantity in model.input_quantities]
+    found = []
+    for factor in (1.0, -1.3):
+        table = {"time": DT * np.arange(31)}
+        table |= dict(zip(symbols, np.vstack([gyro[:1], gyro]).T, strict=True))  # each acts until its row
+        table |= {f"s_{axis}": factor * seen[:, i] for i, axis in enumerate("wxyz")}
+        found.append(estimate(table, "ekf", tracker_model()))
+        np.testing.assert_allclose(found[-1].means, batch.means, atol=1e-12)
+        np.testing.assert_allclose(
+            found[-1].innovations, np.where(np.arange(31)[:, None] == 7, np.nan, batch.innovations), atol=1e-12
+        )
+    assert "Quaternions of star tracker" in " ".join(verdict(found[1], findings(found[1])))
+    result = findings(found[0], 1)
+    v, S = batch.innovations[1:], batch.innovation_covs[1:]
+    nis = np.einsum("ki,ki->k", v, np.linalg.solve(S, v[..., None])[..., 0])
+    np.testing.assert_allclose(result.mean_nis, np.delete(nis, 6).sum() / 87, rtol=1e-9)
+    assert [(part.quantity.symbol, part.quantity.unit, part.rows) for part in result.predictions] == [
+        (f"s_{i}", "rad", 29) for i in (1, 2, 3)
+    ]
+    frame = batch.to_frame()
+    np.testing.assert_array_equal(np.isnan(frame["innovation_s_1_rad"]), np.arange(31) == 7)
+    assert {"measured_s_w", "innovation_std_s_3_rad"} < set(frame)
+    assert len(batch.plot().axes) == 9
+    with pytest.raises(ValueError, match="measurements of a log with a monitor must be numbers and angles"):
+        alarms_of(found[0], Monitor())
 
 
 def test_what_cannot_measure_rotations_says_so():

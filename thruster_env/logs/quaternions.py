@@ -1,8 +1,9 @@
 """Columns of a quaternion in a log: found by the names of its components, with length 1 and one sign.
 
-The four columns of a rotation among a model's states, q_w, q_x, q_y and q_z, are a reference. They may have the
-names of other programs, such as orientation.x ... orientation.w of ROS, whatever their order; numbers such as q0
-... q3 do not say which one is the scalar, so they are not read unless columns are given.
+The four columns of a rotation among a model's measurements have its symbols, or headers that are given. Those
+of one among its states, q_w, q_x, q_y and q_z, are a reference. They may have the names of other programs,
+such as orientation.x ... orientation.w of ROS, whatever their order; numbers such as q0 ... q3 do not say
+which one is the scalar, so they are not read unless columns are given.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from thruster_env.logs.columns import STATE, TIME, Column
+from thruster_env.logs.columns import MEASUREMENT, STATE, TIME, Column
 from thruster_env.logs.findings import QUATERNION, Remark
 from thruster_env.logs.grid import Series
 from thruster_env.model.state_space import StateSpaceModel
@@ -24,9 +25,14 @@ ROUNDED = 1e-3  # of a length, by which the digits of a file may change it
 
 
 def groups_of(model: StateSpaceModel) -> list[tuple[str, list[str]]]:
-    """The name of each rotation and pose among a model's states, and the channels of its quaternion, w first."""
-    turns = [turn for turn in model.turns if turn.kind != "direction"]
-    return [(turn.name, [f"{STATE}:{state.symbol}" for state in model.states[turn.quaternion]]) for turn in turns]
+    """The name of each rotation and pose of a model, states first, and the channels of its quaternion, w first."""
+    parts = [(STATE, model.states, turn) for turn in model.turns]
+    parts += [(MEASUREMENT, model.measurements, turn) for turn in model.measured_turns]
+    return [
+        (turn.name, [f"{kind}:{quantity.symbol}" for quantity in quantities[turn.quaternion]])
+        for kind, quantities, turn in parts
+        if turn.kind != "direction"
+    ]
 
 
 def named_columns(
@@ -37,7 +43,8 @@ def named_columns(
     Raises:
         ValueError: if a quaternion has some of its columns alone, or two quaternions are there.
     """
-    groups, used = groups_of(model), {column.header for column in columns.values()}
+    used = {column.header for column in columns.values()}
+    groups = [group for group in groups_of(model) if group[1][0].startswith(STATE)]
     for name, keys in groups:
         known = [key for key in keys if key in columns]
         if 0 < len(known) < len(keys):

@@ -238,7 +238,7 @@ def read_log(
     in_file = [channel for channel in wanted if channel.key in column_of]
     read = {channel.key: _series(table, column_of[channel.key], channel, of_file) for channel in in_file}
     samples = {key: series for key, (series, _) in read.items()}
-    if model.turns:
+    if model.turns or model.measured_turns:
         samples, turned = quaternions.repaired(model, samples)
         turned += quaternions.remark_on_numbers(model, table.names, column_of)
     for channel in in_file:
