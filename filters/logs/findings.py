@@ -64,6 +64,7 @@ FEWEST_MOVES = 10  # rows in which an input changes, for each input
 FOLLOWS = 0.5  # share of the innovations' squares that changes of the input explain, from which it is named
 MARGIN = 0.06  # of an axis above and below what it shows
 DOTS: dict[str, Any] = {"color": "0.5", "s": 4.0, "linewidths": 0, "label": "measurement", "zorder": 1.5}
+DRIFT = 2.0  # deviation of yaw at the end over the first, beyond which it is said to drift
 
 
 class Residual(NamedTuple):
@@ -220,6 +221,7 @@ def verdict(estimate: LogEstimate, log_findings: LogFindings) -> list[str]:
     and its Q and R are not to blame.
     """
     messages = sentences(estimate.log.findings) + ([estimate.restarts.sentence] if estimate.restarts else [])
+    messages += drift_sentences(estimate)
     spoilt = [finding for finding in estimate.log.findings if finding.kind in SPOILING]
     if any(finding.kind == GAP for finding in spoilt):
         messages.append("At a gap the filter predicts with the last input held.")
@@ -257,6 +259,18 @@ def verdict(estimate: LogEstimate, log_findings: LogFindings) -> list[str]:
         if OUTLIER in kinds and "robust" not in estimate.filter.name:
             conclusion += " The filter ekf-robust gives outliers less weight."
     return [*messages, conclusion]
+
+
+def drift_sentences(estimate: LogEstimate) -> list[str]:
+    """That yaw drifts, of each rotation whose deviation of yaw is larger at the end than after the first row."""
+    result = []
+    for symbol, output in estimate.model.outputs.items():
+        if isinstance(output.function, EulerAngle) and output.function.axis == 2:
+            first, last = np.rad2deg(estimate.output(symbol)[1][[0, -1]])
+            if last > DRIFT * first:
+                grows = f"The deviation of {symbol} grows from {first:.2g} to {last:.2g} deg: it drifts, as "
+                result.append(grows + "measurements do not determine it (a magnetometer does).")
+    return result
 
 
 def feedthrough_sentences(estimate: LogEstimate, first: int = 0) -> list[str]:

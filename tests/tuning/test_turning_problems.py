@@ -186,6 +186,10 @@ def test_without_a_magnetometer_yaw_is_not_measured():
     deviations = filters.run(make_filter("ekf", model), **still).stds
     assert (np.diff(deviations[:, 2]) > 0.0).all()
     assert (deviations[-1, :2] < 0.02).all()
+    columns = table(lambda q: {})
+    log = tuning.read_logs(columns | {"acc_z": 9.81 + columns["acc_x"]}, model="attitude-imu")
+    words = " ".join(tuning.estimate(log, filter="ekf").sentences())
+    assert "The deviation of yaw grows from 0." in words
 
 
 def test_the_trap_of_a_free_gyroscope():
