@@ -19,8 +19,7 @@ import numpy as np
 from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import as_floats, at_least, one_of, positive, short_repr
 from thruster_env.core.compiled import is_interpreting
-from thruster_env.model.turns import Turn
-from thruster_env.model.turns import innovation as difference
+from thruster_env.model.turns import Turn, readings
 
 if TYPE_CHECKING:
     from filters.filter import Filter
@@ -436,8 +435,7 @@ class Watch:
         """Take the innovation (m,), its covariance (m, m) and the measurement z, NaN where there was none."""
         raised, since, sizes = self._out
         innovation, cov, z = (np.ascontiguousarray(part, dtype=np.float64) for part in (innovation, cov, z))
-        if self._turns:  # of which only NaN matter
-            z = np.array(difference(z, z, self._turns))
+        z = readings(z, self._turns) if self._turns else z
         count = (len(self._state),)
         if innovation.shape != count or z.shape != count or cov.shape != 2 * count:
             rule = f"a monitor of {count[0]} channels must get as many innovations and measurements"

@@ -18,7 +18,7 @@ from thruster_env.core.checks import FEW, at_least
 from thruster_env.core.modules import to_install
 from thruster_env.logs.log import Log
 from thruster_env.model.continuous import same_dt
-from thruster_env.model.turns import stored_covs
+from thruster_env.model.turns import readings, stored_covs
 
 if TYPE_CHECKING:
     import pandas
@@ -71,7 +71,7 @@ class WithTables:
 
     def _of_log(self, run: int) -> LogEstimate:
         """A trajectory as the estimate of a log."""
-        from filters.logs.estimate import LogEstimate, of_measured
+        from filters.logs.estimate import LogEstimate
 
         data, model = self.data, self.data.filter.model
         run = at_least("run", run, 0, len(data.keys) - 1)
@@ -93,7 +93,7 @@ class WithTables:
             filter_,
             means,
             stored_covs(means, covs, plain.turns),
-            of_measured(innovations, z, plain.measured_turns),
+            np.where(np.isnan(readings(z, plain.measured_turns)), np.nan, innovations),
             innovation_covs,
             likelihoods,
             int(np.max(filtered.divergences)),

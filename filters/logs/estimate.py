@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from thruster_env.logs.log import Log, seen_by
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import Turn, error_quantities, innovation, stored_covs
+from thruster_env.model.turns import error_quantities, readings, stored_covs
 
 SKIPPED = 50  # first rows that do not count, in which a filter settles
 STEP = 1e-4  # of the slopes of outputs, in standard deviations
@@ -115,12 +115,6 @@ class LogEstimate(NamedTuple):
         return here, np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", slopes, self.covs, slopes), 0.0))
 
 
-def of_measured(innovations: np.ndarray, measurements: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
-    """Innovations (K + 1, m) of measurements with parts `turns`, NaN where a number of a part is missing."""
-    rows = measurements.T
-    return np.where(np.isnan(np.stack(innovation(rows, rows, turns), axis=-1)), np.nan, innovations)
-
-
 def estimate(
     log: Log | str | Path,
     filter: str | Estimator | Callable | None = None,
@@ -206,13 +200,13 @@ def estimate_with(
     if smoother:
         dt = None if log.stamps is None else np.diff(log.times)
         means, covs = smoothed_rows(prepared(filter_, *data, dt=dt, noise=noise), lag)[0]
-    likelihoods = estimates.log_likelihoods[0]
+    likelihoods, turns = estimates.log_likelihoods[0], filter_.model.measured_turns
     return LogEstimate(
         log,
         filter_,
         means[0],
         stored_covs(means, covs, filter_.model.turns)[0],
-        of_measured(estimates.innovations[0], measurements, filter_.model.measured_turns),
+        np.where(np.isnan(readings(measurements, turns)), np.nan, estimates.innovations[0]),
         estimates.innovation_covs[0],
         likelihoods if filter_.has_covariance else np.full_like(likelihoods, np.nan),
         int(estimates.divergences[0]),

@@ -43,7 +43,7 @@ from thruster_env.model import rotations
 from thruster_env.model.euler import EulerAngle, euler_outputs
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.simulate import inputs_until
-from thruster_env.model.turns import refuse_measured
+from thruster_env.model.turns import readings, refuse_measured
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -235,8 +235,7 @@ def verdict(estimate: LogEstimate, log_findings: LogFindings) -> list[str]:
         silent = "This estimator gives no innovation, so there is no NIS, no whiteness and no likelihood."
         return [*messages, silent]
     names = [quantity.name for quantity in estimate.innovation_quantities]
-    firsts = [turn.stored for turn in estimate.model.measured_turns]  # other numbers are as many as errors
-    measurements = np.delete(estimate.log.measurements, firsts, axis=1)
+    measurements = readings(estimate.log.measurements, estimate.model.measured_turns)
     blown = blow_up_sentence(estimate.innovations[log_findings.first :], measurements, names, estimate.log.dt)
     if blown:
         return [*messages, blown]

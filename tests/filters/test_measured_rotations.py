@@ -13,7 +13,7 @@ import filters
 from filters.c.project import c_filter
 from filters.logs.estimate import estimate
 from filters.logs.findings import alarms_of, findings, verdict
-from filters.monitoring import Monitor
+from filters.monitoring import Monitor, watch_of
 from filters.registry import FILTERS
 from filters.sensitivity import likelihood
 from filters.starts import begun_at
@@ -354,6 +354,9 @@ def test_a_log_has_the_estimates_of_a_batch_for_either_sign(data, extended):
     np.testing.assert_array_equal(np.isnan(frame["innovation_s_1_rad"]), np.arange(31) == 7)
     assert {"measured_s_w", "innovation_std_s_3_rad"} < set(frame)
     assert len(batch.plot().axes) == 9
+    watch = watch_of(Monitor(), found[0].filter)
+    steps = zip(batch.innovations, batch.innovation_covs, seen, strict=True)
+    assert "stuck" not in {alarm.test for step in steps for alarm in watch.step(*step).alarms}
     with pytest.raises(ValueError, match="measurements of a log with a monitor must be numbers and angles"):
         alarms_of(found[0], Monitor())
 

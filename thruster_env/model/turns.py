@@ -217,6 +217,14 @@ def refuse_measured(model: Any, where: str) -> None:
         raise ValueError(f"{rule}: filters.run, sessions, EstimateState and C take such models")
 
 
+def readings(z: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
+    """Measurements (..., m) by innovation: of a part all numbers but the first, NaN where one is missing."""
+    z = np.array(z, dtype=np.float64)
+    for turn in turns:
+        z[..., turn.stored : turn.stored + turn.size + 1][np.isnan(turn.of_state(z.T)).any(axis=0).T] = np.nan
+    return np.delete(z, [turn.stored for turn in turns], axis=-1)
+
+
 def refuse_signs(observe: Callable[[np.ndarray], Any], model: Any) -> None:
     """Raise ValueError if h(x) differs between q and -q of a rotation: no filter knows which one a sensor has.
 
