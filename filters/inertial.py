@@ -1,4 +1,4 @@
-"""Models of inertial sensors: `attitude` of a body, and `heave`, roll and pitch of a vessel in waves.
+"""Models of inertial sensors: `attitude` of a body, `heave` of a vessel in waves, `inertial_navigation` with GPS.
 
 **attitude**: a rotation by gyroscope, accelerometer and magnetometer, with the noise of data sheets. The gyroscope
 is the input; its bias walks. World axes are east, north, up, with magnetic north. The acceleration of the sensor
@@ -36,11 +36,11 @@ import numpy as np
 from filters.models import oscillator
 from filters.signals import block_diagonal
 from thruster_env.core.checks import finite, positive
-from thruster_env.model import rotations
+from thruster_env.model import poses, rotations
 from thruster_env.model.continuous import noise_of_densities
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import Rotation, Turn
+from thruster_env.model.turns import ExtendedPose, Rotation, Turn
 
 GRAVITY = 9.81  # [m/s^2]
 UNKNOWN = 2.0  # standard deviation of the first attitude on each axis [rad], which is none
@@ -319,4 +319,100 @@ def heave(
         ),
         input_quantities=GYROSCOPE,
         measurements=MEASURED,
+    )
+
+
+class Flight(NamedTuple):
+    """Numbers of f of `inertial_navigation`."""
+
+    dt: float
+    gravity: float
+
+
+def _fly(x, u, c):
+    rate, force = tuple(u[i] - x[10 + i] for i in range(3)), tuple(u[3 + i] - x[13 + i] for i in range(3))
+    return *poses.strapdown(x[:10], rate, force, (0.0, 0.0, -c.gravity), c.dt), *x[10:]
+
+
+def _fix(x, c):
+    return *x[7:10], x[9] + x[16]
+
+
+def inertial_navigation(
+    dt: float = 0.01,
+    gyroscope: float = 2e-4,
+    bias_walk: float = 1e-5,
+    accelerometer: float = 2e-3,
+    accelerometer_walk: float = 1e-4,
+    gps: float = 1.5,
+    barometer: float = 0.3,
+    barometer_walk: float = 0.02,
+    tilt_std: float = 2.0,
+    heading: float = 0.0,
+    heading_std: float = 5.0,
+    gyroscope_bias: float = 0.005,
+    accelerometer_bias: float = 0.05,
+    gravity: float = GRAVITY,
+) -> StateSpaceModel:
+    """Attitude, velocity and position of a craft by an IMU, which is the input, GPS and a barometer.
+
+        (q, v, p)' = strapdown((q, v, p), u_g - b_g, u_a - b_a, (0, 0, -g), dt)
+        GPS:  p + noise,   barometer:  p_z + b + noise
+
+    World axes are east, north, up from a place nearby, so longitude and latitude must be turned into metres. The
+    craft is one element of SE_2(3) with errors of the body; biases of gyroscope, accelerometer and barometer walk.
+    GPS and barometer come at their own rates, NaN between. Without acceleration, nothing measures the heading.
+    From first errors of twice the default ones an extended filter's NEES is a quarter too large.
+
+    Args:
+        dt: sample time [s], of the IMU.
+        gyroscope: noise density of the gyroscope, its angle random walk [rad/s/sqrt(Hz)].
+        bias_walk: density of its bias's rate [rad/s^2/sqrt(Hz)].
+        accelerometer: noise density of the accelerometer, its velocity random walk [m/s^2/sqrt(Hz)].
+        accelerometer_walk: density of its bias's rate [m/s^3/sqrt(Hz)].
+        gps: deviation of a position on each axis [m].
+        barometer: deviation of a height [m].
+        barometer_walk: density of the rate of the barometer's bias [m/s/sqrt(Hz)].
+        tilt_std: deviation of the first roll and pitch, which are zero [deg].
+        heading: first yaw, from east to north [deg].
+        heading_std: its deviation [deg].
+        gyroscope_bias: deviation of its first bias on each axis [rad/s].
+        accelerometer_bias: likewise [m/s^2].
+        gravity: g [m/s^2].
+
+    Raises:
+        ValueError: if a deviation, density, dt or gravity is not positive.
+    """
+    gyro = _gyroscope_noise(gyroscope, positive("bias_walk", bias_walk), positive("dt", dt))
+    walk = positive("accelerometer_walk", accelerometer_walk)
+    densities = np.diag([positive("accelerometer", accelerometer) ** 2, 0.0, walk**2])  # of v, p and the bias
+    moving = noise_of_densities(densities, [[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dt)
+    noise, turning, steady = np.zeros((16, 16)), [*range(3), *range(9, 12)], [*range(3, 9), *range(12, 15)]
+    noise[np.ix_(turning, turning)], noise[np.ix_(steady, steady)] = gyro, np.kron(moving, np.eye(3))
+    noise[15, 15] = positive("barometer_walk", barometer_walk) ** 2 * dt
+    tilt, yaw = (math.radians(positive(*std)) for std in (("tilt_std", tilt_std), ("heading_std", heading_std)))
+    first = 0.5 * math.radians(finite("heading", heading))
+    biases = [positive("gyroscope_bias", gyroscope_bias)] * 3 + [
+        positive("accelerometer_bias", accelerometer_bias)
+    ] * 3
+    stds = tilt, tilt, yaw, *[5.0] * 3, *[3.0 * gps] * 3, *biases, 20.0
+    return StateSpaceModel(
+        transition=_fly,
+        observe=_fix,
+        process_noise_cov=noise,
+        measurement_noise_cov=[positive("gps", gps) ** 2] * 3 + [positive("barometer", barometer) ** 2],
+        prior_mean=[math.cos(first), 0.0, 0.0, math.sin(first)] + [0.0] * 13,
+        prior_cov=np.square(stds),
+        constants=Flight(dt, positive("gravity", gravity)),
+        states=(
+            ExtendedPose("craft"),
+            *TURNING[1:],
+            *(Quantity(f"accelerometer bias {axis}", f"d_{axis}", "m/s^2") for axis in AXES),
+            Quantity("barometer bias", "b_h", "m"),
+        ),
+        input_quantities=(*GYROSCOPE, *MEASURED[:3]),
+        measurements=(
+            *(Quantity(f"GPS {axis}", f"gps_{axis[0]}", "m") for axis in WORLD),
+            Quantity("barometer height", "baro", "m"),
+        ),
     )

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.inertial import attitude, attitude_imu, heave
+from filters.inertial import attitude, attitude_imu, heave, inertial_navigation
 from thruster_env.core.checks import one_of, positive, short_repr
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.model.continuous import ContinuousModel
@@ -478,6 +478,7 @@ def battery(
 PLANTS: Mapping[str, Callable[..., Any]] = {
     "attitude": attitude,
     "attitude-imu": attitude_imu,
+    "inertial-navigation": inertial_navigation,
     "heave": heave,
     "coordinated-turn": coordinated_turn,
     "unicycle": unicycle,
