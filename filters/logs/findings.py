@@ -54,6 +54,7 @@ ALPHA = 0.05  # below which a p-value speaks against white innovations
 SOLID, DASHED, DOTTED, BOTH, TWO_DOTS = "-", "--", ":", "-.", (0, (4, 1.5, 1, 1.5, 1, 1.5))
 TRUTH: dict[str, Any] = {"color": TRUE, "linewidth": 3.0, "zorder": 1.8}  # wide, below the estimates
 MEASURED: dict[str, Any] = {"color": PALE, "linewidth": 0.8}
+SPARSE: dict[str, Any] = {"marker": ".", "markersize": 3.0, "linewidth": 0.0}  # of a slow sensor
 OTHER = (GREEN, DOTTED)  # an estimator of one's own
 TWO_SIDED = 1.96
 MOST_PANELS = 6  # of states and outputs
@@ -522,10 +523,14 @@ def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: 
         axis.plot(own_times, mean, color=colour, linewidth=1.0, label=what)
         axis.set_ylabel(label.plot_label.replace(" $", "\n$"))
     for j, (axis, quantity) in enumerate(zip(axes[len(plotted) :], channels, strict=True)):
-        std = np.sqrt(np.maximum(estimate.innovation_covs[:, j, j], 0.0))
-        _band(axis, times, np.zeros_like(std), std, colour)
-        _limit(axis, np.zeros_like(std), std, estimate.innovations[:, j])
-        axis.plot(times, estimate.innovations[:, j], color=colour, linewidth=0.8, label="innovation")
+        std, innovation = np.sqrt(np.maximum(estimate.innovation_covs[:, j, j], 0.0)), estimate.innovations[:, j]
+        rows, sparse = np.arange(len(times)), is_sparse(~np.isnan(innovation))
+        if sparse:  # a line has no ends there, and S of the rows between is another one
+            rows = np.flatnonzero(~np.isnan(innovation))
+        _band(axis, times[rows], np.zeros(len(rows)), std[rows], colour)
+        _limit(axis, np.zeros(len(rows)), std[rows], innovation[rows])
+        style = SPARSE if sparse else {"linewidth": 0.8}
+        axis.plot(times[rows], innovation[rows], color=colour, label="innovation", **style)
         for episode in episodes(alarms.alarms, alarms.monitor.memory) if alarms else ():
             if episode[0].channel == j:
                 span = min(alarm.since for alarm in episode), episode[-1].step
@@ -543,6 +548,12 @@ def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: 
         named |= dict(zip(texts, handles, strict=True))
     figure.legend(named.values(), named, loc="outside lower center", ncols=len(named), frameon=False)
     return figure
+
+
+def is_sparse(measured: np.ndarray) -> bool:
+    """Whether most measured rows have none beside them that is, as those of a slow sensor."""
+    near = np.pad(measured, 1)
+    return bool(2 * (measured & ~near[:-2] & ~near[2:]).sum() > measured.sum())
 
 
 def _measurements_of(estimate: LogEstimate, values: np.ndarray) -> list[np.ndarray]:

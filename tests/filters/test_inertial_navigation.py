@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import filters
+from filters.logs.findings import is_sparse
 from filters.named import model_named
 from thruster_env.model import poses, rotations
 from thruster_env.model.turns import difference
@@ -68,3 +69,13 @@ def test_the_noise_is_that_of_white_sensors_and_walking_biases(model):
     assert np.linalg.eigvalsh(q).min() > 0.0
     turned = model_named("inertial-navigation:heading=90")(dt=DT).prior_mean[:4]
     np.testing.assert_allclose(rotations.to_world(turned, (1.0, 0.0, 0.0)), (0.0, 1.0, 0.0), atol=1e-15)
+
+
+def test_innovations_of_slow_sensors_are_drawn_as_dots(model):
+    """A line between rows without a neighbour has no length."""
+    _, inputs, z = flight(np.random.default_rng(1))
+    figure = filters.run(filters.make_filter("ekf", model), inputs=inputs[:200], measurements=z[:201]).plot()
+    lines = [line for axis in figure.axes for line in axis.lines if line.get_label() == "innovation"]
+    assert [(line.get_marker(), len(line.get_xdata())) for line in lines] == [(".", 21)] * 3 + [(".", 41)]
+    for measured, sparse in ((np.array([True] * 9 + [False]), False), (np.arange(12) % 3 == 0, True)):
+        assert is_sparse(measured) is sparse

@@ -11,7 +11,7 @@ import numpy as np
 
 from filters.engine.batch import Estimates
 from filters.filter import Filter
-from filters.logs.findings import MEASURED, TRUTH, colour_of
+from filters.logs.findings import MEASURED, SPARSE, TRUTH, colour_of, is_sparse
 from thruster_env.core.angles import with_breaks, wrapped, wrapped_where
 from thruster_env.core.files import BLUE, GREY, RUST, new_figure, thinned, tidy
 from thruster_env.core.sources import as_value, is_array
@@ -317,10 +317,15 @@ def limit_innovations(axes, runs: Sequence[Run], start: int, j: int) -> None:
 
 
 def draw_in_band(axis, time: np.ndarray, values: np.ndarray, band: np.ndarray, label: str, colour: str) -> None:
-    """An error over time in the filter's band."""
+    """An error over time in the filter's band; of a slow sensor as dots."""
+    present = ~np.isnan(values)
+    sparse = is_sparse(present)
+    if sparse:
+        time, values, band = time[present], values[present], band[present]
     draw_band(axis, time, -band, band, colour)
     contrast = BLUE if colour == RUST else RUST  # an error never looks like the estimate
-    axis.plot(*thinned(time, values), color=contrast, linewidth=0.9, label=label)
+    style = SPARSE if sparse else {"linewidth": 0.9}
+    axis.plot(*thinned(time, values), color=contrast, label=label, **style)
 
 
 def draw_band(axis, time: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str) -> None:
@@ -346,12 +351,14 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
     colour = colour_of(filter_.name)
     for axis, j in zip(axes, channels, strict=False):
         angle = model.measurements[j].angle
-        line = line_of(angle, filtered.time, measured[:, j])
-        axis.plot(*line, label="measured", **(MEASURED | {"linewidth": 2.0}))
+        line, dots = line_of(angle, filtered.time, measured[:, j]), {}
+        if is_sparse(~np.isnan(measured[:, j])):
+            dots = SPARSE
+        axis.plot(*line, label="measured", **(MEASURED | {"linewidth": 2.0} | dots))
         expected = measured[:, j] - filtered.innovations[:, j]
         expected = wrapped(expected) if angle else expected
         line = line_of(angle, filtered.time, expected)
-        axis.plot(*line, color=colour, linewidth=0.8, label="predicted before the update")
+        axis.plot(*line, color=colour, label="predicted before the update", **({"linewidth": 0.8} | dots))
         axis.set_ylabel(axis_label(model.measurements[j]))
     for axis, i in zip(axes[len(channels) :], inputs, strict=True):
         time, values = thinned(filtered.time[:-1], single.inputs[0][:, i])
