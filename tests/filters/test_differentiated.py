@@ -49,7 +49,7 @@ def test_only_what_can_be_traced_becomes_a_program():
 
 @pytest.mark.usefixtures("as_python")
 def test_a_graph_that_is_too_large_is_called(monkeypatch):
-    monkeypatch.setattr(differentiated, "MOST", 50)
+    monkeypatch.setattr(differentiated, "most_operations", lambda shape: 50)
     recursion_of.cache_clear()
     assert at_once(wide_model()) == 1
     recursion_of.cache_clear()

@@ -51,7 +51,7 @@ def test_functions_that_are_called_have_the_derivatives_of_those_that_are_traced
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", NAMES)
 def test_a_model_that_is_too_large_to_be_written_out_is_called(name, monkeypatch):
-    monkeypatch.setattr(differentiated, "MOST", 50)
+    monkeypatch.setattr(differentiated, "most_operations", lambda shape: 50)
     recursion_of.cache_clear()
     model = random_affine(n=7, m=2, p=1)  # its matrices are arrays
     inputs, z = simulated(model, 3, count=2, missing=0.2)

@@ -299,8 +299,9 @@ class Vehicle(TrainingPlant):
             raise ValueError(f"{rule} and dt from {SHORTEST_STEP} s, but got {scenario.name!r}")
 
     def model(self, **arguments) -> StateSpaceModel:
-        """What a filter assumes: `thruster_env.auv.model.auv_model`."""
-        return auv_model(**arguments)
+        """What a filter assumes: `thruster_env.auv.model.auv_model`, of a plant whose attitude is Euler's."""
+        of_plant = {name: value for name, value in arguments.items() if (name, value) != ("attitude", EULER)}
+        return auv_model(**of_plant)
 
     def check_observes(self, name: str, observe: str) -> None:
         """Raise ValueError for a history, or a belief with standard deviations."""
