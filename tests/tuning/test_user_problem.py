@@ -210,7 +210,7 @@ def test_what_is_no_problem_is_one_clear_line(text, name, line, thruster, tmp_pa
 
 def test_the_problems_of_the_page_are_problems():
     page = (Path(__file__).parents[2] / "docs" / "problems.md").read_text(encoding="utf-8")
-    names = {}
+    names = {"__name__": "page"}  # as other tests call it, which may have run before
     for code in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
         exec(compile(code, "docs/problems.md", "exec"), names)
     with interpreted():
