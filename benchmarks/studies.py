@@ -217,7 +217,6 @@ def peer_line(steps: int) -> np.ndarray:
     return np.polyfit(PEER_SIZES, seconds, 1)
 
 
-NETWORKS = 2  # one of the action, one of the value, which is a single number, too
 PASSES = 3  # through them in a step of gradient descent: the output, then slopes over weights and over inputs
 COPIES = 64
 GOAL = 0.60  # of the time that Stable-Baselines3 by itself takes

@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     import filterpy.kalman
 
 
-CHANGES = ": what changes is an input of a model, transition(x, u, c) or observe(x, u, c) (docs/other_packages.md)"
+AS_INPUT = (
+    ": what changes is an input of a model, transition(x, u, c) or observe(x, u, c) (docs/other_packages.md)"
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,7 +80,8 @@ def from_filterpy(kf: Any, *, update_first: bool = False, first_input: ArrayLike
     Raises:
         ValueError: for another class, a fading memory, or correlated noise.
     """
-    f, h, q, r, x, p = _attributes(kf, "a filterpy.kalman.KalmanFilter", "F", "H", "Q", "R", "x", "P")
+    way = ": a filter of functions is make_filter(name, StateSpaceModel(transition=..., observe=...))"
+    f, h, q, r, x, p = _attributes(kf, "a filterpy.kalman.KalmanFilter", "F", "H", "Q", "R", "x", "P", way=way)
     for name, neutral in (("alpha", 1.0), ("M", 0.0)):
         if np.any(np.asarray(getattr(kf, name, neutral)) != neutral):
             rule = f"a filter of FilterPy must have {name} = {neutral:g}"
@@ -147,7 +150,7 @@ def from_pykalman(kf: Any) -> KalmanFilter:
     for name, value in values.items():
         most = 1 if name.endswith(("offsets", "mean")) else 2
         if value.ndim > most:
-            raise ValueError(f"{name} must be the same in all steps, but has shape {value.shape}{CHANGES}")
+            raise ValueError(f"{name} must be the same in all steps, but has shape {value.shape}{AS_INPUT}")
     a, offset, q, h, shift, r, mean, cov = values.values()
     return _filter(a, np.zeros((len(a), 0)), h, q, r, mean, cov, state_offset=offset, measurement_offset=shift)
 
@@ -173,7 +176,7 @@ def from_statsmodels(results: Any) -> KalmanFilter:
     for name in names:
         value = as_floats(getattr(part, name))
         if value.shape[-1] > 1 and (value != value[..., :1]).any():
-            raise ValueError(f"{name} must be the same in all steps, but changes{CHANGES}")
+            raise ValueError(f"{name} must be the same in all steps, but changes{AS_INPUT}")
         matrices.append(value[..., 0])
     f, c, selection, noise, h, d, r = matrices
     diffuse = getattr(part, "initial_diffuse_state_cov", None)
@@ -251,12 +254,11 @@ def from_control(
     return _filter(a, b, c, q, r, np.zeros(n) if prior_mean is None else prior_mean, prior_cov, dt=dt)
 
 
-def _attributes(value: Any, kind: str, *names: str) -> list[np.ndarray]:
-    """Attributes as matrices; ValueError where one is missing."""
+def _attributes(value: Any, kind: str, *names: str, way: str = "") -> list[np.ndarray]:
+    """Attributes as matrices; ValueError, with the way out, if one is missing."""
     missing = [name for name in names if getattr(value, name, None) is None]
     if missing:
-        way = "a filter of functions is make_filter(name, StateSpaceModel(transition=..., observe=...))"
-        raise ValueError(f"it must be {kind}, but a {type(value).__name__} has no {', '.join(missing)}: {way}")
+        raise ValueError(f"it must be {kind}, but a {type(value).__name__} has no {', '.join(missing)}{way}")
     return [np.atleast_2d(as_floats(getattr(value, name))) for name in names]
 
 

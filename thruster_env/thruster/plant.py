@@ -33,7 +33,6 @@ from thruster_env.thruster.analysis import (
     LinearModel,
     equilibrium,
     required_substeps_of_all,
-    state_range,
     steady_state,
 )
 from thruster_env.thruster.dynamics import Constants
@@ -295,7 +294,6 @@ def differences(then: Mapping, now: Mapping) -> tuple[list[str], list[str]]:
 
 
 DEFAULT_WEIGHTS = (1.0, 0.0, 0.01)  # tracking, energy, voltage rate
-ABSURD = 100.0  # a state this many times its range away from rest ends the episode
 
 
 class Task(NamedTuple):
@@ -335,15 +333,3 @@ def thrust_scale(plant: Plant) -> float:
     if plant.linear is None:
         return steady_state(plant.parameters, plant.max_voltage).thrust
     return float(abs(equilibrium(plant.linear, (plant.max_voltage, 0.0))[2]))
-
-
-def state_limits(plant: Plant) -> np.ndarray:
-    """Magnitudes (2,) of omega_m [rad/s] and U_a [m/s] at which an episode ends."""
-    if plant.linear is not None:
-        speed, flow, _ = equilibrium(plant.linear, (plant.max_voltage, plant.ambient_velocity))
-        # The open-bladed system hardly answers to the voltage: its noise is larger than its range.
-        spread = np.sqrt(np.diag(plant.initial_cov)) + np.sqrt(np.diag(plant.process_noise_cov))
-        return ABSURD * (2 * np.abs([speed, flow]) + np.abs(plant.initial_mean) + spread)
-    flow = abs(plant.ambient_velocity)
-    turned_by_flow = np.array([flow / plant.constants.blade_speed, flow])
-    return ABSURD * (state_range(plant.parameters, plant.max_voltage) + turned_by_flow)

@@ -325,8 +325,8 @@ class SeriesFit(Result):
             sentences += [
                 f"{who} ({where}), beyond {self.gate:g} standard deviations of the prediction: Q and R are those "
                 "of the others.",
-                f"So a filter has to leave out outliers, too, as the lines of --code do, fit.filter.session("
-                f"gate={self.gate:g}, most={BURST}), and the filter ekf-robust.",
+                "A filter must leave out outliers, too: use the lines of --code, fit.filter.session("
+                f"gate={self.gate:g}, most={BURST}) or --filter ekf-robust.",
             ]
         if self.jumps:
             row, height = max(self.jumps, key=lambda jump: abs(jump[1]))

@@ -57,10 +57,10 @@ class Far(NamedTuple):
 def without_outliers(column: Column, fit: Callable[[Column], SeriesFit]) -> SeriesFit:
     """The fit without the outliers, which it names.
 
-    All numbers count if more than `MOST` of them are outliers, if outliers come at regular times, if they are most
-    of a stretch, if the others do not vary, or if the model does not fit these: it predicts too poorly then to
-    tell outliers from a course that it misses, but for those also far from their neighbours, unless most
-    of a stretch are: that has another variance.
+    All numbers count if more than `MOST` of them are outliers, if they come at regular times, if they are most of
+    a stretch, which then has another variance, or if the others do not vary. If the model does not fit the others,
+    it predicts too poorly to tell an outlier from a course that it misses: then only numbers that are also far
+    from the median of their neighbours are left out.
 
     Args:
         column: the numbers.
@@ -70,21 +70,21 @@ def without_outliers(column: Column, fit: Callable[[Column], SeriesFit]) -> Seri
     far = far_of_all = far_from(of_all.chosen, of_all.level, column)
     if not (far.outliers.any() or far.jumps or _hides_many(of_all)):
         return of_all
-    off = far_from_medians(column)
-    answer, first = of_all, far.outliers | off
+    off_median = far_from_medians(column)
+    answer, first = of_all, far.outliers | off_median
     if not first.any():
         return replace(of_all, jumps=far.jumps)
     try:
         for _ in range(CHOICES):
-            outliers = _settled(answer.chosen, column, first, off)
-            answer, far = _fit_without(outliers, column, fit, off)
+            outliers = _settled(answer.chosen, column, first, off_median)
+            answer, far = _fit_without(outliers, column, fit, off_median)
             first = far.outliers
             if (first == outliers).all():
                 break
-        certain = outliers & off
-        if answer.is_wrong and certain.any() and not _are_together(off):
+        certain = outliers & off_median
+        if answer.is_wrong and certain.any() and not _are_together(off_median):
             outliers = certain
-            answer, far = _fit_without(outliers, column, fit, off)
+            answer, far = _fit_without(outliers, column, fit, off_median)
         elif answer.is_wrong:
             raise NoOutliersError("without them no model that was tried fits")
         if not outliers.any():
@@ -100,13 +100,13 @@ def without_outliers(column: Column, fit: Callable[[Column], SeriesFit]) -> Seri
         if far.jumps:
             return answer
         what = "their neighbours"
-    count = int((far_of_all.outliers if far_of_all.outliers.any() else off).sum())
+    count = int((far_of_all.outliers if far_of_all.outliers.any() else off_median).sum())
     numbers = "1 number is" if count == 1 else f"{count} numbers are"
     return replace(answer, peaks=f"{numbers} far from {what}, but part of the fit: {reason}.")
 
 
 def _fit_without(
-    outliers: np.ndarray, column: Column, fit: Callable[[Column], SeriesFit], off: np.ndarray
+    outliers: np.ndarray, column: Column, fit: Callable[[Column], SeriesFit], off_median: np.ndarray
 ) -> tuple[SeriesFit, Far]:
     """The fit without outliers, and what is far from that, unless they are signal."""
     rows = np.flatnonzero(outliers.any(axis=1))
@@ -114,7 +114,7 @@ def _fit_without(
     if _are_together(outliers):
         raise NoOutliersError("they are most numbers of a stretch, which has another variance")
     answer = fit(column.without(outliers))
-    return answer, far_from(answer.chosen, answer.level, column, off)
+    return answer, far_from(answer.chosen, answer.level, column, off_median)
 
 
 def _hides_many(fit: SeriesFit) -> bool:
@@ -158,10 +158,10 @@ def _are_together(off: np.ndarray) -> bool:
     return any(np.convolve(axis, np.ones(4 * BURST)).max() > 2 * BURST for axis in off.T)
 
 
-def _settled(candidate: Candidate, column: Column, outliers: np.ndarray, off: np.ndarray) -> np.ndarray:
+def _settled(candidate: Candidate, column: Column, outliers: np.ndarray, off_median: np.ndarray) -> np.ndarray:
     """The outliers of one model, fitted without them again and again until they stay the same, (K, axes).
 
-    It begins without `outliers`, (K, axes); `off` are those far from the median of their neighbours.
+    It begins without `outliers`, (K, axes); `off_median` are those far from the median of their neighbours.
 
     Raises:
         NoOutliersError: if more than `MOST` of the numbers are outliers.
@@ -171,16 +171,18 @@ def _settled(candidate: Candidate, column: Column, outliers: np.ndarray, off: np
         if outliers.sum() > MOST * column.measured.sum():
             raise NoOutliersError(f"there are more than {100.0 * MOST:.0f} % of them")
         fitted = most_likely(model, column.without(outliers))
-        before, outliers = outliers, far_from(fitted.candidate, fitted.mean, column, off).outliers
+        before, outliers = outliers, far_from(fitted.candidate, fitted.mean, column, off_median).outliers
         if (before == outliers).all():
             break
     return outliers
 
 
-def far_from(candidate: Candidate, level: np.ndarray | None, column: Column, off: np.ndarray | None = None) -> Far:
+def far_from(
+    candidate: Candidate, level: np.ndarray | None, column: Column, off_median: np.ndarray | None = None
+) -> Far:
     """Outliers and jumps of a column under a fitted model; `level` is the mean about which it varies, if any.
 
-    Until the filter has followed a jump, outliers are those far from the median of their neighbours, `off`.
+    Until the filter has followed a jump, outliers are those far from the median of their neighbours, `off_median`.
     Outliers among the first numbers, from which the filter learns its state, are those of the record backwards:
     all named models are the same in both directions.
     """
@@ -188,7 +190,7 @@ def far_from(candidate: Candidate, level: np.ndarray | None, column: Column, off
     begin, outliers = column.rows(0, SETTLING).backwards, np.zeros(column.table.shape, dtype=bool)
     backwards = _far(candidate, level, begin, outliers[:SETTLING]).outliers[::-1]
     outliers[:first] = backwards[:first]
-    return _far(candidate, level, column, outliers, off)
+    return _far(candidate, level, column, outliers, off_median)
 
 
 def _far(
@@ -196,8 +198,13 @@ def _far(
     level: np.ndarray | None,
     column: Column,
     outliers: np.ndarray,
-    off: np.ndarray | None = None,
+    off_median: np.ndarray | None = None,
 ) -> Far:
+    """`far_from`, with outliers among the first numbers that are known before.
+
+    Each pass filters without the outliers known so far, and takes the first far number of each group, since those
+    behind it may be far because of it. A group after which the record stays where it went is a jump.
+    """
     named, values = named_model(candidate.name), candidate.values
     model = model_of(named, column, values, level)
     signal = named.signal(_signal_values(candidate))
@@ -222,15 +229,15 @@ def _far(
                     while end < len(far) and (settled[end, axis] or outliers[end, axis]):
                         end += 1  # what was far after it was so because of it
                     outliers[begin:end, axis] = False
-                    if off is not None:
+                    if off_median is not None:
                         after = column.table[begin:end, axis]
                         apart = np.abs(after - np.nanmedian(after)) > 0.5 * abs(height)
-                        outliers[begin:end, axis] = off[begin:end, axis] & apart
+                        outliers[begin:end, axis] = off_median[begin:end, axis] & apart
                     jumps.append((begin, float(relative[begin, axis])))
             rows = np.flatnonzero(far[:, axis])
             order = np.cumsum(column.measured[:, axis])[rows]
             alone = np.diff(order, prepend=-2 * BURST) > BURST  # those after it may be far because of it
-            rows = rows[alone if off is None else alone | off[rows, axis]]
+            rows = rows[alone if off_median is None else alone | off_median[rows, axis]]
             outliers[rows, axis], heights[rows, axis] = True, innovations[rows, axis]
             relative[rows, axis] = innovations[rows, axis] / deviations[rows, axis]
             far[:, axis] = False
