@@ -50,6 +50,7 @@ def test_labels_of_figures_show_a_name_as_it_is(name):
     axis.set_ylabel(Quantity(name, "omega_m", name[:20]).plot_label)
     figure.savefig(io.BytesIO(), format="svg")
     assert verbatim(name).replace(r"\$", "$") == name and len(verbatim(name, most=90)) < 100
+    assert verbatim("log L of the\ninnovations\a") == "log L of the\ninnovations?"
 
 
 @pytest.mark.parametrize("name", [r"$\frac$", "[/]", "n" * 400])

@@ -52,10 +52,10 @@ def showable(text: str, encoding: str) -> str:
 
 
 def verbatim(text: str, most: int | None = None) -> str:
-    """A user's text for a figure: dollars are escaped, and the middle of a long text is left out."""
+    """A user's text for a figure: dollars are escaped, lines stay, and the middle of a long text is left out."""
     if most is not None and len(text) > most:
         text = f"{text[: most // 2]}...{text[-(most // 2) :]}"
-    return "".join(character if character.isprintable() else "?" for character in text).replace("$", r"\$")
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in text).replace("$", r"\$")
 
 
 def _replace(error: UnicodeError) -> tuple[str, int]:

@@ -354,7 +354,7 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
         line, dots = line_of(angle, filtered.time, measured[:, j]), {}
         if is_sparse(~np.isnan(measured[:, j])):
             dots = SPARSE
-        axis.plot(*line, label="measured", **(MEASURED | {"linewidth": 2.0} | dots))
+        axis.plot(*line, label="measured", **(MEASURED | {"linewidth": 2.0, "markeredgewidth": 3.0} | dots))
         expected = measured[:, j] - filtered.innovations[:, j]
         expected = wrapped(expected) if angle else expected
         line = line_of(angle, filtered.time, expected)
