@@ -643,3 +643,31 @@ def test_data_without_noise_are_called_that():
     for exact in (tiny, 3.0 + 2.0 * (0.1 * np.arange(200))):
         with pytest.raises(ValueError, match="z must have noise, .* lie on a smooth curve to"):
             tuning.fit(exact, 0.1)
+
+
+def test_samples_that_are_no_measurements_do_not_change_q_and_r():
+    """Placeholders, a sensor that sticks, and one that is slower than the log."""
+    clean = simulated("constant", 600) + 20.0
+    missing, rows = clean.copy(), np.arange(600)
+    missing[(200 <= rows) & (rows < 240)] = np.nan
+    reference = tuning.fit(missing, 0.1, model="constant")
+    for number in (-999.0, 0.0, clean[199]):
+        fit = tuning.fit(np.where(np.isnan(missing), number, missing), 0.1, model="constant")
+        assert fit.r == pytest.approx(reference.r, rel=0.02) and fit.q == pytest.approx(reference.q, rel=0.02)
+        assert any("left out" in sentence for sentence in fit.sentences())
+    slow, held = (tuning.fit(*record, model="constant") for record in ((clean, 0.5), (np.repeat(clean, 5), 0.1)))
+    assert held.r == pytest.approx(slow.r, rel=1e-9) and held.q == pytest.approx(slow.q, rel=1e-9)
+    assert held.column.dt == pytest.approx(0.5) and "5 times" in " ".join(held.sentences())
+
+
+def test_an_angle_that_wraps_goes_on():
+    course = 40.0 * simulated("constant", 600)
+    straight, wrapped = (
+        tuning.fit({"t": 0.1 * np.arange(600), "heading[deg]": angle}, model="constant")
+        for angle in (course, np.mod(course, 360.0))
+    )
+    assert wrapped.r == pytest.approx(straight.r, rel=1e-6) and wrapped.q == pytest.approx(straight.q, rel=1e-6)
+    assert any("wraps" in sentence for sentence in wrapped.sentences())
+    for language in LANGUAGES:
+        assert "z + 360 round((z_before - z)/360)" in wrapped.code(language)
+        assert "z_before" not in straight.code(language)

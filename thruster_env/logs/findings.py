@@ -1,8 +1,8 @@
 """Findings in a recorded run that affect the trust in results from it.
 
 They are gaps; rows that were moved, dropped or doubled; inputs without samples; sensors that are stuck or
-saturated; outliers and bursts of them; axes or units of inertial sensors that differ; and the way times were
-read, if the file does not state it.
+saturated; samples that are no measurements; outliers and bursts of them; axes or units of inertial sensors that
+differ; and the way times were read, if the file does not state it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 GAP, MISSING, MOVED, DROPPED, DOUBLED = "gap", "missing rows", "moved", "dropped", "doubled"
 STUCK, SATURATED, OUTLIER = "stuck", "saturated", "outlier"
+WRAPPED = "wrapped"  # a measured angle
+PLACEHOLDER, REPEATED = "placeholder", "repeated"  # samples that are no measurements, and are left out
 DAMAGED = "damaged"  # the file: of its messages some are not read
 CLOCK, OUTSIDE, STALE = "clock", "outside", "no input"
 MISALIGNED, QUATERNION = "axes or units", "quaternion"
@@ -31,6 +33,12 @@ LEVEL = 1e-4
 SHORTEST = 8  # samples: a run of equal ones that is worth a word
 COMMON = 0.1  # of neighbours that are equal: the channel is quantised
 RUNS = 3
+CHANGES = 20  # of a channel, at least, from which the rate of a slower sensor is seen
+TURNS = {"deg": 360.0, "rad": 2.0 * np.pi}
+SPANNED, CLOSED = 0.75, 1.000001  # share of a turn that samples of an angle that wraps span
+ACROSS = 0.25  # share of a turn that their steps across its end have at most
+SELDOM = 0.25  # share of a channel's samples that a placeholder may have
+REPEATS, UNLIKE = 0.6, 0.9  # most new samples in all of a slower sensor, and fewest values in its new samples
 OFTENER = 4.0
 SPIKE, ALONE = 7.0, 2.0
 AROUND = 25  # samples before and after, whose differences tell the noise, too
@@ -63,6 +71,7 @@ class Recording(NamedTuple):
     dropped: tuple[tuple[str, int], ...] = ()  # samples of a channel beside a nearer one of the same grid time
     damage: tuple[str, ...] = ()  # what of the file is not read because it is damaged, in words
     remarks: tuple[Remark, ...] = ()  # how the file was read
+    turns: tuple[tuple[str, float], ...] = ()  # measured angles to which whole turns were added, and a turn
 
 
 @dataclass(frozen=True)
@@ -71,7 +80,8 @@ class Finding:
 
     Attributes:
         kind: "damaged", "clock", "outside", "no input", "gap", "missing rows", "moved", "dropped", "doubled",
-            "stuck", "saturated", "outlier", "axes or units" or "quaternion".
+            "stuck", "saturated", "outlier", "placeholder", "repeated", "wrapped", "axes or
+            units" or "quaternion".
         channel: such as "measurement:thrust"; empty for all of a row.
         first: row of the log where it begins; 0 if it is everywhere.
         last: row where it ends, included.
@@ -176,14 +186,22 @@ def _of_channel(log: Log, column: int, channel: str) -> list[Finding]:
     if len(rows) < SHORTEST:
         return []
     values, quantity = values[rows], log.measured[column]
+    turned: list[Finding] = []
+    if (turn := dict(log.recording.turns).get(channel, 0.0)) > 0.0:
+        text = f"{_name(channel)} wraps: whole turns ({turn:.6g}) are added, and a filter needs the same"
+        turned.append(Finding(WRAPPED, channel, 0, log.steps, len(rows), text))
+    elif not quantity.angle and turn_of(values, quantity.unit):
+        text = f"{_name(channel)} wraps like an angle, and the model does not have it as one (angle=True)"
+        turned.append(Finding(WRAPPED, channel, 0, log.steps, len(rows), text))
     runs = _runs_of_equals(values)
     findings, ends = _saturated(log, channel, rows, values, runs)
-    for first, count in _stuck(log, rows, values, runs):
+    for first, count in _stuck(log, rows, values, runs, quantity.angle):
         if values[first] in ends:  # said already
             continue
         low, high = int(rows[first]), int(rows[first + count - 1])
         text = f"{_name(channel)} is stuck at {values[first]:.6g} for {count} samples{_where(log, low, high)}"
         findings.append(Finding(STUCK, channel, low, high, count, text))
+    findings = turned + findings
     bursts = _bursts(log, rows, values, quantity.angle)
     for begin, end in bursts:
         first, last = int(rows[begin]), int(rows[end])
@@ -209,6 +227,58 @@ def outliers(log: Log, channel: str) -> np.ndarray:
     bursts = _bursts(log, rows, values, angle)
     indices = [np.arange(begin, end + 1) for begin, end in bursts]
     return rows[np.sort(np.concatenate([*indices, _alone(_spikes(rows, values, angle), bursts)]).astype(int))]
+
+
+def unmeasured(values: np.ndarray) -> tuple[np.ndarray, list[tuple[str, str]]]:
+    """Which samples of a channel are no measurements, (N,), and kinds and texts of these findings.
+
+    A placeholder of missing numbers, such as -999, comes more than once and is farther from all other values than
+    their range. A sample is repeated if its sensor is slower than the log: either the channel changes in every
+    p-th sample alone, or hardly a value comes again later, as it would in a quantised channel.
+
+    Args:
+        values: samples of the channel, (N,).
+    """
+    left_out, texts = np.zeros(len(values), dtype=bool), []
+    levels, counts = np.unique(values, return_counts=True)
+    for end, inner in ((0, levels[1:]), (-1, levels[:-1])) if len(levels) > SHORTEST else ():
+        if 1 < counts[end] < SELDOM * len(values) and abs(levels[end] - inner[end]) > np.ptp(inner):
+            left_out |= values == levels[end]
+            text = f"is {levels[end]:.6g} in {counts[end]} samples, far from all others: they are left out"
+            texts.append((PLACEHOLDER, text))
+            break
+    rows = np.flatnonzero(~left_out)
+    repeated = np.append(False, np.diff(values[rows]) == 0)
+    new = rows[~repeated]
+    if len(new) > CHANGES:
+        period = int(np.gcd.reduce(np.diff(new)))
+        if period > 1:
+            repeated = (rows - new[0]) % period != 0
+        elif len(new) > REPEATS * len(rows) or len(levels) < UNLIKE * len(new):
+            return left_out, texts
+        left_out[rows[repeated]] = True
+        times = round(len(rows) / np.count_nonzero(~repeated))
+        text = f"has each number {times} times, as its sensor is slower than the log: repeats are left out"
+        texts.append((REPEATED, text))
+    return left_out, texts
+
+
+def turn_of(values: np.ndarray, unit: str) -> float:
+    """A whole turn in the unit of an angle whose samples wrap, 0 for other samples.
+
+    They span most of a turn and no more, and a step from one of its ends to the other is short on a circle.
+
+    Args:
+        values: samples of the channel, (N,).
+        unit: "deg" or "rad"; without one both are tried.
+    """
+    span = float(np.ptp(values)) if len(values) else 0.0
+    for turn in (TURNS[unit],) if unit in TURNS else TURNS.values() if not unit else ():
+        across = abs(np.diff(values)) > 0.5 * turn
+        steps = abs(np.diff(np.unwrap(values, period=turn)))[across]
+        if SPANNED * turn < span <= CLOSED * turn and len(steps) and float(np.median(steps)) < ACROSS * turn:
+            return turn
+    return 0.0
 
 
 def _runs_of_equals(values: np.ndarray) -> list[tuple[int, int]]:
@@ -237,12 +307,15 @@ def _by_chance(values: np.ndarray, first: int, count: int, equal: int, pairs: in
     return len(values) * max(share, share_there) ** (count - 1) >= LEVEL
 
 
-def _stuck(log: Log, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+def _stuck(
+    log: Log, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int, int]], angle: bool
+) -> list[tuple[int, int]]:
     """Runs of identical samples in a row that quantisation does not explain.
 
-    At rest, while no input changes, a quantised channel and one that reads 0 may stay where they are.
+    At rest, while no input changes, a quantised channel and one that came to 0 without a jump may stay there.
     """
     equal, pairs, stretches = int((np.diff(values) == 0).sum()), len(values) - 1, []
+    steps, noise = _steps_and_noise(values, angle)
     for first, count in sorted(runs, key=lambda run: -run[1]):
         equal, pairs = equal - (count - 1), pairs - (count - 1)  # each is held against those that are shorter
         if count < SHORTEST or _by_chance(values, first, count, equal, pairs):
@@ -250,7 +323,9 @@ def _stuck(log: Log, rows: np.ndarray, values: np.ndarray, runs: list[tuple[int,
         inputs = log.inputs[rows[first] : rows[first + count - 1]]
         at_rest = len(inputs) == 0 or bool((np.ptp(inputs, axis=0) == 0).all())
         quantised = equal + 1 > COMMON * (pairs + 2)
-        if not (at_rest and (quantised or values[first] == 0.0)):
+        last = first + count - 1
+        jumps = 0 < first and last < len(steps) and min(abs(steps[[first - 1, last]])) > SPIKE * noise
+        if not (at_rest and (quantised or values[first] == 0.0 and not jumps)):
             stretches.append((first, count))
     return sorted(stretches)
 

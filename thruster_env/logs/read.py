@@ -24,7 +24,7 @@ from thruster_env.logs.columns import (
     find_wanted,
     quantities_of,
 )
-from thruster_env.logs.findings import CLOCK, STALE, Recording, Remark
+from thruster_env.logs.findings import CLOCK, STALE, Recording, Remark, turn_of, unmeasured
 from thruster_env.logs.grid import (
     CLOSE_TO_GRID,
     MOST_HELD,
@@ -157,6 +157,7 @@ def read_log(
     inputs_act: str | None = None,
     name: str = "a table",
     table: Table | None = None,
+    unwrap: bool = False,
 ) -> Log:
     """Read a log of a model's inputs and measurements from a file; columns of states and outputs are references.
 
@@ -195,6 +196,7 @@ def read_log(
             "from" for others.
         name: of a log that is not a file.
         table: of the file, if it was read before.
+        unwrap: whether whole turns are added to measured angles that wrap, for a linear model.
 
     Raises:
         ValueError: if a column is missing, or a value is wrong; it names file, line and column.
@@ -233,7 +235,7 @@ def read_log(
     common = {offsets.get(channel.key, 0.0) for channel in wanted if channel.key in column_of}
     if len(common) == 1 and any(common) and not model.input_quantities:
         start, offsets = start - common.pop(), {}  # one clock for all: times move, and no sample is interpolated
-    source, parts, turned = {}, {}, list[Remark]()
+    source, parts, turned, unwrapped = {}, {}, list[Remark](), dict[str, float]()
     rows, dropped = np.zeros(len(of_file.times), bool), []
     in_file = [channel for channel in wanted if channel.key in column_of]
     read = {channel.key: _series(table, column_of[channel.key], channel, of_file) for channel in in_file}
@@ -243,6 +245,13 @@ def read_log(
         turned += quaternions.remark_on_numbers(model, table.names, column_of)
     for channel in in_file:
         series, present = samples[channel.key], read[channel.key][1]
+        if channel.kind == MEASUREMENT and not model.measured_turns:
+            series, left_out = _measured(series, channel)
+            turned += left_out
+            turn = turn_of(series.values, channel.quantity.unit) if unwrap else 0.0
+            if turn:
+                unwrapped[channel.key] = turn
+                series = Series(series.times, np.unwrap(series.values, period=turn))
         if until and channel.kind == INPUT:  # a sample acts since the one before
             values = series.values[-len(series.values) + 1 :]
             if act == "between" and len(series.values) > 1:
@@ -300,10 +309,20 @@ def read_log(
         source=source,
         offsets=offsets,
         irregular=of_file.irregular,
-        recording=recording._replace(damage=table.damage, remarks=remarks),
+        recording=recording._replace(damage=table.damage, remarks=remarks, turns=tuple(unwrapped.items())),
         stamps=marks,
         until=until,
     )
+
+
+def _measured(series: Series, channel: Wanted) -> tuple[Series, list[Remark]]:
+    """The samples of a channel that are measurements, and what of the others is to be said."""
+    left_out, texts = unmeasured(series.values)
+    if not texts:
+        return series, []
+    name = channel.key.partition(":")[2]
+    remarks = [Remark(kind, channel.key, f"{name} {text}") for kind, text in texts]
+    return Series(series.times[~left_out], series.values[~left_out]), remarks
 
 
 def _doubled(grid: Grid) -> int:

@@ -489,7 +489,7 @@ class SeriesFit(Result):
                 f'but {self.name} {forgets}: take code("python") or code("filterpy"), whose gain varies, or '
                 "thruster tune and export, which write such a one in C"
             )
-        return lines_of(language, self.model, self._gains(), self.column.dt, self.gate)
+        return lines_of(language, self.model, self._gains(), self.column.dt, self.gate, self.column.turns)
 
 
 def _step_text(dt: float) -> str:

@@ -19,7 +19,18 @@ import numpy as np
 from filters.models import Scales, named_model
 from thruster_env.core.checks import as_floats, listed, one_of, short_repr
 from thruster_env.logs.columns import COUNTERS, DATE_NAMES, TIME, TIME_NAMES, parted
-from thruster_env.logs.findings import CLOCK, GAP, MISSING, OUTLIER, Remark, sentences
+from thruster_env.logs.findings import (
+    CLOCK,
+    GAP,
+    MISSING,
+    OUTLIER,
+    PLACEHOLDER,
+    REPEATED,
+    STUCK,
+    WRAPPED,
+    Remark,
+    sentences,
+)
 from thruster_env.logs.grid import resolution_of_digits
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
@@ -53,6 +64,7 @@ class Column:
         quantities: name, symbol and unit of the numbers of each axis.
         remarks: what was found while they were read, in sentences.
         stamps: times of the rows [s], (K,), 0 at the first, where steps are unequal; otherwise None.
+        turns: what was a whole turn of each axis, before turns were added so that its numbers go on; 0 for others.
     """
 
     values: np.ndarray
@@ -60,6 +72,7 @@ class Column:
     quantities: tuple[Quantity, ...]
     remarks: tuple[str, ...] = ()
     stamps: np.ndarray | None = None
+    turns: tuple[float, ...] = ()
 
     @property
     def times(self) -> np.ndarray:
@@ -124,7 +137,10 @@ class Column:
 
     def axis(self, index: int) -> Column:
         """One axis alone."""
-        return replace(self, values=self.table[:, index], quantities=self.quantities[index : index + 1])
+        alone = slice(index, index + 1)
+        return replace(
+            self, values=self.table[:, index], quantities=self.quantities[alone], turns=self.turns[alone]
+        )
 
     def middle(self, most: int) -> Column:
         """The column itself, or its middle rows if it has more than `most`."""
@@ -175,13 +191,31 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
             or log.recording.jitter > resolution_of_digits(at_times.times + at_times.start, log.dt)
         ):
             log, stamps = at_times, at_times.times
-    for quantity, values in zip(log.measured, log.measurements.T, strict=True):
-        _check_numbers(quantity.symbol, values)
-    values = log.measurements[:, 0] if len(log.measured) == 1 else log.measurements
-    lost = (GAP, MISSING) if stamps is None else ()  # of which one sentence tells all
-    remarks = sentences([finding for finding in log.findings if finding.kind not in (*lost, OUTLIER)])
+    channels = [f"measurement:{quantity.symbol}" for quantity in log.measured]
+    of_turns = dict(log.recording.turns)
+    turns = tuple(of_turns.get(channel, 0.0) for channel in channels)
+    if any(remark.kind == REPEATED for remark in log.recording.remarks):
+        rows = (~np.isnan(log.measurements)).any(axis=1)
+        units = [f"[{quantity.unit}]" if quantity.unit else "" for quantity in log.measured]
+        headers = [f"{quantity.name}{unit}" for quantity, unit in zip(log.measured, units, strict=True)]
+        columns = dict(zip(headers, log.measurements[rows].T, strict=True))
+        slower = column_of({TIME_HEADER: log.times[rows], **columns}, column=headers)
+        remarks = sentences(
+            [finding for finding in log.findings if finding.kind in (PLACEHOLDER, REPEATED, WRAPPED)]
+        )
+        return replace(slower, remarks=(*remarks, *slower.remarks), turns=turns)
+    table, findings = log.measurements.copy(), []
+    for finding in log.findings:
+        if finding.kind == STUCK:
+            table[finding.first : finding.last + 1, channels.index(finding.channel)] = np.nan
+            finding = replace(finding, sentence=f"{finding.sentence}: they are left out")
+        if finding.kind not in (GAP, MISSING) * (stamps is None) + (OUTLIER,):  # one sentence tells all
+            findings.append(finding)
+    for quantity, numbers in zip(log.measured, table.T, strict=True):
+        _check_numbers(quantity.symbol, numbers)
+    values = table[:, 0] if len(log.measured) == 1 else table
     missing = [] if stamps is not None else _missing(log.measurements, log.dt)
-    return Column(values, log.dt, log.measured, (*remarks, *missing), stamps)
+    return Column(values, log.dt, log.measured, (*sentences(findings), *missing), stamps, turns)
 
 
 def _missing(values: np.ndarray, dt: float) -> list[str]:
@@ -245,7 +279,7 @@ def log_of_columns(
         refuse_holes(z.index)
     options["dt"] = 1.0 if dt is None and time is None and not recorded else dt
     options = {key: value for key, value in options.items() if value is not None}
-    log = read_log(source, reader, columns, table=table, **options)
+    log = read_log(source, reader, columns, table=table, unwrap=True, **options)
     if not is_table or recorded or time is not None or dt is not None or table is None:
         return log
     further = [name for name in table.names if name not in headers]

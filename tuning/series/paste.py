@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -13,7 +13,14 @@ ARDUINO = "arduino"  # the only one of constant gain
 BURST = 10  # far numbers in a row that are outliers; more are a jump
 
 
-def lines_of(language: str, model: AffineModel, gain: np.ndarray, dt: float, gate: float | None = None) -> str:
+def lines_of(
+    language: str,
+    model: AffineModel,
+    gain: np.ndarray,
+    dt: float,
+    gate: float | None = None,
+    turns: Sequence[float] = (),
+) -> str:
     """The filter of a model without inputs as lines of a language, below a comment with sample time and units.
 
     Args:
@@ -22,6 +29,7 @@ def lines_of(language: str, model: AffineModel, gain: np.ndarray, dt: float, gat
         gain: K (n, m), the steady-state gain.
         dt: sample time [s].
         gate: standard deviations of S beyond which measurements are left out; all are taken if None.
+        turns: a whole turn of each measurement that wraps, 0 for others; none do if empty.
 
     Raises:
         ValueError: for another language.
@@ -32,7 +40,14 @@ def lines_of(language: str, model: AffineModel, gain: np.ndarray, dt: float, gat
         f"{word}: {', '.join(f'{quantity.symbol} [{quantity.unit or 1}]' for quantity in quantities)}"
         for word, quantities in (("measured", model.measurements), ("state", model.states))
     ]
-    return "\n".join([f"{comment} a step is {dt:.12g} s", *(f"{comment} {line}" for line in units), lines])
+    unwrapped = [
+        f"{quantity.symbol} wraps: before the filter z = z + {turn:.12g} round((z_before - z)/{turn:.12g}), "
+        "where z_before is the last such z"
+        for quantity, turn in zip(model.measurements, turns, strict=False)
+        if turn
+    ]
+    heads = [f"{comment} {line}" for line in (f"a step is {dt:.12g} s", *units, *unwrapped)]
+    return "\n".join([*heads, lines])
 
 
 def _python(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:

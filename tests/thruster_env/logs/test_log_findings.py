@@ -7,7 +7,7 @@ import pytest
 
 from tests.thruster_env.logs.test_logs import MODEL
 from tests.tuning.test_log_problem import logs_of
-from thruster_env.logs.findings import has_outliers, outliers, remarks_on, sentences
+from thruster_env.logs.findings import has_outliers, outliers, remarks_on, sentences, turn_of
 from thruster_env.logs.read import read_log
 from tuning.problems.find import find_problem
 
@@ -89,6 +89,42 @@ def test_quantisation_and_rest_are_no_stuck_sensor():
     for name in ("voltage", "tach"):
         table[name][:300] = 0.0  # at rest, and the sensor has no noise there
     assert not found(table)[0]
+
+
+def test_a_zero_between_jumps_is_stuck():
+    table = recorded()
+    table["tach"] = table["tach"] + 3.0
+    table["tach"][400:430] = 0.0
+    table["tach"][0] = -4.0  # so that 0 is no placeholder
+    kinds, _ = found(table)
+    assert kinds["stuck"].count == 30 and "tach is stuck at 0 for 30 samples" in kinds["stuck"].sentence
+
+
+def test_placeholders_and_repeats_are_no_measurements():
+    table = recorded()
+    held = np.repeat(table["tach"][::5], 5)
+    for tach, kind, left in (
+        (np.where(np.arange(1000) % 100 < 3, -999.0, table["tach"]), "placeholder", np.arange(1000) % 100 >= 3),
+        (held, "repeated", np.arange(1000) % 5 == 0),
+        (np.round(held, 1), "repeated", np.arange(1000) % 5 == 0),  # equal neighbours among the measured ones, too
+        (np.repeat(table["tach"], np.tile([2, 4, 3, 3], 250))[:1000], "repeated", None),
+    ):
+        kinds, log = found({**table, "tach": tach})
+        finding, measured = kinds.pop(kind), ~np.isnan(log.measurements[:, 0])
+        expected = np.append(True, np.diff(tach) != 0) if left is None else left
+        assert not kinds and "left out" in finding.sentence
+        np.testing.assert_array_equal(measured, expected)
+        np.testing.assert_array_equal(log.measurements[measured, 0], tach[measured])
+
+
+@pytest.mark.parametrize(("unit", "turn"), [("deg", 360.0), ("rad", 2.0 * np.pi), ("", 360.0)])
+def test_an_angle_wraps_only_if_its_samples_span_a_turn(unit, turn):
+    angle = np.cumsum(np.random.default_rng(0).normal(size=1000)) * turn / 20.0
+    assert turn_of(np.mod(angle, turn), unit) == turn_of(np.mod(angle, turn) - 0.5 * turn, unit) == turn
+    assert not turn_of(angle, unit) and not turn_of(np.mod(angle, turn), "m")
+    jumps = np.where(np.arange(1000) // 100 % 2, 0.45 * turn, -0.45 * turn) + angle * 1e-4
+    assert turn_of(jumps, unit) == turn  # 0.1 of a turn on the circle
+    assert not turn_of(0.7 * jumps, unit)  # 0.63 of a turn, no more
 
 
 def test_a_saturated_sensor_is_found():
