@@ -72,8 +72,8 @@ class StateSpaceModel:
         measurement_noise_cov: R, (m, m) or m variances, of each error of a measurement; positive definite.
         prior_mean: mean of the initial state, (n,).
         prior_cov: covariance of the initial state, (n, n) or n variances; zero allowed.
-        inputs: number p of inputs; if None as many as `input_quantities`, and without these none, or one if f does
-            not work without.
+        inputs: number p of inputs, or their `input_quantities`; if None as many as those, and without these none,
+            or one if f does not work without.
         constants: a NamedTuple (or tuple) of floats that is passed to every function.
         transition_jacobian: df/dx(x, u, c) of one application, finite at the prior mean. If None it follows from f
             exactly, where f consists of arithmetic, functions of `math` or numpy and a few branches, or else by
@@ -151,6 +151,8 @@ class StateSpaceModel:
             "constants": checked_constants(self.constants),
         }
         inputs, u = self.inputs, self.input_quantities
+        if u is None and isinstance(inputs, list | tuple):
+            inputs, u = None, inputs
         if inputs is None:
             inputs = _needed_inputs(self, checked) if u is None else count_of(u)
         checked["inputs"] = at_least("inputs", inputs, 0)

@@ -64,7 +64,8 @@ def test_wrong_names_are_refused(names, rule):
 
 @pytest.mark.parametrize("names", [["left pump", "right pump"], ["pump"], []])
 def test_there_are_as_many_inputs_as_have_names(names):
-    model = decay(input_quantities=names)
+    model = decay(inputs=names)
+    assert model.input_quantities == decay(input_quantities=names).input_quantities
     assert model.inputs == len(names) and [one.name for one in model.input_quantities] == names
     assert model.replace(prior_mean=[1.0]).inputs == len(names)
     assert decay().inputs == 0
