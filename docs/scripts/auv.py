@@ -122,7 +122,7 @@ EKF, ROBUST, UKF = (contender(name) for name in ("ekf", "ekf-robust", "ukf"))
 ENKF, ETKF = contender("enkf", ensemble_size=100), contender("etkf", ensemble_size=50)
 FILTERS = (EKF, ROBUST, ENKF, ETKF)
 MOTION = ("auv:motion", "auv:dvl_outliers", "auv:wrong_drag")
-NAVIGATION = ("auv:navigation", "auv:dvl_dropout", "auv:current", "auv:usbl", "auv:no_dvl")
+NAVIGATION = ("auv:navigation", "auv:dvl_dropout", "auv:current", "auv:usbl", "auv:no_dvl", "auv:loop")
 HEADER = ("filter", "over the EKF's", "NEES", "NIS / m")
 AXIAL_DRAG = {"x_uu": Unknown(std=1.5, walk_std=0.005)}
 """The drag ahead [kg/m]: believed to within its own size at first, and slow to change."""
