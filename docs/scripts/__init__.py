@@ -62,14 +62,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--figure", action="append", metavar="FILE", help="only this picture; may be repeated")
     parser.add_argument("--out", type=Path, default=DOCS, metavar="FOLDER", help="of page and pictures [docs]")
     parser.add_argument("--check", action="store_true", help="write nothing, compare the tables with the page's")
-    parser.add_argument("--data", type=Path, metavar="FOLDER", help="recordings, which the page real_data needs")
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="recordings, of attitude and real_data")
     options = parser.parse_args(arguments)
     if options.page is None:
         print("\n".join(f"{page}: {', '.join(modules)}" for page, modules in PAGES.items()))
         return 0
     tables, figures = made_by(options.page, "TABLES"), made_by(options.page, "FIGURES")
     if options.data is not None:
-        tables |= importlib.import_module(PAGES[options.page][0]).tables_from(options.data)
+        for module in map(importlib.import_module, PAGES[options.page]):
+            tables |= module.tables_from(options.data) if hasattr(module, "tables_from") else {}
     for asked, known, what in ((options.table, tables, "table"), (options.figure, figures, "figure")):
         for name in set(asked or ()) - set(known):
             parser.error(f"--{what} must be one of {', '.join(known) or 'none'} on this page, but got {name}")

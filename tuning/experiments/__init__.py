@@ -41,6 +41,7 @@ EXPERIMENTS = {
     "lidar": Experiment("Learned Q and R of a lidar's tracks, beside OKF", "lidar", "methods"),
     "identification": Experiment("Are the standard errors of identification right?", "identification", "identify"),
     "faults": Experiment("How soon a monitor notices faults", "faults", "monitoring"),
+    "broad": Experiment("Attitude filters beside motion capture, Laidig et al. 2021", "broad", "attitude"),
     "recordings": Experiment("A recorded thruster beside its load cell", "recordings", "real_data"),
     "users": Experiment("Filters tuned on users' problems, beside users' baselines", "users", "tuning"),
     "methods": Experiment("Every method of tuning on the same data and budget", "methods_tables", "methods"),
