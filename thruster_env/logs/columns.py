@@ -28,7 +28,7 @@ WORDS = (
     *("psi", "ksi", "torr", "mmHg", "atm", "mol", "arcmin", "arcsec", "dB", "dBm", "liter", "litre", "gallon"),
 )
 PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
-PREFIXED = ("V", "A", "W", "N", "N*m", "Pa", "Hz", "g", "m", "s", "rad", "K")
+PREFIXED = ("V", "A", "W", "N", "N*m", "Pa", "Hz", "g", "m", "s", "rad", "K", "T")
 GRAVITY = "g_0"  # standard gravity; also "g" of accelerometers, where the other unit is an acceleration
 GRAMS = {"g": "g_0", "mg": "mg_0", "ug": "ug_0", "G": "g_0"}
 # Units as multiples of others. What turns or swings so often a second has an angle of 2 pi each time.
@@ -55,6 +55,17 @@ WRITTEN = {"Nm": "N*m", "°C": "degC", "°F": "degF", "°": "deg"}  # as pint re
 WRITTEN |= {**dict.fromkeys(("m/s/s", "m/s2", "m/s²", "m/s**2"), "m/s^2"), **dict.fromkeys(("g0", "gn"), "g_0")}
 PURE = {"", "-", "1"}  # of a number without a unit
 LENGTHS = ("rad", "deg", "m", "mm", "cm", "km")  # over a time even without "_per_"
+# Names of an inertial sensor's vectors in other programs, in lower case without other signs, best first.
+SENSORS = {
+    "gyr": ("gyr", "gyro", "gyroscope", "angularvelocity", "rotationrate"),
+    "acc": ("acc", "accel", "totalacceleration", "accelerometer"),
+    "mag": ("mag", "magn", "magnetometer", "magneticfield"),
+}
+OF_ROS = {
+    "angular_velocity": ("gyr", "rad/s"),
+    "linear_acceleration": ("acc", "m/s^2"),
+    "magnetic_field": ("mag", "T"),
+}
 _RATE = re.compile(r"^(?P<base>.*?)_(?P<over>[A-Za-z]+)(?P<per>_per)?_(?P<under>s|min|h)(?P<power>[23]?)$")
 _BRACKETS = re.compile(r"^(?P<base>.*?\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 
@@ -304,6 +315,26 @@ def _check_columns(
     raise ValueError(f"{rule}, but {file} has {listed(headers)}; {python}")
 
 
+def sensor_of(header: str) -> tuple[str, int, str | None] | None:
+    """The symbol that an axis of an inertial sensor has in models, the rank of its name, and the unit in ROS.
+
+    The name is the last part of a header, with the one before it if it is an axis alone: "ACCELEROMETER X",
+    "Gyroscope.x", "/imu/mag.magnetic_field.x". A phone's linear acceleration lacks gravity, not so ROS's.
+    """
+    parts = parted(header)[0].split(".")
+    text = "".join(re.findall("[a-z0-9]", (parts[-1] if len(parts[-1]) > 1 else "".join(parts[-2:])).lower()))
+    name, axis = text[:-1], text[-1:]
+    if not axis or axis not in "xyz":
+        return None
+    if parts[-1] == axis and parts[-2:-1] and parts[-2] in OF_ROS:
+        sensor, unit = OF_ROS[parts[-2]]
+        return f"{sensor}_{axis}", 0, unit
+    for sensor, names in SENSORS.items():
+        if name in names:
+            return f"{sensor}_{axis}", names.index(name), None
+    return None
+
+
 def _by_headers(columns: dict, wanted: Sequence[Wanted], headers: Sequence[str], units: Mapping[str, str]) -> None:
     used = {column.header for column in columns.values()}
     left = [header for header in headers if header not in used]
@@ -338,3 +369,13 @@ def _by_headers(columns: dict, wanted: Sequence[Wanted], headers: Sequence[str],
         for channel in remaining:
             symbol = plain(channel.quantity.symbol)
             take(channel.key, [header for header in bases.get(symbol, []) if plain(parted(header)[0]) == symbol])
+        sensors: dict[str, list[tuple[int, str, str | None]]] = {}
+        for header in bare:
+            if sensor := sensor_of(header):
+                sensors.setdefault(sensor[0], []).append((sensor[1], header, sensor[2]))
+        for channel in remaining:
+            ranked = sorted(sensors.get(channel.quantity.symbol, []), key=lambda entry: entry[0])
+            if channel.key not in columns and ranked and [rank for rank, *_ in ranked].count(ranked[0][0]) == 1:
+                _, header, unit = ranked[0]
+                columns[channel.key] = Column(header, _unit(header, units) or unit)
+                del bare[header]

@@ -57,8 +57,8 @@ def named_columns(
         return {}
     by_prefix: dict[str, dict[str, str]] = {}
     for header in headers:
-        text = re.sub(r"\[.*|[^a-z0-9]", "", header.lower())
-        if header not in used and text[-1:] in tuple("wxyz") and text[:-1] in PREFIXES:
+        text, last = (re.sub(r"\[.*|[^a-z0-9]", "", part.lower()) for part in (header, _last(header)))
+        if header not in used and text[-1:] in tuple("wxyz") and {text[:-1], last[:-1]} & {*PREFIXES}:
             by_prefix.setdefault(text[:-1], {})[text[-1]] = header
     complete = [parts for parts in by_prefix.values() if len(parts) == 4]
     if len(complete) > 1:
@@ -71,6 +71,11 @@ def named_columns(
         if complete
         else {}
     )
+
+
+def _last(header: str) -> str:
+    """The component of a header with the name before it: "orientation.w" of "field.orientation.w"."""
+    return ".".join(header.split(".")[-2:])
 
 
 def remark_on_numbers(

@@ -216,9 +216,10 @@ def read_log(
     if form is not None:
         asked = [text for text in description.columns.values() if isinstance(text, str)]
         recorded = Recorded(path, form, asked, description.stamps)
-        table, column_of = recorded.table(
-            recorded.columns(wanted, description.columns, description.units, description.dt is None)
-        )
+        column_of = recorded.columns(wanted, description.columns, description.units, description.dt is None)
+        if model.turns and not form.has_stamps:
+            column_of = column_of | quaternions.named_columns(model, [*recorded.samples], column_of)
+        table, column_of = recorded.table(column_of)
     else:
         check_stamps(description.stamps, None, path if is_file else name)
         if table is None:

@@ -194,7 +194,8 @@ def read_table(path: str | Path) -> Table:
         from thruster_env.logs.recorders.registry import ENDINGS  # which knows tables
 
         endings = ", ".join((*SUFFIXES, *ENDINGS))
-        raise ValueError(f"a log must be a file that ends in {endings}, but got {short_repr(str(path))}")
+        rule = f"a log must be a file that ends in {endings}, or a folder of CSV files"
+        raise ValueError(f"{rule}, but got {short_repr(str(path))}")
     try:
         return {".csv": _read_csv, ".parquet": _read_parquet, ".npz": _read_npz}[suffix](Path(path))
     except OSError as error:

@@ -49,7 +49,8 @@ def is_listed(log: Path, only: str | None, is_asked: bool) -> bool:
     """
     form = format_of(log)
     if only is not None and form is None:
-        rule = f"--only must go with a recorder's file, {', '.join(ENDINGS)} or a folder with {METADATA}"
+        folder = f"a folder with {METADATA} or CSV files"
+        rule = f"--only must go with a recorder's file, {', '.join(ENDINGS)} or {folder}"
         raise ValueError(f"{rule}, but got {log}")
     if only is None and (is_asked or log.with_suffix(".toml").is_file()):
         return False

@@ -16,7 +16,7 @@ from thruster_env.logs.columns import INPUT, MEASUREMENT, TIME, Column, find_col
 from thruster_env.logs.columns import Wanted as MergedWanted
 from thruster_env.logs.findings import CLOCK, OUTSIDE, Remark
 from thruster_env.logs.grid import SECOND, follows, in_seconds, time_text
-from thruster_env.logs.recorders import arrays, autopilots, bags
+from thruster_env.logs.recorders import arrays, autopilots, bags, tables
 from thruster_env.logs.recorders.bag_counts import METADATA
 from thruster_env.logs.recorders.bags import HEADER, RECEIPT, STAMPS, Choice, Clocked, chosen_clock
 from thruster_env.logs.recorders.topics import Format, Topic, Wanted, unreadable
@@ -30,7 +30,7 @@ MANY = 0.1  # of the samples of a channel outside the log: worth a word
 FORMATS = (
     *(autopilots.ULOG, autopilots.DATAFLASH),
     *(bags.ROS1_BAG, bags.MCAP_FILE, bags.ROS2_BAG),
-    *(arrays.MATLAB, arrays.HDF5),
+    *(arrays.MATLAB, arrays.HDF5, tables.TABLES),
 )
 ENDINGS = tuple(ending for form in FORMATS for ending in form.endings)
 
@@ -94,6 +94,8 @@ def format_of(path: str | Path) -> Format | None:
     named = next((form for form in FORMATS if path.suffix.lower() in form.endings), None)
     if (path / METADATA).is_file():
         return next(form for form in FORMATS if ".db3" in form.endings)
+    if tables.is_folder(path) or tables.has_clocks(path):
+        return tables.TABLES
     if path.is_dir() and named is not None:
         raise unreadable(named.kind, path, "it is a folder")
     if named is None and (path.suffix.lower() in SUFFIXES or not path.is_file()):
@@ -122,7 +124,7 @@ def contents(path: str | Path, stamps: str | None = None) -> Contents:
     Raises:
         ValueError: if it is no recorder's file and no table, or is damaged; the message is one line.
     """
-    if Path(path).suffix.lower() in SUFFIXES:
+    if Path(path).suffix.lower() in SUFFIXES and format_of(path) is None:
         check_stamps(stamps, None, path)
         return _of_table(read_table(path))
     form = _known(path)
@@ -211,7 +213,9 @@ def _known(path: str | Path) -> Format:
     form = format_of(path)
     if form is None:
         kinds = ", ".join(ENDINGS)
-        raise ValueError(f"a recorder's file must end in {kinds} or be a folder with {METADATA}, but got {path}")
+        raise ValueError(
+            f"a recorder's file must end in {kinds} or be a folder with {METADATA} or CSV files, but got {path}"
+        )
     return form
 
 
