@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,8 @@ from thruster_env.core.angles import difference
 from thruster_env.core.checks import at_least
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.model_env import ReplayEnv
-from thruster_env.logs.log import Log, seen_by
+from thruster_env.logs.grid import MOST_HELD
+from thruster_env.logs.log import FEWEST_STEPS, Log, piece_of, seen_by
 from thruster_env.model.continuous import ContinuousModel
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
@@ -29,6 +30,7 @@ from thruster_env.model.turns import error_quantities, readings, stored_covs
 
 SKIPPED = 50  # first rows that do not count, in which a filter settles
 STEP = 1e-4  # of the slopes of outputs, in standard deviations
+LOST = 0.3  # rad, by which a sensor turns in a gap, from which on the rate before it tells nothing of its attitude
 
 # A filter over a log on its own stamps: by the clock, as `filter.live()` goes.
 
@@ -165,6 +167,26 @@ def estimate(
     return estimate_with(filter_, env.log, smoother=smoother, lag=lag, seed=seed, noise=noise)
 
 
+def lost_in_gaps(model: StateSpaceModel, log: Log) -> list[int]:
+    """The rows after gaps in which a sensor has turned by more than 0.3 rad, at the log's mean square rate.
+
+    Of models with a gyroscope as input, whose attitude a magnetometer determines, so that it can begin anew.
+    """
+    rates = [i for i, quantity in enumerate(log.input_quantities) if quantity.symbol.startswith("gyr_")]
+    if not (model.turns and rates and any(quantity.symbol.startswith("mag_") for quantity in log.measured)):
+        return []
+    apart = np.diff(log.times)
+    pauses = np.flatnonzero(apart > (MOST_HELD + 1.5) * np.median(apart))  # of a log on its own stamps
+    gaps = [(row, row + 1) for row in pauses.tolist()] if log.stamps is not None else []
+    gaps += [(first - 1, first + count) for first, count in log.recording.gaps]
+    rate, rows = float(np.sqrt(np.mean(np.sum(log.inputs[:, rates] ** 2, axis=1)))), list[int]()
+    for before, after in gaps:
+        far = rate * (log.times[after] - log.times[before]) > LOST
+        if far and min(after - max([0, *rows]), log.steps + 1 - after) > FEWEST_STEPS:
+            rows.append(after)
+    return rows
+
+
 def estimate_with(
     filter_: Filter,
     log: Log,
@@ -176,6 +198,8 @@ def estimate_with(
 ) -> LogEstimate:
     """Run a given filter over a log; of a model with rotations it begins at the first measurement.
 
+    It begins anew in the rows of `lost_in_gaps`.
+
     Args:
         filter_: the filter.
         log: the log.
@@ -185,6 +209,14 @@ def estimate_with(
         noise: of a log on its own stamps, Q by the length of a step [s]; None for one in proportion to it.
     """
     smoother = smoother or lag is not None
+    starts = [0, *lost_in_gaps(filter_.model, log)]
+    if len(starts) > 1:
+        counts = np.diff([*starts, log.steps + 1]).tolist()
+        parts = [piece_of(log, first, count) for first, count in zip(starts, counts, strict=True)]
+        return _joined(
+            log,
+            [estimate_with(filter_, part, smoother=smoother, lag=lag, seed=seed, noise=noise) for part in parts],
+        )
     measurements = seen_by(filter_.model, log.measurements)
     data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], measurements[None]
     if filter_.model.turns:
@@ -213,6 +245,15 @@ def estimate_with(
         smoother,
         noise,
         restarts,
+    )
+
+
+def _joined(log: Log, parts: Sequence[LogEstimate]) -> LogEstimate:
+    """The estimates of a log from those of its parts, whose gaps have been predicted over."""
+    rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in LogEstimate._fields[2:7]}
+    restarts = next((part.restarts for part in parts if part.restarts is not None), None)
+    return parts[0]._replace(
+        log=log, divergences=sum(part.divergences for part in parts), restarts=restarts, **rows
     )
 
 

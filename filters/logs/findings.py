@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from filters.consistency.nees import LAGS, Whiteness, blow_up_sentence, root_mean_square, whitened, whiteness_of
-from filters.logs.estimate import SKIPPED, LogEstimate, estimate_with
+from filters.logs.estimate import SKIPPED, LogEstimate, estimate_with, lost_in_gaps
 from filters.monitoring import Alarm, Monitor
 from thruster_env.core.angles import difference, with_breaks, wrapped
 from thruster_env.core.checks import at_least
@@ -226,6 +226,12 @@ def verdict(estimate: LogEstimate, log_findings: LogFindings) -> list[str]:
     spoilt = [finding for finding in estimate.log.findings if finding.kind in SPOILING]
     if any(finding.kind == GAP for finding in spoilt):
         messages.append("At a gap the filter predicts with the last input held.")
+    lost = lost_in_gaps(estimate.model, estimate.log)
+    if lost:
+        after = "the gap" if len(lost) == 1 else f"{len(lost)} gaps"
+        messages.append(
+            f"The sensor turns in gaps: after {after} the filter begins anew at the first measurement."
+        )
     if not log_findings.rows:
         return [
             *messages,

@@ -255,7 +255,7 @@ def seen_by(model: StateSpaceModel, measurements: np.ndarray) -> np.ndarray:
 
 def piece_of(log: Log, first: int, rows: int) -> Log:
     """So many rows of a log from one of them on, which remembers the log."""
-    kept_rows, since, source = slice(first, first + rows), first * log.dt, {}
+    kept_rows, since, source = slice(first, first + rows), float(log.times[first]), {}
     for channel, series in log.source.items():
         times = series.times - since
         shifted = times - log.offsets.get(channel, 0.0)
@@ -274,6 +274,7 @@ def piece_of(log: Log, first: int, rows: int) -> Log:
         source=source,
         recording=Recording(),
         uncut=log,
+        stamps=None if log.stamps is None else log.stamps[kept_rows] - since,
     )
 
 
