@@ -16,7 +16,7 @@ from thruster_env.model import rotations
 from thruster_env.model.simulate import simulate
 from thruster_env.model.turns import Rotation
 from tuning.evaluation.evaluate import check_consistency, evaluate
-from tuning.logs.problem import of_gyroscope
+from tuning.logs.problem import log_problem, of_gyroscope
 from tuning.plants.auv import SCENARIOS as VEHICLES
 from tuning.problems.check import checked_problem
 from tuning.problems.find import read_scenario
@@ -242,3 +242,15 @@ def test_both_forms_of_the_vehicle_have_the_same_errors(tmp_path):
     np.testing.assert_allclose(*pairs, rtol=3e-3)
     angles = np.rad2deg(np.sqrt(sum(interval.value**2 for interval in first.rmse[6:9])))
     assert second.output_rmse["q_angle"].value == pytest.approx(angles, rel=0.02)
+
+
+def test_a_quaternion_alone_is_no_truth_of_a_pose():
+    """A study says that it is not used, and `estimate` states the errors of its angles."""
+    columns = table(lambda q: {f"q_{axis}": q["wxyz".index(axis)] for axis in "wxyz"})
+    columns |= {"acc_z": 9.81 + columns["acc_x"]}
+    (sentence,) = [text for text in log_problem(columns, model="attitude-imu").remarks if "reference" in text]
+    assert sentence.startswith("The reference of 'attitude' is not used: an error of this state needs o_e, o_n, ")
+    estimate = tuning.estimate(tuning.read_logs(columns, model="attitude-imu"), filter="ekf")
+    assert {"roll", "pitch", "yaw", "q_angle"} == {r.quantity.symbol for r in estimate.findings.references}
+    used = log_problem(columns, model="attitude")
+    assert not any("reference" in text for text in used.remarks)

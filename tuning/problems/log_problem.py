@@ -15,6 +15,7 @@ from filters.starts import MEASUREMENT, STARTS, begun_at, cov_of_measured_starts
 from thruster_env.core.checks import at_least, one_of, short_repr
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.model_env import ReplayEnv
+from thruster_env.logs.columns import STATE
 from thruster_env.logs.findings import OUTLIERS, Recording, has_outliers, remarks_on
 from thruster_env.logs.findings import outliers as rows_of_outliers
 from thruster_env.logs.log import RATIO, Log, in_any_steps, in_steps, seen_by
@@ -50,7 +51,23 @@ MEASURED = (
     "the state."
 )
 
+QUATERNION = 3  # numbers of the error of a rotation, of which a pose's has more
 ATTITUDES = "Each block begins at the attitude of its first measurement."
+
+
+def unused_references(model: StateSpaceModel, logs: Sequence[Log]) -> list[str]:
+    """Sentences on quaternions of all logs that are a part of a pose, whose other numbers no log has."""
+    sentences = []
+    for turn in model.turns:
+        symbols = [state.symbol for state in turn.of_state(model.states)]
+        known = [all(f"{STATE}:{symbol}" in log.references for log in logs) for symbol in symbols]
+        if turn.size > QUATERNION and all(known[: QUATERNION + 1]):
+            missing = ", ".join(symbol for symbol, is_known in zip(symbols, known, strict=True) if not is_known)
+            sentences.append(
+                f"The reference of {turn.name!r} is not used: an error of this state needs {missing}, too. "
+                "thruster estimate states the errors of roll, pitch and yaw."
+            )
+    return sentences
 
 
 def as_rows(log: Log) -> Log:
@@ -209,6 +226,8 @@ class LogProblem(AssumedProblem):
             remarks.append(MEASURED)
         if self.model().turns:
             remarks.append(ATTITUDES)
+        if self._states is None:
+            remarks += unused_references(self.model(), self.logs)
         return (*remarks, *self.parts.sentences())
 
     def model(self, **changes) -> StateSpaceModel:
