@@ -14,13 +14,12 @@ from filters import FILTERS, affine_model, make_filter, run
 from filters.bounds import path_bound, posterior_bound, wrapped_variances
 from tests.filters.test_bounds_at_any_scale import VELOCITY, apart, exact_covariances
 from tests.fuzz.python_interface import _line, _until
-from tests.models import line_model, simulated, small
+from tests.models import small
 from tests.thruster_env.core.test_angles import data_of, makers, plain_run, rotated
 from tests.thruster_env.logs.test_logs_of_angles import model, recorded
 from thruster_env.core.angles import difference, on_one_branch, wrapped
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.streams import filter_keys
-from thruster_env.logs.log import Log, at_offset
+from thruster_env.logs.log import at_offset
 
 WITHIN = 2e-8  # of angle filters about another heading
 STEPS = 20
@@ -97,33 +96,6 @@ def stiff_noise(rng: np.random.Generator, seconds: float) -> str:
             assert apart(kf.covs[0], exact) < 1e-8 and not kf.divergences.any(), given
             counts["models"] += 1
     return _line("stiff noise", counts)
-
-
-def masked_samples(rng: np.random.Generator, seconds: float) -> str:
-    """Samples behind a mask, of any share and with any fill value: the same as NaN on all paths."""
-    counts, names, one = Counter(), list(FILTERS), line_model()
-    with interpreted():
-        for k in _until(seconds):
-            name = names[k % len(names)]
-            inputs, measurements = simulated(one, 10, seed=int(rng.integers(1000)))
-            where = rng.random(measurements.shape) < rng.random()
-            plain = np.where(where, np.nan, measurements)
-            behind = float(rng.choice([1e300, -1.0, math.inf, math.nan, 0.0]))
-            hidden = np.ma.masked_array(np.where(where, behind, measurements), where, fill_value=3.0)
-            filter_ = small(name, one)
-            expected = run(filter_, filter_keys([k]), inputs, plain)
-            for part, other in zip(run(filter_, filter_keys([k]), inputs, hidden), expected, strict=True):
-                np.testing.assert_array_equal(part, other, err_msg=name)
-            session, other = filter_.session(), filter_.session()
-            session.start((k, 1), hidden[0, 0]), other.start((k, 1), plain[0, 0])
-            for step in range(10):
-                session.step(inputs[0, step], hidden[0, step + 1])
-                other.step(inputs[0, step], plain[0, step + 1])
-            np.testing.assert_array_equal(session.mean, other.mean, err_msg=name)
-            log = Log("run", 0.1, inputs[0], hidden[0], one.input_quantities, one.measurements)
-            np.testing.assert_array_equal(log.measurements, plain[0])
-            counts["runs"] += 1
-    return _line("masked samples", counts)
 
 
 def _covariance(rng: np.random.Generator, variances: np.ndarray) -> np.ndarray:

@@ -80,16 +80,7 @@ def kill_comparison(rng: np.random.Generator, kills: int, seconds: float) -> str
     with tempfile.TemporaryDirectory() as scratch:
         found, kept = Path(scratch) / "found", {}
         command = [sys.executable, "-m", "tuning.cli.main", "reproduce", "policies", "--quick", "--seeds", "1"]
-        command += [
-            "--steps",
-            "4096",
-            "--executor",
-            "processes:2",
-            "--out",
-            str(found),
-            "--json",
-            str(found / "result.json"),
-        ]
+        command += f"--steps 4096 --executor processes:2 --out {found} --json {found / 'result.json'}".split()
         while done < kills and time.monotonic() < deadline:
             news, delay = int(rng.integers(0, 5)), float(rng.uniform(0.0, 1.0))
             process = _start(command)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.io import savemat
 
 from tests.fuzz.logs import MODEL
-from tests.thruster_env.logs.recorders.files import dataflash, stamped, write_bag, write_ulog
+from tests.thruster_env.logs.recorders.files import dataflash, twists, write_bag, write_ulog
 from thruster_env.logs.read import read_log
 from thruster_env.logs.recorders.registry import fields
 from thruster_env.logs.write import write_columns
@@ -73,18 +73,10 @@ def _bag(rng, form: str, place: Path, dt: float, force, speed, origins) -> tuple
     rate = float(rng.choice([1.0, 1.0, 0.2, 5.0]))
 
     def messages(values, kind, origin):
-        def at(k):
-            def make(types, name):
-                vector = types["geometry_msgs/msg/Vector3"]
-                twist = types["geometry_msgs/msg/Twist"](vector(float(values[k]), 0.0, 0.0), vector(0.0, 0.0, 0.0))
-                if kind == "no header":
-                    return twist
-                stamp = round(1e9 * origin) + round(1e9 * rate * dt * k) if kind == "stamps" else 0
-                return types["geometry_msgs/msg/TwistStamped"](stamped(types, name, stamp), twist)
-
-            return make
-
-        return [(EPOCH * 10**9 + round(1e9 * dt * k), at(k)) for k in range(len(values))]
+        since = np.round(1e9 * dt * np.arange(len(values))).astype(int)
+        stamps = {"stamps": round(1e9 * origin) + np.round(rate * since).astype(int), "no stamps": 0 * since}
+        received = (EPOCH * 10**9 + since).tolist()
+        return list(zip(received, twists(values, stamps.get(kind)), strict=True))
 
     topics, columns = [], {}
     for name, key, values, kind, origin in zip(

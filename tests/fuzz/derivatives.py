@@ -11,11 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tests.filters.test_far_from_zero import LINEARISING, body, estimates
 from tests.fuzz.python_interface import _line, _until
-from tests.models import simulated
-from tests.thruster_env.graphs.test_slopes_at_kinks import slopes_of
-from thruster_env.core.compiled import interpreted
+from tests.thruster_env.graphs.test_traced_arithmetic import slopes_of
 from thruster_env.graphs.programs import values_of
 
 INNER = (  # of which all are zero or have a kink at the origin
@@ -80,31 +77,3 @@ def found_at(function: Callable, point: np.ndarray) -> float:
         return float(function(*point.tolist()))
     except ArithmeticError:
         return math.nan
-
-
-def far_from_zero(rng: np.random.Generator, seconds: float) -> str:
-    """Filters that linearise, of models that branch, moved by up to 1e9, in units of 1e-9 to 1e9."""
-    counts = Counter()
-    with interpreted():
-        for _ in _until(seconds):
-            name, unit = str(rng.choice(LINEARISING)), 10.0 ** rng.uniform(-9.0, 9.0)
-            away = rng.choice([-1.0, 1.0]) * 10.0 ** rng.uniform(0.0, 9.0)
-            known = rng.random() < 0.3
-            noise = [0.0 if known else 1e-3, 10.0 ** rng.uniform(-4.0, -2.0)]
-            prior = [0.0 if known else 1.0, 0.1]
-
-            def model(offset, unit, called, noise=noise, prior=prior):
-                covs = {
-                    "process_noise_cov": np.multiply(noise, unit**2),
-                    "prior_cov": np.multiply(prior, unit**2),
-                }
-                return body(offset, unit, called, **covs)
-
-            inputs, z = simulated(model(0.0, 1.0, False), 12, count=2, level=1.0)
-            expected = estimates(name, model(0.0, 1.0, False), inputs, z)
-            for called in (False, True):
-                found = estimates(name, model(away * unit, unit, called), inputs, z)
-                within = 1e-5 + 1e-14 * abs(away)
-                assert abs(found - expected).max() < within * 30.0, (name, unit, away, called, known)
-            counts[name] += 1
-    return _line("far from zero", counts)

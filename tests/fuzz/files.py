@@ -20,7 +20,6 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
 from filters.tuned_file import sealed
 from tests.tuned_files import write_untuned
-from thruster_env.logs.recorders.registry import fields, read
 from tuning.evaluation.tuned import read_tuned
 from tuning.plants.thruster import find_scenario
 from tuning.policies.environments import make_environments
@@ -104,20 +103,7 @@ def setups(rng: np.random.Generator, seconds: float) -> str:
 
 def scenario_files(rng: np.random.Generator, seconds: float) -> str:
     """TOML of scenarios, damaged byte by byte, with values in the place of others."""
-    values = (
-        "nan",
-        "inf",
-        "-1",
-        "1e300",
-        "[]",
-        "[[]]",
-        "{}",
-        '""',
-        "true",
-        "1979-05-27",
-        '"nominal"',
-        "0x7" + "f" * 40,
-    )
+    values = f'nan inf -1 1e300 [] [[]] {{}} "" true 1979-05-27 "nominal" 0x7{"f" * 40}'.split()
 
     def write(path: Path) -> None:
         lines = SCENARIO.strip().splitlines()
@@ -159,34 +145,6 @@ def journals(rng: np.random.Generator, seconds: float) -> str:
         trial = study.ask(plan.space())
         study.tell(trial, 1.0)
         assert study.get_trials()[trial.number].value == 1.0
-
-    return _attack(rng, seconds, write, use)
-
-
-def recordings(rng: np.random.Generator, seconds: float) -> str:
-    """Recorders' files of all formats, damaged anywhere: listed and read, in part at most, or refused."""
-    from tests.thruster_env.logs.recorders.test_bad_recordings import SOME, write_good
-
-    with tempfile.TemporaryDirectory() as folder:
-        good = {ending: write_good(Path(folder) / f"{ending[1:]}{ending}").read_bytes() for ending in SOME}
-    ending = SOME[0]
-
-    def write(path: Path) -> None:
-        nonlocal ending
-        ending = SOME[rng.integers(len(SOME))]
-        data = good[ending]
-        for _ in range(rng.integers(1, 4)):
-            data = _damaged(rng, data) or data
-        path.write_bytes(data)
-
-    def use(path: Path) -> None:
-        named = path.rename(path.with_suffix(ending))
-        try:
-            for one in fields(named):
-                samples = read(named, [one.name])[one.name]
-                assert len(samples.values) == one.samples, f"{one.name} has {one.samples} samples"
-        finally:
-            named.rename(path)
 
     return _attack(rng, seconds, write, use)
 

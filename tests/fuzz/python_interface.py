@@ -26,25 +26,12 @@ from thruster_env.core.compiled import interpreted
 
 WAYS = (
     copy.deepcopy,
-    lambda value: pickle.loads(pickle.dumps(value)),
-    lambda v: pickle.loads(cloudpickle.dumps(v)),
+    *(lambda v, dumps=dumps: pickle.loads(dumps(v)) for dumps in (pickle.dumps, cloudpickle.dumps)),
 )
 EXTREME = (0.0, 5e-324, 1e-300, 1e-30, 1e8, -1e8, 1e30, -1e30, 1e154, 1e300, -1e308, math.inf, -math.inf, math.nan)
 WRONG = (
-    "12",
-    b"1",
-    None,
-    1j,
-    [1j],
-    [None],
-    {},
-    [],
-    [[1.0], [2.0, 3.0]],
-    "full",
-    object(),
-    True,
-    [1.0] * 3,
-    10**400,
+    *("12", b"1", None, 1j, [1j], [None], {}, [], [[1.0], [2.0, 3.0]], "full", object(), True),
+    *([1.0] * 3, 10**400),
 )
 NUMBERS = ("dt", "max_voltage", "ambient_velocity", "process_noise_cov", "measurement_noise_cov", "initial_state")
 

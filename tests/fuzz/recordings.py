@@ -6,11 +6,9 @@ The counts are those that the formats' own writers were given. Of a damaged file
 
 from __future__ import annotations
 
-import struct
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -20,14 +18,13 @@ from pyarrow import parquet
 from scipy.io import savemat
 
 from tests.fuzz.files import _damaged
+from tests.thruster_env.logs.recorders.files import EPOCH, dataflash, write_definitions
 from thruster_env.logs.recorders.registry import contents, read
 from thruster_env.logs.table import read_table
-from thruster_env.logs.write import write_columns
 
 AUTOPILOTS, BAGS = (".bin", ".ulg"), (".mcap", ".bag", ".db3")
 TABLES = (".npz", ".parquet", ".csv")
 FIELDS = ("x", "y", "z", "w")
-EPOCH = 10**9  # [ns]
 
 
 def message_counts(rng: np.random.Generator, seconds: float) -> str:
@@ -74,7 +71,11 @@ def two_definitions(rng: np.random.Generator, seconds: float) -> str:
             orders = [list(rng.permutation(FIELDS)[: rng.integers(1, 5)]) for _ in range(rng.integers(1, 4))]
             rows = [rng.normal(size=(int(rng.integers(2, 9)), len(FIELDS))) for _ in orders]
             path = Path(folder) / f"{counts.total()}"
-            path = _write_dataflash(path, orders, rows) if kind == ".bin" else _write_bag(path, kind, orders, rows)
+            if kind == ".bin":
+                path = _write_dataflash(path, orders, rows)
+            else:
+                path = path.with_suffix(".bag" if kind == "ros1" else "")
+                write_definitions(path, kind, orders, rows, FIELDS)
             name = "A" if kind == ".bin" else "/m"
             found = read(path, None)
             assert set(found) == {f"{name}.{key}" for order in orders for key in order}
@@ -119,31 +120,6 @@ def transforms_of_bags(rng: np.random.Generator, seconds: float) -> str:
                     np.testing.assert_array_equal(one.values, [numbers[place] for _, numbers in rows])
                     np.testing.assert_allclose(one.times, [(stamp - EPOCH) / 1e9 for stamp, _ in rows], atol=1e-9)
             counts[kind] += 1
-    return ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
-
-
-def damaged_tables(rng: np.random.Generator, seconds: float) -> str:
-    """CSV, npz and Parquet with bytes zeroed, flipped, doubled or cut off: read, or one line."""
-    counts, end = Counter(), time.monotonic() + seconds
-    columns = {"t": 0.1 * np.arange(60), "voltage": rng.normal(size=60), "tach": np.arange(60.0)}
-    with tempfile.TemporaryDirectory() as folder:
-        good = {}
-        for ending in TABLES:
-            write_columns(Path(folder) / f"good{ending}", columns)
-            good[ending] = (Path(folder) / f"good{ending}").read_bytes()
-        np.savez_compressed(Path(folder) / "packed.npz", **columns)
-        packed = (Path(folder) / "packed.npz").read_bytes()
-        while not counts or time.monotonic() < end:
-            ending = str(rng.choice(TABLES))
-            data = packed if ending == ".npz" and rng.random() < 0.5 else good[ending]
-            path = Path(folder) / f"a{ending}"
-            path.write_bytes(_zeroed(rng, data) if rng.random() < 0.3 else _damaged(rng, data))
-            try:
-                read_table(path)
-                counts["read"] += 1
-            except ValueError as error:
-                assert str(error) and "\n" not in str(error) and "None" not in str(error), repr(error)
-                counts["refused"] += 1
     return ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
 
 
@@ -219,8 +195,6 @@ def _one_bit(rng: np.random.Generator, data: bytes) -> bytes:
 
 def _write_dataflash(path: Path, orders: list[list[str]], rows: list[np.ndarray]) -> Path:
     """Logs put together, each with its own format of message A."""
-    from tests.thruster_env.logs.recorders.files import dataflash
-
     out, row = b"", 0
     for order, part in zip(orders, rows, strict=True):
         places = [FIELDS.index(key) for key in order]
@@ -229,28 +203,4 @@ def _write_dataflash(path: Path, orders: list[list[str]], rows: list[np.ndarray]
         row += len(part)
     path = path.with_suffix(".bin")
     path.write_bytes(out)
-    return path
-
-
-def _write_bag(path: Path, kind: str, orders: list[list[str]], rows: list[np.ndarray]) -> Path:
-    """A bag whose topic /m has several definitions, in turns."""
-    from rosbags import rosbag1, rosbag2
-
-    if kind == "ros1":
-        path = path.with_suffix(".bag")
-        writer, head = rosbag1.Writer(path), b""
-    else:
-        plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
-        writer, head = rosbag2.Writer(path, version=9, storage_plugin=plugin), b"\x00\x01\x00\x00"
-    add: Callable = writer.add_connection
-    row = 0
-    with writer:
-        for part, (order, numbers) in enumerate(zip(orders, rows, strict=True)):
-            text = "".join(f"float64 {key}\n" for key in order)
-            own = {"md5sum": f"{part:032d}"} if kind == "ros1" else {"rihs01": f"RIHS01_{part:064d}"}
-            connection = add("/m", f"a{part}/msg/M", msgdef=text, **own)
-            for values in numbers:
-                body = struct.pack(f"<{len(order)}d", *(values[FIELDS.index(key)] for key in order))
-                writer.write(connection, EPOCH + 10**7 * row, head + body)
-                row += 1
     return path

@@ -17,7 +17,7 @@ from filters.engine.batch import run
 from filters.estimators.foreign import Estimator
 from filters.registry import make_filter
 from tests.fuzz.python_interface import _until
-from thruster_env.core.streams import SPAWN_KEYS, derived_generator, derived_seed
+from tests.models import scalar_model
 from tuning.problems.env_problem import EnvProblem
 
 STEPS, RUNS = 50, 20
@@ -84,15 +84,7 @@ class Held:
 
 
 def _model() -> StateSpaceModel:
-    return StateSpaceModel(
-        transition=lambda x, u, c: (0.5 * x[0] + u[0],),
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[0.3],
-        measurement_noise_cov=[0.1],
-        prior_mean=[0.0],
-        prior_cov=[1.0],
-        inputs=1,
-    )
+    return scalar_model(a=[[0.5]], b=[[1.0]], c=[[1.0]])
 
 
 def runs_of_envs(rng: np.random.Generator, seconds: float) -> str:
@@ -122,24 +114,6 @@ def runs_of_envs(rng: np.random.Generator, seconds: float) -> str:
         _uncorrelated({"noise": w.ravel(), "inputs": u.ravel()}, what)
         tried += 1
     return f"runs of envs: {tried}, each the same in another order, with buffers and other global generators"
-
-
-def pairs_of_streams(rng: np.random.Generator, seconds: float) -> str:
-    """All generators of a random seed and of its neighbour."""
-    tried = 0
-    for _ in _until(seconds):
-        seed, number, rows = int(rng.integers(2 ** int(rng.integers(1, 62)))), int(rng.integers(100)), {}
-        for one in (seed, seed + 1):
-            rows[f"env {one}"] = np.random.default_rng(one).uniform(size=4000)
-            for purpose, key in SPAWN_KEYS.items():
-                rows[f"{purpose} {one}"] = derived_generator(one, key).uniform(size=4000)
-                rows[f"{purpose} {one} {number}"] = derived_generator(one, key, number).uniform(size=4000)
-                space = gym.spaces.Box(0.0, 1.0, (4000,), np.float64)
-                space.seed(derived_seed(one, key))
-                rows[f"space of {purpose} {one}"] = space.sample()
-        _uncorrelated(rows, f"seed {seed}")
-        tried += 1
-    return f"streams: {tried} seeds, {len(rows)} of each, no pair correlated"
 
 
 def _uncorrelated(rows: dict[str, np.ndarray], what: str) -> None:

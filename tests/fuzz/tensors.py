@@ -14,7 +14,7 @@ import filters
 from filters import StateSpaceModel, run
 from tests.fuzz.arithmetic import drawn
 from tests.fuzz.python_interface import _line, _until
-from tests.models import small
+from tests.models import small, state_space
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import filter_keys
 
@@ -66,15 +66,8 @@ def model(gate) -> StateSpaceModel:
         jumps = np.clip(gate(np.round(x[0]), np.round(x[1])), -1.0, 1.0)
         return 0.9 * x[0] + 0.1 * x[1] + (x[0] > 30.0) * 0.1, 0.8 * x[1] + u[0] + 0.0625 * (jumps == 1.0)
 
-    return StateSpaceModel(
-        transition=transition,
-        observe=lambda x, c: (x[0] + 0.1 * x[1] * x[1],),
-        process_noise_cov=[0.1, 0.1],
-        measurement_noise_cov=[0.1],
-        prior_mean=[0.31, 0.17],
-        prior_cov=[1.0, 1.0],
-        inputs=1,
-    )
+    noise, prior = {"q": [0.1, 0.1], "r": [0.1]}, {"mean": [0.31, 0.17], "cov": [1.0, 1.0]}
+    return state_space(transition, lambda x, c: (x[0] + 0.1 * x[1] * x[1],), **noise, **prior, inputs=1)
 
 
 def samples(rng: np.random.Generator, count: int):

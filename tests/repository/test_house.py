@@ -32,12 +32,13 @@ KNOW_PLANTS = ("tuning/plants/", "tuning/policies/", "tuning/experiments/", "tun
 LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
 OF_PAGES = {"bokeh", "tornado", "jinja2", "markupsafe"}
 PAGE = "tuning/exploring/page/"  # what a browser shows of a bench
-OF_TENSORS = (  # networks in models and estimators
-    "filters/tensors/",
-    "filters/learned/",
-    "tuning/learning.py",
-    "thruster_env/core/parallel.py",
-)
+# Networks in models and estimators.
+OF_TENSORS = "filters/tensors/", "filters/learned/", "tuning/learning.py", "thruster_env/core/parallel.py"
+
+
+@cache
+def tree_of(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 @cache
@@ -45,7 +46,7 @@ def imports_of(path, source=None):
     """Modules that a file imports, anywhere in it, by full name: `from a import b` gives a and a.b."""
     found = set()  # a caller must not change it: it is remembered
     package = path.relative_to(ROOT).parent.parts
-    for node in ast.walk(ast.parse(path.read_text() if source is None else source)):
+    for node in ast.walk(tree_of(path) if source is None else ast.parse(source)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -122,7 +123,7 @@ def test_the_index_in_a_package_s_docstring_names_its_files():
     listed = 0
     for path in FILES:
         if path.name == "__init__.py":
-            text = ast.get_docstring(ast.parse(path.read_text())) or ""
+            text = ast.get_docstring(tree_of(path)) or ""
             lines = [re.match(r"([a-z_]+(?:, [a-z_]+)*)  +[a-zA-Z`]", line) for line in text.splitlines()]
             names = [name for line in lines if line for name in line[1].split(", ")]
             missing = [
@@ -167,7 +168,7 @@ def opens_bytes(call):
 
 def test_text_files_are_utf_8_whatever_the_terminal_has():
     for path in FILES:
-        for call in (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)):
+        for call in (node for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)):
             opens = isinstance(call.func, ast.Name) and call.func.id == "open" and not opens_bytes(call)
             if opens or getattr(call.func, "attr", "") in ("read_text", "write_text"):
                 assert "encoding" in {keyword.arg for keyword in call.keywords}, f"{path}:{call.lineno}"
@@ -188,7 +189,7 @@ ORDERS = (
 )
 
 
-@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("order", [*ORDERS, ASKED])
 def test_envs_are_registered_in_whichever_order_packages_are_imported(order):
     ids = "BowThruster-v0", "SegorogeniAUVPath-v0", "Replay-v0", "BowThruster-EKF-v0", "SegorogeniAUV-Filtered-v0"
     code = (
@@ -199,24 +200,13 @@ def test_envs_are_registered_in_whichever_order_packages_are_imported(order):
 
 
 HEAVY = {
-    *(
-        "bokeh",
-        "gymnasium",
-        "h5py",
-        "jinja2",
-        "llvmlite",
-        "matplotlib",
-        "numba",
-        "numpy",
-        "optuna",
-        "pandas",
-        "pint",
-    ),
-    *("pyarrow", "pydantic", "pygame", "rich", "sqlalchemy", "stable_baselines3", "torch", "filters", "tuning"),
+    *"bokeh gymnasium h5py jinja2 llvmlite matplotlib numba numpy optuna pandas pint pyarrow pydantic".split(),
+    *("pygame", "rich", "sqlalchemy", "stable_baselines3", "torch", "filters", "tuning"),
     *(f"scipy.{part}" for part in ("integrate", "linalg", "optimize", "signal", "special", "stats")),
 }
 TERMINAL = {"rich", "tuning"}
 COMMAND = {*TERMINAL, "pydantic"}  # Typer's
+FITTING = {"numpy", "filters", "llvmlite", "scipy.linalg", "scipy.optimize", "scipy.special"}
 MAY_LOAD = {  # what imports, and commands of the command line, may load
     "import thruster_env": set(),
     "import filters": {"numpy", "filters"},
@@ -225,15 +215,7 @@ MAY_LOAD = {  # what imports, and commands of the command line, may load
     "thruster --help": TERMINAL,
     "thruster new problem mine": COMMAND,
     "thruster inspect": {*COMMAND, "numpy", "scipy.linalg"},
-    "thruster fit acc.csv": {
-        *COMMAND,
-        "numpy",
-        "filters",
-        "llvmlite",
-        "scipy.linalg",
-        "scipy.optimize",
-        "scipy.special",
-    },
+    "thruster fit acc.csv": COMMAND | FITTING,
 }
 
 

@@ -2,17 +2,11 @@
 
 import ast
 import re
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = (
-    "thruster_env",
-    "filters",
-    "tuning",
-    "docs",
-    "benchmarks",
-    "examples",
-)
+from tests.repository.test_house import ROOT, tree_of
+
+PACKAGES = "thruster_env", "filters", "tuning", "docs", "benchmarks", "examples"
+PATHS = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
 
 
 def words_to_avoid():
@@ -25,7 +19,7 @@ def words_to_avoid():
 def defined_in(path):
     """Names that a file defines: its own, functions, parameters, classes, fields."""
     yield path.stem
-    for one in ast.walk(ast.parse(path.read_text())):
+    for one in ast.walk(tree_of(path)):
         if isinstance(one, ast.FunctionDef | ast.ClassDef):
             yield one.name
         if isinstance(one, ast.arg):
@@ -41,8 +35,7 @@ def as_words(name):
 def test_no_definition_has_a_word_of_the_list():
     avoided = words_to_avoid()
     assert len(avoided) > 10 and as_words("MyTwin") == "_my_twin_"
-    paths = (path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-    found = {(path.relative_to(ROOT).as_posix(), name) for path in paths for name in defined_in(path)}
+    found = {(path.relative_to(ROOT).as_posix(), name) for path in PATHS for name in defined_in(path)}
     found = [one for one in sorted(found) if any(word in as_words(one[1]) for word in avoided)]
     assert not found, found
 
@@ -55,7 +48,7 @@ def variables_to_avoid():
 
 def variables_in(path):
     """Variables that a file assigns, but for fields of classes."""
-    tree = ast.parse(path.read_text())
+    tree = tree_of(path)
     lines = [line for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for line in node.body]
     fields = {id(line.target) for line in lines if isinstance(line, ast.AnnAssign)}
     fields |= {id(target) for line in lines if isinstance(line, ast.Assign) for target in line.targets}
@@ -66,6 +59,5 @@ def variables_in(path):
 def test_a_variable_says_what_it_holds():
     avoided = variables_to_avoid()
     assert len(avoided) > 15 and "one" in avoided
-    paths = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
-    wrong = {path.relative_to(ROOT).as_posix(): variables_in(path) & avoided for path in paths}
+    wrong = {path.relative_to(ROOT).as_posix(): variables_in(path) & avoided for path in PATHS}
     assert not {name: words for name, words in wrong.items() if words}

@@ -43,7 +43,7 @@ NOT_RUN = {  # programs, by page and what is in them
     ("extending.md", "tank_model"): "the same",
     ("other_packages.md", "UnobservedComponents"): "needs statsmodels: tests/filters/test_converters.py",
     ("size.md", "lorenz_96"): "a fragment of a model",
-    ("workers.md", "SLURMCluster"): "needs a cluster; executors: tests/thruster_env/core/test_executors.py",
+    ("workers.md", "SLURMCluster"): "needs a cluster; executors: tests/thruster_env/core/test_parallel.py",
     ("workers.md", "KubeCluster"): "the same",
     ("design.md", "def update"): "a part of the package: test_docs.py compares it",
     ("policies.md", "VecNormalize"): "needs Stable-Baselines3, as howto/stable_baselines.md does, which runs",

@@ -28,13 +28,8 @@ WAYS = {
     "pickle": lambda value: pickle.loads(pickle.dumps(value)),
     "cloudpickle": lambda value: pickle.loads(cloudpickle.dumps(value)),
 }
-DISTURBED = {
-    "sensors": {"thrust": SENSORS},
-    "flow": FLOW,
-    "amplifier": AMPLIFIER,
-    "reference": REFERENCE,
-    "uncertainty": UNCERTAINTY,
-}
+DISTURBED = {"sensors": {"thrust": SENSORS}, "flow": FLOW, "amplifier": AMPLIFIER}
+DISTURBED |= {"reference": REFERENCE, "uncertainty": UNCERTAINTY}
 TRACKING = "BowThrusterTracking-v0"
 SINGLE = {
     "plain": lambda: gym.make("BowThruster-v0"),

@@ -17,7 +17,6 @@ OF_PROCESSES = "processes.", "checkpoints."  # tests of their own show what thes
 ATTACKS = [name for name in attacks() if not name.startswith(OF_PROCESSES)]
 SLOW = {  # wait, compile, start processes
     "files.journals",
-    "starts.starts_and_effects",
     "commands.command_lines",
     "arithmetic.compiled_arithmetic",
     "arithmetic.filtered_arithmetic",

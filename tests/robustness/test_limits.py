@@ -46,6 +46,8 @@ def refused(call, rule):
             {"preset": TUNNEL._replace(diameter=1e300)},
             r"diameter must be from 1e-12 to 1e\+12, but got 1e\+300",
         ),
+        ("", {"uncertainty": {"load_gain": {"name": "log-normal", "std": 300}}}, "std must be at most 2"),
+        ("", {"sensors": {"thrust": [{"name": "delay", "steps": 1e15}]}}, "steps must be at most 10000"),
         ("Linear", {"dt": 1e-320}, "dt must be from 1e-09 to 10 s"),
         ("Linear", {"max_voltage": 1e100}, "max_voltage must be from 0.001 to"),
         ("Tracking", {"reference": {"name": "steps", "hold_time": 1e300}}, r"hold_time must be at most 1e\+09 s"),
@@ -95,14 +97,8 @@ def test_counts_have_limits():
     refused(lambda: compare("tunnel", 0.5, runs=HUGE), "runs must be at most 100000, but got")
     refused(lambda: command(out=Path("x.csv"), steps=HUGE), "steps must be at most 10000000")
     model = thruster_model()
-    of_filters = (
-        ("gsf", "parts"),
-        ("vb", "iterations"),
-        ("ienkf", "iterations"),
-        ("kf", "schedule"),
-        ("mhe", "horizon"),
-    )
-    for name, number in of_filters:
+    of_filters = {"gsf": "parts", "vb": "iterations", "ienkf": "iterations", "kf": "schedule", "mhe": "horizon"}
+    for name, number in of_filters.items():
         refused(lambda: make_filter(name, model, **{number: HUGE}), f"{number} must be at most")  # noqa: B023
 
 

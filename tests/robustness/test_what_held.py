@@ -15,9 +15,7 @@ from filters.logs.findings import findings
 from tests.filters.test_filter_paths import assert_paths_agree
 from tests.models import KEY, line_model, scalar_model, simulated, small
 from tests.slow import slow_but
-from tests.thruster_env.core.test_angles import data_of, makers, plain_run, rotated
 from tests.thruster_env.logs.test_logs import MODEL
-from thruster_env.core.angles import difference
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.model_env import ReplayEnv
@@ -25,20 +23,6 @@ from thruster_env.logs.log import Log
 from thruster_env.logs.read import read_log
 
 LOGS, LEVEL = 600, 3.9  # deviations that a binomial share stays within, but once in 10 000 seeds
-
-
-@pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", FILTERS)
-def test_about_any_heading_a_filter_errs_alike(name):
-    _, plain, make = makers(name)
-    keys, inputs, measurements = data_of(plain)
-    for heading in (0.5 * math.pi, -0.5 * math.pi, math.pi, -math.pi, -3.0):
-        found = run(small(name, make(heading)), keys, inputs, rotated(measurements, heading))
-        reference = plain_run(name)
-        apart = difference(found.means, reference.means + [0.0, heading], (False, True))
-        assert np.abs(apart).max() < 2e-8, heading
-        for one, other in zip(found[1:], reference[1:], strict=True):
-            np.testing.assert_allclose(one, other, rtol=2e-8, atol=2e-8)
 
 
 @pytest.mark.usefixtures("as_python")

@@ -28,18 +28,8 @@ from tuning.evaluation.evaluate import evaluate
 from tuning.experiments.users import PANEL, found_problems, name_of
 
 PAGES = (
-    altitude,
-    battery,
-    chain,
-    compartments,
-    geared_motor,
-    heat_exchanger,
-    lateral,
-    lidar,
-    lorenz63,
-    pendulum,
-    range_bearing,
-    reactor,
+    *(altitude, battery, chain, compartments, geared_motor, heat_exchanger, lateral, lidar, lorenz63, pendulum),
+    *(range_bearing, reactor),
 )
 SEEDS = range(2000, 2008)
 FEW = 20  # runs that decide a statistic

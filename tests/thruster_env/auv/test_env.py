@@ -1,9 +1,7 @@
 """The vehicle's env: its interface, its noise, its reward and its ends."""
 
-import copy
 import json
 import math
-import pickle
 import tomllib
 from pathlib import Path
 
@@ -14,7 +12,6 @@ from gymnasium.utils.env_checker import check_env
 
 import thruster_env.auv  # noqa: F401 - registers the envs
 from filters import EstimateState
-from thruster_env.auv.env import SegorogeniAUVVectorEnv
 from thruster_env.auv.equations import simulate as simulate_plant
 from thruster_env.auv.plant import make_plant
 from thruster_env.core.streams import draw_key
@@ -173,19 +170,6 @@ def test_the_same_seed_gives_the_same_episode_and_the_action_leaves_the_noise_al
     np.testing.assert_equal(one, two)
     other = infos_of(gym.make("SegorogeniAUV-v0", **DISTURBED), some_actions(5, 1), seed=3)
     np.testing.assert_equal([i["current"] for i in other], [i["current"] for i in one])
-
-
-@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_copies_and_pickles_go_on_with_the_same_numbers(again):
-    for env, action in (
-        (gym.make("SegorogeniAUVPath-v0", **DISTURBED).unwrapped, CRUISE),
-        (SegorogeniAUVVectorEnv(2, **DISTURBED), np.tile(CRUISE, (2, 1))),
-    ):
-        env.reset(seed=1)
-        env.step(action)
-        other = again(env)
-        for _ in range(3):
-            np.testing.assert_equal(other.step(action), env.step(action))
 
 
 @every_id

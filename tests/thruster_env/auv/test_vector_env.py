@@ -3,12 +3,10 @@
 import importlib.metadata
 
 import gymnasium as gym
-import numpy as np
 import pytest
 
 import thruster_env.auv  # noqa: F401 - registers the envs
 from filters import wrappers as ids
-from filters.wrappers.envs import EstimateState, EstimateStates
 from tests.thruster_env.auv.test_env import DISTURBED
 from tests.thruster_env.thruster.test_vector_env import NEXT_STEP, assert_copies_are_single_envs, every_mode
 
@@ -31,23 +29,6 @@ def test_compiled_copies_of_several_blocks_are_single_envs():
         TASKS[1], 130, NEXT_STEP, 25, 12, [0, 127, 129], exact=range(5), inputs=3, ulps=16, **WILD
     )
     assert ends.sum() >= 6
-
-
-@pytest.mark.usefixtures("as_python")
-def test_a_filter_on_every_copy_is_the_filter_on_a_single_env():
-    given = {"sensors": "motion", "current": [0.1, 0.0, 0.0]}
-    envs = EstimateStates(gym.make_vec(TASKS[0], 2, **given), "ekf")
-    singles = [EstimateState(gym.make(TASKS[0], **given), "ekf") for _ in range(2)]
-    envs.reset(seed=4)
-    for i, single in enumerate(singles):
-        single.reset(seed=4 + i)
-    actions = np.random.default_rng(0).uniform([0.0, -0.5, -0.5], [6.0, 0.5, 0.5], (4, 2, 3))
-    for action in actions:
-        info = envs.step(action)[-1]
-        for i, single in enumerate(singles):
-            expected = single.step(action[i])[-1]
-            np.testing.assert_allclose(info["estimate"][i], expected["estimate"], rtol=1e-10, atol=1e-12)
-            np.testing.assert_allclose(info["estimate_cov"][i], expected["estimate_cov"], rtol=1e-9, atol=1e-14)
 
 
 @pytest.mark.usefixtures("as_python")

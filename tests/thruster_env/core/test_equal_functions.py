@@ -17,9 +17,8 @@ from filters import make_filter, run
 from tests.models import state_space
 from thruster_env.core import equal_functions
 from thruster_env.core.derivatives import runge_kutta
-from thruster_env.core.equal_functions import first_equal
+from thruster_env.core.equal_functions import captured_numbers, differ_in_numbers_alone, first_equal, with_numbers
 from thruster_env.model.continuous import ContinuousModel
-from thruster_env.model.state_space import StateSpaceModel
 
 GAIN = 2.0
 
@@ -212,6 +211,7 @@ def with_module(value=1.0):
     return lambda x: module.value * x
 
 
+NOT_COPIED = from_text, with_large_array, with_members_of_a_local_class, with_cache, with_matrix
 FACTORIES = [
     *(with_number, with_default, with_keyword, with_helper, with_two_levels, with_array, with_large_array),
     *(with_list, with_object, with_frozen, with_namespace, with_method, with_partial, with_local_tuple),
@@ -228,6 +228,14 @@ def test_functions_with_equal_values_are_one_and_functions_with_other_values_are
     assert first_equal(again) == first and first_equal(first) == first
     assert first_equal(other) != first
     assert [first_equal(f)(2.0) for f in (one, again, other)] == [f(2.0) for f in (one, again, other)]
+
+
+@pytest.mark.parametrize("values", [(1.0, 3.0), (-0.0, 1e300), (np.inf, 1e-300)])
+@pytest.mark.parametrize("make", [make for make in FACTORIES if make not in NOT_COPIED])
+def test_a_copy_with_the_numbers_of_another_function_is_that_function(make, values):
+    one, other = map(make, values)
+    assert differ_in_numbers_alone(one, other)
+    assert with_numbers(one, captured_numbers(other))(2.0) == other(2.0)
 
 
 @pytest.mark.parametrize("values", [(1.0, 1), (1.0, True), (0.0, -0.0), (1.0, np.float64(1.0)), (1.0, 1 + 0j)])
@@ -438,17 +446,8 @@ def model_of(number=0.5, gain=1.0, jacobians=True, local_constants=False):
     if jacobians:
         given["transition_jacobian"] = lambda x, u, c: ((1.0 - number * c[0],),)
         given["observe_jacobian"] = lambda x, c: ((number,),)
-    return StateSpaceModel(
-        transition=transition,
-        observe=observe,
-        process_noise_cov=[0.01],
-        measurement_noise_cov=[0.04],
-        prior_mean=[0.0],
-        prior_cov=[1.0],
-        inputs=1,
-        constants=Constants(gain) if local_constants else (gain,),
-        **given,
-    )
+    given["constants"] = Constants(gain) if local_constants else (gain,)
+    return state_space(transition, observe, q=[0.01], r=[0.04], mean=[0.0], cov=[1.0], inputs=1, **given)
 
 
 def continuous(number=0.5, gain=1.0, named=False):

@@ -1,12 +1,13 @@
-"""Files are whole or not there, links stay links, and what is no regular file is written to as it is."""
+"""Files are whole or not there, links stay links, other files are written as they are; TOML is read again."""
 
 import os
 import stat
+import tomllib
 
 import numpy as np
 import pytest
 
-from thruster_env.core.files import check_target, write_whole
+from thruster_env.core.files import as_toml, check_target, read_toml, write_whole
 
 
 @pytest.fixture(autouse=True)
@@ -149,3 +150,26 @@ def test_a_failure_leaves_the_old_file_and_nothing_aside(here):
     with pytest.raises(RuntimeError):
         write_whole("a.json", fail)
     assert (here / "a.json").read_text() == "old" and names(here) == ["a.json"]
+
+
+def test_what_is_written_is_read_again(tmp_path):
+    tables = {
+        "numbers": {"one": 1, "tenth": 0.1, "tiny": 1e-300, "yes": True, "name with spaces": 'a "b"\n\\ ü'},
+        "none": {},
+        "nested": {"list": [1.0, 2.5], "by": {"x y": 1, "z": [True, "t"]}},
+    }
+    text = as_toml(tables, "about")
+    assert text.startswith("# about\n\n[numbers]\n") and "[none]" not in text
+    kept = {name: table for name, table in tables.items() if table}
+    assert tomllib.loads(text) == kept
+    (tmp_path / "x.toml").write_text(text, encoding="utf-8")
+    assert read_toml(tmp_path / "x.toml", "a file") == kept
+
+
+@pytest.mark.parametrize("content", [b"x = ", b"\xff\xfe", b"[" * 5000])
+def test_what_is_no_toml_is_one_line(content, tmp_path):
+    (tmp_path / "x.toml").write_bytes(content)
+    with pytest.raises(ValueError, match="a file must be TOML, but .*x.toml is not"):
+        read_toml(tmp_path / "x.toml", "a file")
+    with pytest.raises(ValueError, match="a file must be readable, but .*none.toml is not: No such file"):
+        read_toml(tmp_path / "none.toml", "a file")

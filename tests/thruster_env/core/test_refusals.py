@@ -1,12 +1,14 @@
-"""Why a function runs as Python: a model that nothing compiles, a broken function of the package, a full disk."""
+"""Why a function runs as Python: no compilation, a model that nothing compiles, a broken function, a full disk."""
 
 import functools
+import runpy
 import threading
 import warnings
 
 import numpy as np
 import pytest
 
+import thruster_env.core.compiled
 from thruster_env.core import compiled
 from thruster_env.core.compiled import Instead, compiled_in_place_of
 from thruster_env.core.sources import Source
@@ -118,3 +120,10 @@ def test_a_second_thread_waits_for_the_machine_code_of_what_it_calls():
     Loops(called_by_ours(replaced))(one)
     thread.join()
     assert (one[0], other[0]) == (5.0, 5.0)
+
+
+@pytest.mark.parametrize("value, runs_as_python", [("1", True), ("0", False), ("", False)])
+def test_the_environment_variable_of_numba_leaves_functions_as_they_are(value, runs_as_python, monkeypatch):
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", value)
+    found = runpy.run_path(thruster_env.core.compiled.__file__)
+    assert found["is_interpreting"]() == runs_as_python

@@ -132,11 +132,6 @@ def test_neighbours_are_independent(changes):
         assert np.abs(correlation).max() < 5.5 / math.sqrt(steps.size)
 
 
-def test_streams_are_seven_different_words():
-    names = "PROCESS MEASUREMENT INITIAL EXCITATION FILTER_PROCESS FILTER_MEASUREMENT FILTER_PRIOR".split()
-    assert len({getattr(streams, name) for name in names}) == 7
-
-
 def test_arrays_and_scalars_give_the_same_numbers():
     steps = np.arange(20)
     many = np.array(streams.normal_block(2, steps, streams.MEASUREMENT, *KEY))

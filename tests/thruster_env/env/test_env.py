@@ -16,8 +16,6 @@ from tests.thruster_env.thruster.test_vector_env import (
     DISABLED,
     NEXT_STEP,
     SAME_STEP,
-    assert_copies_are_single_envs,
-    every_mode,
 )
 from thruster_env.core.streams import draw_key
 from thruster_env.model.simulate import simulate
@@ -61,19 +59,6 @@ def test_truth_is_that_of_the_model_with_the_same_key():
 
 
 @as_python
-@every_mode
-def test_a_copy_is_the_single_env_with_its_seed(mode):
-    ends = assert_copies_are_single_envs("Cart-v0", 3, mode, 40, 7, [0, 1, 2], inputs=2, **LOSING)
-    assert ends.all()  # some were terminated, some truncated
-
-
-@pytest.mark.slow
-def test_compiled_copies_of_several_blocks_are_single_envs():
-    ends = assert_copies_are_single_envs("Cart-v0", 130, NEXT_STEP, 12, 5, [0, 127, 129], inputs=2, **LOSING)
-    assert ends.any()
-
-
-@as_python
 def test_modes_differ_in_what_a_step_beyond_the_end_shows():
     shown = {}
     for mode in (NEXT_STEP, SAME_STEP, DISABLED):
@@ -84,19 +69,6 @@ def test_modes_differ_in_what_a_step_beyond_the_end_shows():
         if mode == NEXT_STEP:
             assert env.step(np.full((2, 2), np.nan))[-1]["time"][0] == 0.0  # the actions of a reset are ignored
     assert shown == {NEXT_STEP: pytest.approx(0.2), SAME_STEP: 0.0, DISABLED: pytest.approx(0.2)}
-
-
-@as_python
-def test_missing_measurements_are_flagged_and_repeated():
-    env = CartEnv(**LOSING)
-    last, lost = env.reset(seed=3)[1]["measurement"][0], 0
-    for _ in range(30):
-        observation, *_, info = env.step(ACTION)
-        assert info["measurement_valid"].dtype == bool and info["measurement_valid"][1]
-        assert observation[2] == info["measurement_valid"][0] and observation[3] == np.float32(info["state"][2])
-        assert info["measurement_valid"][0] != (info["measurement"][0] == last)
-        last, lost = info["measurement"][0], lost + (not info["measurement_valid"][0])
-    assert 3 < lost < 20
 
 
 @as_python
@@ -150,15 +122,6 @@ def test_arguments_stand_in_one_place():
         CartEnv(render_mode="human")
     with pytest.raises(ValueError, match="of a cart's model must be among process_noise_cov, but got 'mass'"):
         CartEnv().state_space_model(mass=1.0)
-
-
-@as_python
-def test_a_state_may_be_given():
-    for env in (CartEnv(), CartVectorEnv(2)):
-        _, info = env.reset(seed=1, options={"state": [1.0, 2.0, 3.0]})
-        np.testing.assert_array_equal(np.atleast_2d(info["state"])[-1], [1.0, 2.0, 3.0])
-        with pytest.raises(ValueError, match="the state of options must be 3 finite numbers"):
-            env.reset(options={"state": [1.0, 2.0]})
 
 
 @as_python

@@ -15,13 +15,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from filters import EstimateState
-from tests.models import lonely_model, plane_model
+from tests.models import lonely_model, plane_model, state_space
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.env.model_env import ModelEnv, ModelVectorEnv, page_of
 from thruster_env.graphs.values import traceable
 from thruster_env.model.simulate import simulate
-from thruster_env.model.state_space import StateSpaceModel
 from tuning.experiments import range_bearing
 
 
@@ -110,18 +109,9 @@ def ends(x):
 
 
 def one_state(transition):
-    return StateSpaceModel(
-        transition=transition,
-        observe=level,
-        process_noise_cov=[0.04],
-        measurement_noise_cov=[0.01],
-        prior_mean=[1.0],
-        prior_cov=[1.0],
-        inputs=1,
-        states=[("level", "h", "m")],
-        input_quantities=[("flow", "q", "m/s")],
-        measurements=[("pressure", "p", "m")],
-    )
+    names = {"states": [("level", "h", "m")], "input_quantities": [("flow", "q", "m/s")]}
+    noise = {"q": [0.04], "r": [0.01], "mean": [1.0], "cov": [1.0]}
+    return state_space(transition, level, **noise, inputs=1, measurements=[("pressure", "p", "m")], **names)
 
 
 @pytest.mark.parametrize("transition", [linear, deciding])

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import filters
-from filters import StateSpaceModel, make_filter, run
+from filters import make_filter, run
 from filters.c.programs import programs_of
+from tests.models import state_space
 from thruster_env.core.compiled import (
     Copies,
     caught,
@@ -107,16 +108,8 @@ def overflows(x, u, c):
 
 
 def model(transition, n=2, **changes):
-    given = dict(
-        transition=transition,
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[0.1] * n,
-        measurement_noise_cov=[0.1],
-        prior_mean=[0.0] * n,
-        prior_cov=[1.0] * n,
-        inputs=0,
-    )
-    return StateSpaceModel(**given | changes)
+    noise, prior = {"q": [0.1] * n, "r": [0.1]}, {"mean": [0.0] * n, "cov": [1.0] * n}
+    return state_space(transition, lambda x, c: (x[0],), **noise, **prior, inputs=0, **changes)
 
 
 def hears_nothing(transition, name="ekf", **changes):

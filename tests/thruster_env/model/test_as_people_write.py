@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from filters import StateSpaceModel, make_filter, run
-from filters.bounds import posterior_bound
 from filters.c.programs import programs_of
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
@@ -247,13 +246,3 @@ def test_estimates_are_those_of_python(make):
         expected = run(make_filter("ekf", model), KEYS, inputs, truth.measurements)
     found = run(make_filter("ekf", model), KEYS, inputs, truth.measurements)
     np.testing.assert_allclose(found.means, expected.means, rtol=1e-10, atol=1e-11)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("make", MODELS, ids=lambda make: make.__name__)
-def test_bounds_are_those_of_python(make):
-    model = make()
-    inputs = inputs_of(model)[:1, :4]
-    with interpreted():
-        expected = posterior_bound(model, inputs, truths=3)
-    np.testing.assert_allclose(posterior_bound(model, inputs, truths=3), expected, rtol=1e-7)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import filters
+from tests.models import state_space
 from thruster_env.graphs.branches import on_every_side
 from thruster_env.graphs.graphs import Graph
 from thruster_env.graphs.loops import Loops
 from thruster_env.graphs.tracing import traced
 from thruster_env.model.simulate import seconds_as_python
-from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.traced import TABLES, _machine_code, called_function
 
 GAINS = {"pull": 0.3, "names": ("a", "b")}
@@ -184,17 +184,8 @@ def test_the_line_is_that_of_the_helper_which_fails():
     assert TABLES in reason
 
 
-def model_of(transition, **changes):
-    arguments = {
-        "transition": transition,
-        "observe": lambda x, c: (x[0],),
-        "process_noise_cov": [0.1],
-        "measurement_noise_cov": [0.1],
-        "prior_mean": [1.0],
-        "prior_cov": [0.1],
-        "inputs": 1,
-    }
-    return StateSpaceModel(**arguments | changes)
+def model_of(transition):
+    return state_space(transition, lambda x, c: (x[0],), q=[0.1], r=[0.1], mean=[1.0], cov=[0.1], inputs=1)
 
 
 def test_the_time_of_python_is_that_of_models_which_are_no_machine_code():

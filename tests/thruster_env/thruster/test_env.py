@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.utils.env_checker import check_env
 
 import thruster_env
 from thruster_env import PRESETS, BowThrusterEnv
@@ -48,21 +47,6 @@ def assert_same_episode(one, other):
         assert a.keys() == b.keys()
         for key in a:
             np.testing.assert_array_equal(a[key], b[key])
-
-
-# Its advice on bounds is not ours: volts are volts, and Gaussian noise has no bounds.
-@pytest.mark.filterwarnings(r"ignore:.*(symmetric and normalized|probably too):UserWarning")
-@every_preset
-def test_gymnasiums_checker_passes(preset):
-    for arguments in ({}, {"max_voltage": 5, "ambient_velocity": 0.1}):
-        env = gym.make("BowThruster-v0", preset=preset, **arguments)
-        check_env(env.unwrapped, skip_render_check=True)
-
-
-@every_preset
-def test_stable_baselines_checker_passes(preset):
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    checker.check_env(BowThrusterEnv(preset), warn=False, skip_render_check=True)
 
 
 def test_spaces_are_one_voltage_in_and_one_thrust_out():
@@ -128,13 +112,6 @@ def test_what_the_env_returns_is_not_shared():
         assert set(info) == INFO
 
 
-def test_an_action_is_not_changed():
-    env, action = BowThrusterEnv(), np.array([99.0], dtype=np.float32)
-    env.reset(seed=0)
-    env.step(action)
-    assert action[0] == 99.0
-
-
 def test_the_same_seed_gives_the_same_episode():
     voltages = actions(100)
     env = gym.make("BowThruster-v0")
@@ -168,15 +145,6 @@ def test_noise_of_a_seed_does_not_depend_on_the_actions():
     np.testing.assert_allclose(noises[1], noises[0], rtol=0, atol=1e-11)
     np.testing.assert_allclose(noises[2], noises[0], rtol=0, atol=1e-11)
     assert np.abs(noises[0]).min() > 0
-
-
-def test_copies_of_a_vector_env_are_single_envs_with_the_next_seeds():
-    voltages = actions(20)
-    vector = gym.make_vec("BowThruster-v0", num_envs=3, vectorization_mode="sync")
-    observations = [vector.reset(seed=40)[0]] + [vector.step(np.tile(v, (3, 1)))[0] for v in voltages]
-    for i in range(3):
-        expected, _, _ = episode(gym.make("BowThruster-v0"), voltages, seed=40 + i)
-        np.testing.assert_array_equal(np.array(observations)[:, i], expected)
 
 
 @every_preset
@@ -239,20 +207,6 @@ def test_reward_is_the_squared_error_of_the_true_thrust_and_the_cost_of_the_jump
     np.testing.assert_allclose(rewards, expected, rtol=1e-12)
 
 
-def test_holding_the_reference_costs_nothing():
-    env = BowThrusterEnv(process_noise_cov=[0, 0], initial_state={"voltage": 12.0})
-    env.reset(seed=0)
-    env.step([12.0])
-    assert env.step([12.0])[1] == pytest.approx(0.0, abs=1e-15)
-
-
-def test_without_noise_the_observation_is_the_thrust_and_seeds_do_not_matter():
-    env = BowThrusterEnv(process_noise_cov=[0, 0], measurement_noise_cov=0, initial_state=[1.0, 0.0])
-    one, other = (episode(env, actions(50), seed=seed) for seed in (1, 2))
-    assert_same_episode(one, other)
-    np.testing.assert_array_equal(one[0][:, 0], np.float32([info["thrust"] for info in one[2]]))
-
-
 @pytest.mark.parametrize(
     "initial_state",
     [[150.0, 2.0], {"voltage": -6.0}, {"mean": [150.0, 2.0], "cov": [0.0, 0.0]}],
@@ -262,31 +216,6 @@ def test_an_episode_starts_where_it_was_told(initial_state):
     x = BowThrusterEnv(initial_state=initial_state).reset(seed=1)[1]["state"]
     expected = steady_state(TUNNEL, -6.0)[:2] if "voltage" in initial_state else (150.0, 2.0)
     assert tuple(x) == expected
-
-
-WRONG_ACTIONS = [
-    math.nan,
-    [math.nan],
-    np.array([np.nan], np.float32),
-    [],
-    [1.0, 2.0],
-    np.zeros(2, np.float32),
-    np.zeros((2, 1)),
-    "full",
-    None,
-    [1j],
-]
-
-
-@pytest.mark.parametrize("action", WRONG_ACTIONS, ids=repr)
-def test_a_wrong_action_is_refused_and_changes_nothing(action):
-    expected = episode(BowThrusterEnv(), actions(3), seed=4)
-    env = BowThrusterEnv()
-    env.reset(seed=4)
-    with pytest.raises(ValueError, match="an action must be one voltage .*, but got "):
-        env.step(action)
-    for voltage, info in zip(actions(3), expected[2][1:], strict=True):
-        np.testing.assert_array_equal(env.step(voltage)[4]["state"], info["state"])
 
 
 @pytest.mark.parametrize(
@@ -305,7 +234,9 @@ def test_a_voltage_beyond_the_maximum_is_the_maximum(action):
     env = BowThrusterEnv()
     for sign in (1, -1):
         env.reset(seed=4)
-        state = env.step([sign * action])[4]["state"]
+        given = np.array([sign * action])
+        state = env.step(given)[4]["state"]
+        assert given[0] == sign * action  # the caller's array
         env.reset(seed=4)
         np.testing.assert_array_equal(state, env.step([sign * 24.0])[4]["state"])
 

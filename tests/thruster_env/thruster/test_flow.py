@@ -48,10 +48,6 @@ def test_a_sinusoid_is_taken_in_the_middle_of_a_step(dt):
     np.testing.assert_allclose(flows(SIGNALS[0], dt=dt), np.tile(expected, (3, 1)), rtol=0, atol=1e-12)
 
 
-def test_a_sinusoid_of_zero_phase_begins_upwards():
-    assert flows({"name": "sinusoid", "amplitude": 1.0})[0, 0] > 0
-
-
 @pytest.mark.parametrize("dt", [0.01, 0.03])
 def test_a_gauss_markov_flow_is_stationary_normal_and_correlated_as_it_says(dt):
     std, decay = 0.4, math.exp(-dt / 0.3)

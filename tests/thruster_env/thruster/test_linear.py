@@ -147,15 +147,13 @@ def test_nothing_turns_without_voltage_and_flow(p):
     assert steady_state(p, 0.0) == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("p", [OPEN_BLADED_CORRECTED], ids=["open_bladed_corrected"])
-@pytest.mark.parametrize(("voltage", "ambient"), [(-1.0, 0.5), (-12.0, 2.0), (-1.5, 1.0), (-12.0, 5.0)])
-def test_a_voltage_against_the_flow_settles_to_its_steady_state(p, voltage, ambient):
-    x = steady_state(p, voltage, ambient)[:2]
-    assert settled(p, voltage, ambient) == pytest.approx(x, rel=1e-5, abs=1e-6)
+FLOWS = [
+    (p, *at) for p in (TUNNEL, TUNNEL_PHYSICAL, OPEN_BLADED) for at in [(-12, 1), (-1, 0.5), (0, 2), (12, -2)]
+]
+FLOWS += [(OPEN_BLADED_CORRECTED, *at) for at in [(-1, 0.5), (-12, 2), (-1.5, 1), (-12, 5)]]
 
 
-@pytest.mark.parametrize("p", [TUNNEL, TUNNEL_PHYSICAL, OPEN_BLADED], ids=lambda p: f"K_h {p.load_gain}")
-@pytest.mark.parametrize(("voltage", "ambient"), [(-12.0, 1.0), (-1.0, 0.5), (0.0, 2.0), (12.0, -2.0)])
+@pytest.mark.parametrize(("p", "voltage", "ambient"), FLOWS)
 def test_a_voltage_in_a_flow_settles_to_its_steady_state(p, voltage, ambient):
     x = steady_state(p, voltage, ambient)[:2]
     assert settled(p, voltage, ambient) == pytest.approx(x, rel=1e-5, abs=1e-6)

@@ -8,8 +8,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import thruster_env
 from tests.thruster_env.thruster.test_sensors import EVERY_EFFECT as SENSORS
@@ -184,46 +182,6 @@ def test_random_configurations_are_refused_or_finite():
     assert refused > 3 and done >= 300 and terminated > 10
 
 
-numbers = st.one_of(st.floats(), st.floats(-1e3, 1e3), st.sampled_from([0.0, 1e-300, 1e300, -1.0]))
-covariances = st.one_of(
-    numbers, st.lists(numbers, max_size=3), st.lists(st.lists(numbers, max_size=3), max_size=3)
-)
-
-
-@pytest.mark.slow
-@settings(max_examples=150, deadline=None, derandomize=True, database=None)
-@given(
-    st.sampled_from(list(PRESETS)),
-    st.floats(1e-4, 0.1),
-    covariances,
-    covariances,
-    st.one_of(st.none(), st.lists(numbers, max_size=3)),
-    st.lists(numbers, max_size=3),
-)
-def test_any_numbers_are_refused_or_lead_to_finite_results(preset, dt, q, r, initial_state, actions):
-    dt = float(f"{dt:.1g}")  # few enough for their sub-steps to be remembered
-    try:
-        env = thruster_env.BowThrusterEnv(
-            preset, dt=dt, process_noise_cov=q, measurement_noise_cov=r, initial_state=initial_state
-        )
-    except ValueError as error:
-        assert " must be " in str(error) and "\n" not in str(error)
-        return
-    observation, info = env.reset(seed=0)
-    started = np.abs(info["state"]).max() < 1e100 and np.isfinite(info["measurement"]).all()
-    assert not started or not np.isnan(observation).any()
-    for action in actions:
-        if math.isnan(action):
-            with pytest.raises(ValueError, match="an action must be one voltage"):
-                env.step(action)
-            continue
-        observation, reward, terminated, _, info = env.step(action)
-        assert not np.isnan(observation).any()
-        if terminated:
-            break
-        assert np.isfinite(reward) and np.isfinite(info["state"]).all() and math.isfinite(info["thrust"])
-
-
 def test_python_and_machine_code_agree_with_everything_that_disturbs():
     channels = dict.fromkeys(["thrust", "speed", "speed-magnitude", "current"], SENSORS)
     arguments = {"sensors": channels, "flow": FLOW, "amplifier": AMPLIFIER, "reference": REFERENCE}
@@ -304,20 +262,3 @@ def test_the_reward_stays_finite_when_the_state_does_not():
                 ends.append(info["state"])
                 break
     assert not np.isfinite(ends).all()  # the case is met
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"uncertainty": {"load_gain": {"name": "log-normal", "std": 300}}}, "std must be at most 2"),
-        ({"sensors": {"thrust": [{"name": "delay", "steps": 1e15}]}}, "steps must be at most 10000"),
-    ],
-)
-def test_what_no_memory_and_no_number_could_hold_is_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        gym.make("BowThruster-v0", **arguments)
-
-
-def test_a_vector_env_asks_for_a_reset_first():
-    with pytest.raises(gym.error.ResetNeeded):
-        BowThrusterVectorEnv(2).step(np.zeros((2, 1)))

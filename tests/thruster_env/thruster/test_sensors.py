@@ -165,13 +165,6 @@ def test_dropout_has_its_share_its_lengths_and_holds_the_last_valid_reading(prob
     assert abs(share - probability) <= 4.5 * math.sqrt(spread)
 
 
-def test_the_first_readings_are_zero_while_they_are_missing():
-    run = run_of([{"name": "dropout", "probability": 0.5, "mean_length": 20.0}], r=0.25, initial_state=[50.0, 1.0])
-    missing = ~np.logical_or.accumulate(run.valid[..., 0], axis=1)
-    assert missing[:, 0].any() and (run.thrusts[missing] != 0).any()
-    assert (run.measurements[..., 0][missing] == 0).all()
-
-
 def test_validity_is_told_in_the_observation_and_in_info():
     often, seldom = ({"name": "dropout", "probability": share} for share in (0.5, 0.2))
     env = gym.make("BowThruster-v0", sensors={"speed": [], "thrust": [often], "speed-magnitude": [seldom]})

@@ -8,6 +8,7 @@ import pytest
 h5py, *_ = (
     pytest.importorskip(name) for name in ("h5py", "pyulog", "pymavlink", "rosbags")
 )  # the extra recorders
+EPOCH = 1_700_000_000 * 10**9  # [ns]
 STRUCT = {"Q": "Q", "f": "f", "d": "d", "c": "h", "C": "H", "L": "i", "B": "B", "h": "h", "n": "4s", "N": "16s"}
 STRUCT |= {"Z": "64s", "a": "64s", "b": "b", "H": "H", "I": "I"}
 
@@ -63,22 +64,62 @@ def dataflash(kinds, messages, units=None):
     return bytes(out)
 
 
-def write_bag(path, topics, kind="ros1"):
-    """A bag of ROS 1, or of ROS 2 ("sqlite3", "mcap"): topics (name, type, [(received [ns], message)])."""
+def bag_writer(path, kind):
+    """A writer of bags of ROS 1 ("ros1"), or of ROS 2 ("sqlite3", "mcap")."""
     from rosbags import rosbag1, rosbag2
+
+    if kind == "ros1":
+        return rosbag1.Writer(path)
+    plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
+    return rosbag2.Writer(path, version=9, storage_plugin=plugin)
+
+
+def messages_of(kind):
+    """The known types of messages of a bag, and the function that serialises them."""
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
-    if kind == "ros1":
-        writer, serialize = rosbag1.Writer(path), store.serialize_ros1
-    else:
-        plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
-        writer, serialize = rosbag2.Writer(path, version=9, storage_plugin=plugin), store.serialize_cdr
-    with writer:
+    return store, store.serialize_ros1 if kind == "ros1" else store.serialize_cdr
+
+
+def write_bag(path, topics, kind="ros1"):
+    """A bag of some kind: topics (name, type, [(received [ns], message)])."""
+    store, serialize = messages_of(kind)
+    with bag_writer(path, kind) as writer:
         for name, type_name, messages in topics:
             connection = writer.add_connection(name, type_name, typestore=store)
             for received, make in messages:
                 writer.write(connection, received, serialize(make(store.types, kind), type_name))
+
+
+def write_definitions(path, kind, orders, rows, fields):
+    """A bag whose topic /m has several definitions, in turns: names of numbers and rows."""
+    head = b"" if kind == "ros1" else b"\x00\x01\x00\x00"
+    with bag_writer(path, kind) as writer:
+        for part, (order, numbers) in enumerate(zip(orders, rows, strict=True)):
+            text = "".join(f"float64 {key}\n" for key in order)
+            own = {"md5sum": f"{part:032d}"} if kind == "ros1" else {"rihs01": f"RIHS01_{part:064d}"}
+            name = "a/msg/M" if kind == "ros1" else f"a{part}/msg/M"
+            connection = writer.add_connection("/m", name, msgdef=text, **own)
+            for k, values in enumerate(numbers, sum(map(len, rows[:part]))):
+                body = struct.pack(f"<{len(order)}d", *(values[fields.index(key)] for key in order))
+                writer.write(connection, EPOCH + 10**7 * k, head + body)
+
+
+def twists(values, stamps):
+    """Messages with values in linear.x: with stamps [ns] in their headers, or without headers (None)."""
+
+    def at(k):
+        def make(types, kind):
+            vector = types["geometry_msgs/msg/Vector3"]
+            twist = types["geometry_msgs/msg/Twist"](vector(float(values[k]), 0.0, 0.0), vector(0.0, 0.0, 0.0))
+            if stamps is None:
+                return twist
+            return types["geometry_msgs/msg/TwistStamped"](stamped(types, kind, int(stamps[k])), twist)
+
+        return make
+
+    return [at(k) for k in range(len(values))]
 
 
 def stamped(types, kind, stamp):

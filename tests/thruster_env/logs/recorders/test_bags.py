@@ -8,15 +8,12 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from tests.thruster_env.logs.recorders.files import write_bag
+from tests.thruster_env.logs.recorders.files import write_bag, write_definitions
 from tests.thruster_env.logs.recorders.test_bad_recordings import refused, write_good
 from tests.thruster_env.logs.recorders.test_formats import bag_topics
 from thruster_env.logs.recorders import topics
 from thruster_env.logs.recorders.bag_counts import counts_of
 from thruster_env.logs.recorders.registry import fields, read
-
-OLD, NEW = "float64 x\nfloat64 z\n", "float64 z\nfloat64 w\nfloat64 x\n"
-DIGEST = "RIHS01_" + "0" * 64
 
 
 def samples_by_topic(path):
@@ -49,36 +46,11 @@ def test_fifty_seven_zeros_in_an_mcap_file_are_said(tmp_path):
     refused(path, "a bag must hold the messages that it says it has, but '/.*' has .* of 100 by its statistics")
 
 
-def write_merged(path, kind):
-    """A bag with one topic of two definitions, ten messages each, as of a node that was rebuilt."""
-    from rosbags import rosbag1, rosbag2
-
-    if kind == "ros1":
-        writer = rosbag1.Writer(path)
-    else:
-        plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
-        writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
-    with writer:
-        for part, (text, name) in enumerate(
-            ((OLD, "a/msg/M"), (NEW, "a/msg/M" if kind != "sqlite3" else "b/msg/M"))
-        ):
-            options = {"md5sum": f"{part}" * 32} if kind == "ros1" else {"rihs01": DIGEST}
-            qos = {} if kind == "ros1" else {"offered_qos_profiles": []}
-            if kind == "sqlite3" or kind == "mcap":
-                name = f"{'ab'[part]}/msg/M"
-            connection = writer.add_connection("/m", name, msgdef=text, **options, **qos)
-            for k in range(10):
-                numbers = {"x": k + 0.1, "z": 100.0 + k, "w": -7.0}
-                order = [line.split()[1] for line in text.splitlines()]
-                head = b"" if kind == "ros1" else b"\x00\x01\x00\x00"
-                body = struct.pack(f"<{len(order)}d", *(numbers[one] for one in order))
-                writer.write(connection, 10**9 + 10**7 * (10 * part + k), head + body)
-
-
 @pytest.mark.parametrize("kind", ["ros1", "mcap", "sqlite3"])
 def test_messages_of_two_definitions_are_matched_by_the_names_of_fields(tmp_path, kind):
     """In the second one z stands where x was; w is new."""
-    write_merged(tmp_path / "a.bag", kind)
+    rows = np.column_stack([np.arange(10) + 0.1, np.arange(10) + 100.0, np.full(10, -7.0)])
+    write_definitions(tmp_path / "a.bag", kind, ["xz", "zwx"], [rows, rows], "xzw")
     found = read(tmp_path / "a.bag", None if kind == "ros1" else ["/m.x", "/m.z", "/m.w"])
     twice = np.tile(np.arange(10.0), 2)
     np.testing.assert_array_equal(found["/m.x"].values, twice + 0.1)

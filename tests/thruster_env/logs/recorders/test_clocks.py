@@ -5,15 +5,15 @@ import pytest
 from scipy.io import savemat
 
 from tests.fuzz.logs import MODEL
-from tests.thruster_env.logs.recorders.files import dataflash, h5py, stamped, write_bag
+from tests.thruster_env.logs.recorders.files import EPOCH, dataflash, h5py, twists, write_bag
 from thruster_env.logs.findings import sentences
 from thruster_env.logs.read import read_log
 from thruster_env.logs.recorders.registry import fields
 from thruster_env.model.affine import affine_model
 
-EPOCH = 1_700_000_000 * 10**9
 TICK = 10**7  # [ns] from message to message
 ROWS = 120
+K = np.arange(ROWS)
 FORCE = np.where(np.arange(ROWS) // 20 % 2, -1.0, 1.0)
 SPEED = np.sin(np.arange(ROWS) / 7.0)
 # The clock in the headers of the speed, the force and its rate; None for headers without one, "" for no header.
@@ -36,18 +36,8 @@ def write(path, name, kind):
     speed, force, rate = CLOCKS[name]
 
     def messages(values, clock):
-        def at(k):
-            def make(types, kind):
-                vector = types["geometry_msgs/msg/Vector3"]
-                twist = types["geometry_msgs/msg/Twist"](vector(float(values[k]), 0.0, 0.0), vector(0.0, 0.0, 0.0))
-                if clock == "":
-                    return twist
-                stamp = 0 if clock is None else clock + rate * TICK * k
-                return types["geometry_msgs/msg/TwistStamped"](stamped(types, kind, stamp), twist)
-
-            return make
-
-        return [(EPOCH + TICK * k, at(k)) for k in range(ROWS)]
+        stamps = None if clock == "" else 0 * K if clock is None else clock + rate * TICK * K
+        return list(zip((EPOCH + TICK * K).tolist(), twists(values, stamps), strict=True))
 
     types = ["geometry_msgs/msg/Twist" + ("" if clock == "" else "Stamped") for clock in (speed, force)]
     write_bag(path, [("/v", types[0], messages(SPEED, speed)), ("/f", types[1], messages(FORCE, force))], kind)

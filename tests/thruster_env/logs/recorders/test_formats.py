@@ -7,12 +7,11 @@ import pytest
 import scipy.io
 from scipy.io import loadmat, savemat
 
-from tests.thruster_env.logs.recorders.files import dataflash, h5py, stamped, write_bag, write_ulog
+from tests.thruster_env.logs.recorders.files import EPOCH, dataflash, h5py, stamped, write_bag, write_ulog
 from thruster_env.logs.recorders.arrays import arrays_of
 from thruster_env.logs.recorders.registry import fields, format_of, read
 
 RNG = np.random.default_rng(0)
-EPOCH = 1_700_000_000 * 10**9  # [ns]
 
 
 def by_name(path):

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from filters.logs.estimate import estimate
-from tests.thruster_env.logs.recorders.files import stamped
+from tests.thruster_env.logs.recorders.files import EPOCH, bag_writer, messages_of, stamped
 from tests.thruster_env.logs.recorders.test_bad_recordings import refused
-from tests.thruster_env.logs.recorders.test_formats import EPOCH
 from thruster_env.logs.recorders import topics
 from thruster_env.logs.recorders.registry import contents, fields, read
 from thruster_env.thruster.model import thruster_model
@@ -18,21 +17,15 @@ FIELDS = [*(f"translation.{axis}" for axis in "xyz"), *(f"rotation.{axis}" for a
 
 def write_transforms(path, messages, kind="ros1", type_name=TF2):
     """A bag of arrays of transforms: (topic, received [ns], [(parent, child, stamp [ns], seven numbers)])."""
-    from rosbags import rosbag1, rosbag2
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from rosbags.typesys import get_types_from_msg
 
-    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    store, serialize = messages_of(kind)
     if type_name not in store.fielddefs:
         store.register(get_types_from_msg(DEFINITION, type_name))
-    if kind == "ros1":
-        writer, serialize = rosbag1.Writer(path), store.serialize_ros1
-    else:
-        plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
-        writer, serialize = rosbag2.Writer(path, version=9, storage_plugin=plugin), store.serialize_cdr
     types = store.types
     vector, rotation = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
     transform, one_stamped = types["geometry_msgs/msg/Transform"], types["geometry_msgs/msg/TransformStamped"]
-    with writer:
+    with bag_writer(path, kind) as writer:
         connections = {
             topic: writer.add_connection(topic, type_name, typestore=store)
             for topic in dict.fromkeys(topic for topic, *_ in messages)

@@ -1,7 +1,15 @@
+"""Functions written out as text, what their tracebacks show, and what their machine code follows from."""
+
+import linecache
+import sys
+import textwrap
+import types
+
 import numpy as np
 import pytest
+from numba.core.serialize import dumps
 
-from thruster_env.core.compiled import function_fingerprint, interpreted, is_interpreting
+from thruster_env.core.compiled import code_text, function_fingerprint, interpreted, is_interpreting
 from thruster_env.core.sources import (
     column_reader,
     column_writer,
@@ -121,3 +129,79 @@ def test_a_fingerprint_tells_functions_apart_and_is_stable():
 
     assert function_fingerprint(one) == function_fingerprint(one)
     assert len({function_fingerprint(*each) for each in ((), (one,), (other,))}) == 3
+
+
+def shifted(size, by):
+    """A function whose text depends on more than the sizes in its name."""
+    return written_out("shift", "x", f"x + {by:.1f}")
+
+
+def key(function):
+    """What numba compares of a function in a closure to find its machine code again."""
+    return dumps((function,))
+
+
+def test_machine_code_is_found_again_whatever_was_written_out_before(monkeypatch):
+    first, other = key(shifted(2, 1.0)), key(shifted(2, 2.0))
+    assert first != other
+    monkeypatch.setattr(linecache, "cache", {})  # as in another process
+    assert key(shifted(2, 2.0)) == other and key(shifted(2, 1.0)) == first
+
+
+def test_the_source_of_each_of_equal_names_is_shown():
+    for function, text in ((shifted(2, 1.0), "x + 1.0"), (shifted(2, 2.0), "x + 2.0")):
+        file = function.__code__.co_filename
+        assert linecache.getlines(file) == ["def shift(x):\n", f"    return {text}\n"]
+        assert file.startswith("<shift, written out by tests.thruster_env.core.test_sources.shifted(2), ")
+
+
+USERS = """
+import params
+from params import K
+from params import TABLE
+
+def direct(x):
+    return K * x
+
+def attribute(x):
+    return params.K * x
+
+def nested(x):
+    def inner(y):
+        return params.deeper.K * y
+    return inner(x)
+
+def listed(x):
+    return TABLE[0] * x
+
+def made(k):
+    def closed(x):
+        return k * x
+    return closed
+
+def outer(x):
+    return direct(x)
+"""
+
+
+def users(monkeypatch, k):
+    """A user's file, the numbers of which are in another file of his."""
+    params = types.ModuleType("params")
+    params.deeper = types.ModuleType("params.deeper")
+    params.K, params.deeper.K, params.TABLE, params.other = k, k, np.array([k, 1.0]), object()
+    monkeypatch.setitem(sys.modules, "params", params)
+    found = types.ModuleType("mine")
+    exec(compile(textwrap.dedent(USERS), "mine.py", "exec"), found.__dict__)
+    found.closed = found.made(k)
+    return found
+
+
+@pytest.mark.parametrize("name", ["direct", "attribute", "nested", "listed", "closed", "outer"])
+def test_another_number_in_another_file_is_another_code(monkeypatch, name):
+    one, same, other = (getattr(users(monkeypatch, k), name) for k in (2.0, 2.0, 3.0))
+    prints = [function_fingerprint(part) for part in (one, same, other)]
+    assert prints[0] == prints[1] != prints[2]
+
+
+def test_objects_tell_nothing_for_their_addresses_differ(monkeypatch):
+    assert "object at" not in code_text(users(monkeypatch, 2.0).attribute)
