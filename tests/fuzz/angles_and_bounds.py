@@ -1,7 +1,4 @@
-"""Attacks on angles, on noise whose variances lie far apart, and on samples that are masked or NaN.
-
-Each takes a generator and how long it may take [s], and returns a line with what it counted.
-"""
+"""Attacks on angles, on noise whose variances lie far apart, and on samples that are masked or NaN."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Attacks on the arithmetic of traced models: random expressions at whole multiples, zeros, huge numbers and NaN.
 
-Python's own value is the judge, of graphs, machine code, tensors and C. Each attack takes a generator and how long
-it may take [s], and returns a line with what it counted.
+Python's own value is the judge, of graphs, machine code, tensors and C.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Attacks on derivatives: at kinks and zeros, and far from the origin.
-
-Each takes a generator and how long it may take [s], and returns a line with what it counted.
-"""
+"""Attacks on derivatives: at kinks and zeros, and far from the origin."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Attacks on processes: Ctrl-C at any moment, once or twice, also at the last output.
-
-Each takes a random generator and the seconds that it may last, and returns a line for the report; it raises
-AssertionError with what brings the fault about.
-"""
+"""Attacks on processes: Ctrl-C at any moment, once or twice, also at the last output."""
 
 import os
 import signal

@@ -1,7 +1,6 @@
 """Attacks on envs and filters from Python: random arguments, episodes, copies, beliefs and wrong types.
 
-Each takes a generator and how long it may take [s], and returns a line with what it counted. Whatever is refused
-must be so in one line that states a rule; whatever is accepted must lead to finite numbers.
+Whatever is refused must be so in one line that states a rule; whatever is accepted must lead to finite numbers.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Attacks by sizes and units: 1 to 12 states, 1 to 16 sensors, and units that differ by 18 orders of magnitude.
-
-Each takes a generator and how long it may take [s], and returns a line with what it counted.
-"""
+"""Attacks by sizes and units: 1 to 12 states, 1 to 16 sensors, and units that differ by 18 orders of magnitude."""
 
 from __future__ import annotations
 

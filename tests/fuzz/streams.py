@@ -1,7 +1,4 @@
-"""Attacks on what a run follows from: streams of one seed, digests of changed code, arrays that others write into.
-
-Each takes a generator and how long it may take [s], and returns a line with what it counted.
-"""
+"""Attacks on what a run follows from: the seed alone, digests of numbers, arrays that others write into."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Attacks on filters of tensors: random models, filters, forms of missing samples and sizes of batches.
-
-Each takes a generator and how long it may take [s], and returns a line with what it counted.
-"""
+"""Attacks on filters of tensors: random models, filters, forms of missing samples and sizes of batches."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Attacks on steps of unequal length and noises that are set, against a Kalman filter by hand.
-
-Each takes a generator and how long it may take [s], and returns a line with what it counted.
-"""
+"""Attacks on steps of unequal length and noises that are set, against a Kalman filter by hand."""
 
 from __future__ import annotations
 

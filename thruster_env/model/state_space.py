@@ -277,8 +277,7 @@ class StateSpaceModel:
             copied = value.copy() if isinstance(value, np.ndarray | dict) else value
             object.__setattr__(model, attribute.name, copied)
         for name, value in changes.items():
-            measured = name == "measurement_noise_cov"
-            size = self.m if measured else self.t
+            measured, size = (True, self.m) if name == "measurement_noise_cov" else (False, self.t)
             object.__setattr__(model, name, covariance(name, value, size, positive_definite=measured))
         return model
 

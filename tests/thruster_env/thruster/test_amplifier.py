@@ -145,16 +145,6 @@ def test_the_reward_is_told_of_the_commanded_clipped_voltage(amplifier):
             before = clipped
 
 
-def test_noise_of_a_seed_stays_as_it_is():
-    def noise(amplifier):
-        env = gym.make("BowThruster-v0", amplifier=amplifier)
-        env.reset(seed=3)
-        infos = [env.step([9.0])[4] for _ in range(20)]
-        return [float(info["measurement"][0]) - info["thrust"] for info in infos]
-
-    np.testing.assert_allclose(noise(EFFECTS), noise(None), rtol=0, atol=1e-12)
-
-
 def test_no_amplifier_changes_anything_where_it_does_not_reach():
     mild = [{"name": "dead-band", "width": 0.0}, {"name": "slew-limit", "rate": 1e9}]
     mild += [{"name": "saturation", "limit": 24.0}, {"name": "sag", "fraction": 0.0}]

@@ -180,15 +180,6 @@ def test_a_flow_signal_is_followed_as_exactly_as_a_constant_flow(preset):
         assert (np.abs(one - other) <= limit).all()
 
 
-def test_flow_leaves_the_noise_of_a_seed_as_it_is():
-    def noise(flow):
-        env = gym.make("BowThruster-v0", flow=flow)
-        infos = [env.reset(seed=3)[1]] + [env.step([9.0])[4] for _ in range(20)]
-        return [float(info["measurement"][0]) - info["thrust"] for info in infos]
-
-    np.testing.assert_allclose(noise(SIGNALS), noise(None), rtol=0, atol=1e-12)
-
-
 def test_the_flow_of_an_episode_is_forgotten_at_the_next():
     env = gym.make("BowThruster-v0", flow=SIGNALS)
 
@@ -249,12 +240,3 @@ def test_a_file_that_holds_no_such_column_of_numbers_is_refused(tmp_path, text, 
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
         RecordedSeries(file=str(path), column="u")
-
-
-def test_spare_copies_of_a_block_change_nothing():
-    plant = make_plant(flow=SIGNALS)
-    many = copies_of(plant, Task(), 130)
-    many.begin(episode_keys(range(130)))
-    last = [many.step(np.zeros(130)) for _ in range(10)][-1][many.report_rows["ambient_velocity"], 127:]
-    np.testing.assert_array_equal(last, flows(SIGNALS, 130, 10)[127:, -1])
-    np.testing.assert_allclose(last, flows(SIGNALS, 3, 10, 127)[:, -1], atol=1e-12)

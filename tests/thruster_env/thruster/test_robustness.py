@@ -45,14 +45,15 @@ UNCERTAINTY = {
 
 
 def configurations():
-    """Every id with every disturbance it takes, one at a time and all together."""
+    """Every id with all disturbances that it takes, and each of them on one id, as all ids share a page."""
     for name in IDS:
         linear, follows = "Linear" in name, "Tracking" in name or "Reversal" in name
         channels = ["thrust", "speed", "speed-magnitude"] + ([] if linear else ["current"])
-        one = [{"sensors": {"thrust": [effect]}} for effect in SENSORS] + [{"sensors": channels}]
-        one += [{"flow": [signal]} for signal in FLOW] + [{"amplifier": [effect]} for effect in AMPLIFIER]
-        one += [{"reference": [signal]} for signal in REFERENCE if follows]
-        one += [{"system": "open_bladed"}] if linear else [{"uncertainty": UNCERTAINTY}]
+        one = [{"sensors": channels}, {"system": "open_bladed"} if linear else {"uncertainty": UNCERTAINTY}]
+        if name == IDS[0]:
+            one += [{"sensors": {"thrust": [effect]}} for effect in SENSORS]
+            one += [{"flow": [signal]} for signal in FLOW] + [{"amplifier": [effect]} for effect in AMPLIFIER]
+        one += [{"reference": [signal]} for signal in REFERENCE if name == IDS[1]]
         everything = {"sensors": dict.fromkeys(channels, SENSORS), "flow": FLOW, "amplifier": AMPLIFIER}
         everything |= {"reference": REFERENCE} if follows else {}
         everything |= {} if linear else {"uncertainty": UNCERTAINTY}

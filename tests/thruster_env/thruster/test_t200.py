@@ -166,16 +166,6 @@ def test_few_substeps_and_stable_real_poles():
         assert (poles < -60).all() and (poles > -180).all()
 
 
-def test_an_env_of_24_volts_runs():
-    from thruster_env import BowThrusterEnv
-
-    env = BowThrusterEnv(preset="t200")
-    observation, _ = env.reset(seed=1)
-    for action in (1.0, -1.0, 0.5):
-        observation, reward, *_ = env.step(np.full(env.action_space.shape, action, env.action_space.dtype))
-        assert np.isfinite(observation).all() and np.isfinite(reward)
-
-
 def test_pulse_widths_become_voltages():
     controller = PulseWidthMap(droop=0.02, astern_gain=0.9)
     voltages = controller.source_voltage([1100, 1300, 1472, 1500, 1528, 1700, 1900, 2000], 10.0)

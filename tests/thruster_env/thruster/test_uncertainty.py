@@ -9,6 +9,7 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 import thruster_env  # noqa: F401 - registers the envs
+from tests.thruster_env.thruster.test_robustness import AMPLIFIER, FLOW
 from thruster_env.core.streams import episode_keys
 from thruster_env.graphs.draws import Draws
 from thruster_env.thruster.analysis import (
@@ -20,7 +21,6 @@ from thruster_env.thruster.analysis import (
 )
 from thruster_env.thruster.dynamics import rates, thrust_and_torque
 from thruster_env.thruster.effects import UNCERTAIN, LogNormal, Uniform, drawn_parameters
-from thruster_env.thruster.env import BowThrusterVectorEnv
 from thruster_env.thruster.equations import copies_of, simulate
 from thruster_env.thruster.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.thruster.plant import Task, extreme_parameters, make_plant, make_uncertainty
@@ -68,13 +68,14 @@ def test_a_draw_does_not_depend_on_what_else_is_uncertain():
     np.testing.assert_array_equal(factors("load_gain", {"area": UNIFORM, **SOME}, count=20), alone)
 
 
-def test_what_is_uncertain_does_not_move_noise_nor_reference():
-    def told(uncertainty):
-        env = gym.make("BowThrusterTracking-v0", uncertainty=uncertainty)
+@pytest.mark.parametrize("disturbed", [{"uncertainty": SOME}, {"flow": FLOW}, {"amplifier": AMPLIFIER}])
+def test_what_disturbs_does_not_move_noise_nor_reference(disturbed):
+    def told(**disturbances):
+        env = gym.make("BowThrusterTracking-v0", **disturbances)
         infos = [env.reset(seed=3)[1]] + [env.step([9.0])[4] for _ in range(20)]
         return [(float(info["measurement"][0]) - info["thrust"], info["reference"]) for info in infos]
 
-    np.testing.assert_allclose(told(SOME), told(None), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(told(**disturbed), told(), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("flow", [None, [{"name": "sinusoid", "amplitude": 0.5}]], ids=["still", "flow"])
@@ -117,25 +118,6 @@ def test_the_constants_in_memory_are_those_of_the_drawn_parameters():
         constants = derive_constants(p, 0.3, plant.dt / plant.substeps)
         (first,) = np.flatnonzero(np.isclose(stored[:, i], constants[0], rtol=1e-13, atol=0.0))
         np.testing.assert_allclose(stored[first : first + len(constants), i], constants, rtol=1e-13)
-
-
-def test_each_copy_has_its_own_parameters_and_keeps_them_when_another_begins_anew():
-    count = 5
-    vector = BowThrusterVectorEnv(count, autoreset_mode="Disabled", uncertainty=SOME, **EXACT)
-    envs = [gym.make("BowThruster-v0", uncertainty=SOME, **EXACT) for _ in range(count)]
-    vector.reset(seed=10)
-    for i, env in enumerate(envs):
-        env.reset(seed=10 + i)
-    mask = np.array([False, True, False, True, False])
-    for _ in range(3):
-        for _ in range(5):
-            states = vector.step(np.full(count, 20.0))[4]["state"]
-            alone = [env.step([20.0])[4]["state"] for env in envs]
-            np.testing.assert_allclose(states, alone, rtol=1e-12, atol=1e-12)
-        vector.reset(options={"reset_mask": mask})
-        for env in np.array(envs)[mask]:
-            env.reset()
-    assert len({tuple(state) for state in states}) == count
 
 
 def test_scales_of_reward_and_reference_stay_nominal():

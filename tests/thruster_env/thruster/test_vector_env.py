@@ -144,7 +144,7 @@ def assert_copies_are_single_envs(
 
 @every_mode
 @every_id
-@pytest.mark.parametrize("count", [1, 3, 130])
+@pytest.mark.parametrize("count", [1, 130])
 def test_a_copy_is_the_single_env_with_its_seed_over_many_episodes(name, mode, count):
     watched = sorted({0, 1, 2, 127, 128, 129} & set(range(count)))
     ends = assert_copies_are_single_envs(name, count, mode, 50, 12, watched, **wild(name))
