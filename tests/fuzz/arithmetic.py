@@ -21,6 +21,7 @@ from filters import make_filter, run
 from filters.c.programs import _Single
 from filters.tensors.equations import values_of as tensors_of
 from tests.fuzz.python_interface import _line, _until
+from tests.models import state_space
 from thruster_env.core.streams import filter_keys
 from thruster_env.graphs.graphs import Graph, Number, needed_by
 from thruster_env.graphs.loops import Loops
@@ -35,7 +36,6 @@ from thruster_env.graphs.programs import (
 )
 from thruster_env.graphs.python_floats import in_python
 from thruster_env.graphs.tracing import traced
-from thruster_env.model.state_space import StateSpaceModel
 
 LEAVES = ("x", "y", "x", "y", "49.0", "0.1", "3.0", "7", "-2.5", "0.5", "1", "2", "-3.0", "1e-3")
 OPERATORS = ("+", "-", "*", "/", "%", "//", "+", "*", "%")
@@ -255,13 +255,18 @@ def _of_single(program: Program, points: np.ndarray) -> np.ndarray:
     return rows.astype(np.float64)
 
 
-def storing(work):
-    """A program as a function of its results and its arguments."""
+def in_machine_code(numbers: list[Number], points: np.ndarray) -> np.ndarray:
+    """Values (numbers, points) of numbers that are compiled together."""
+    work = callable_of(program_of([(Place("rows", k), one) for k, one in enumerate(numbers)], {}), 1)
 
     def call(rows, given):
         work(rows, rows, given, given)
 
-    return call
+    run_it, found = Loops(call), []
+    for point in points.T:
+        found.append(np.empty(len(numbers)))
+        run_it(found[-1], np.ascontiguousarray(point))
+    return np.transpose(found)
 
 
 def compiled_arithmetic(rng: np.random.Generator, seconds: float) -> str:
@@ -270,14 +275,7 @@ def compiled_arithmetic(rng: np.random.Generator, seconds: float) -> str:
     for _ in _until(seconds):
         expressions, points = drawn(rng, SIZE), points_of(rng, USUAL)
         _, numbers = traced_together(expressions)
-        stores = [(Place("rows", k), one) for k, one in enumerate(numbers)]
-        work = callable_of(program_of(stores, {}), 1)
-
-        run_it, found = Loops(storing(work)), np.empty((len(numbers), points.shape[1]))
-        for k in range(points.shape[1]):
-            rows = np.empty(len(numbers))
-            run_it(rows, np.ascontiguousarray(points[:, k]))
-            found[:, k] = rows
+        found = in_machine_code(numbers, points)
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             for k, one in enumerate(expressions):
@@ -339,15 +337,8 @@ def filtered_arithmetic(rng: np.random.Generator, seconds: float) -> str:
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 expected = np.array(names["f"](tuple(mean.tolist()), (), ()), dtype=float)
-                model = StateSpaceModel(
-                    transition=names["f"],
-                    observe=lambda s, c: (s[0],),
-                    process_noise_cov=[1e-6] * 2,
-                    measurement_noise_cov=[1.0],
-                    prior_mean=mean,
-                    prior_cov=[1e-12] * 2,
-                    inputs=0,
-                )
+                noise = {"q": [1e-6] * 2, "r": [1.0], "cov": [1e-12] * 2}
+                model = state_space(names["f"], lambda s, c: (s[0],), **noise, mean=mean, inputs=0)
                 filter_ = make_filter("ekf", model)
                 found = run(filter_, filter_keys([0]), np.zeros((1, 1, 0)), np.full((1, 2, 1), np.nan))
         except (ArithmeticError, ValueError, TypeError):

@@ -10,6 +10,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from filters import make_filter, thruster_model
 from filters.tuned_file import read_tuned_file
+from tests.robustness.test_wrong_arguments import refused
 from thruster_env.core.checks import as_floats, short_repr, vector
 from thruster_env.thruster.parameters import TUNNEL
 from tuning.cli.simulate import command
@@ -21,12 +22,6 @@ from tuning.problems.find import read_scenario
 
 pytestmark = pytest.mark.usefixtures("as_python")
 HUGE = 10**12
-
-
-def refused(call, rule):
-    with pytest.raises(ValueError, match=rule) as error:
-        call()
-    assert "\n" not in str(error.value) and "must" in str(error.value)
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,10 @@ import weakref
 import numpy as np
 
 from filters import make_filter, run
+from tests.models import state_space
 from thruster_env.core.streams import episode_keys
 from thruster_env.graphs import programs
 from thruster_env.model.simulate import simulate
-from thruster_env.model.state_space import StateSpaceModel
 
 KEPT = 64  # models whose code the caches keep
 TEXT = """
@@ -26,15 +26,8 @@ def used(number):
     """Weak references to a model and its functions, which no other has, after a filter and a simulation."""
     names = {}
     exec(TEXT.format(number), names)
-    model = StateSpaceModel(
-        transition=names["transition"],
-        observe=names["observe"],
-        process_noise_cov=[0.01, 0.01],
-        measurement_noise_cov=[0.1],
-        prior_mean=[0.0, 0.0],
-        prior_cov=[1.0, 1.0],
-        inputs=0,
-    )
+    noise, prior = {"q": [0.01, 0.01], "r": [0.1]}, {"mean": [0.0, 0.0], "cov": [1.0, 1.0]}
+    model = state_space(names["transition"], names["observe"], **noise, **prior, inputs=0)
     run(make_filter("ekf", model), None, None, np.zeros((1, 3, 1)))
     simulate(model, episode_keys([0]), np.zeros((1, 2, 0)))
     return weakref.ref(model), weakref.ref(model.transition), weakref.ref(model.observe)

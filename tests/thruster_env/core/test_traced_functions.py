@@ -7,11 +7,11 @@ import warnings
 import numpy as np
 import pytest
 
-from tests.fuzz.arithmetic import in_c
+from tests.fuzz.arithmetic import in_c, in_machine_code
+from tests.thruster_env.graphs.test_traced_arithmetic import slopes_of
 from thruster_env.graphs.branches import along
 from thruster_env.graphs.graphs import Graph
-from thruster_env.graphs.loops import Loops
-from thruster_env.graphs.programs import Place, callable_of, program_of, values_of
+from thruster_env.graphs.programs import Place, program_of, values_of
 from thruster_env.graphs.tracing import traced
 
 TABLE, VALUES = [-1.0, 0.0, 0.5, 2.0], [1.0, -2.0, 0.3, 4.0]
@@ -87,27 +87,11 @@ def test_machine_code_and_c_have_the_same_values():
     values, slopes = graph_of()
     numbers = [*values, *slopes[0], *slopes[1]]
     program = program_of([(Place("rows", k), one) for k, one in enumerate(numbers)], {})
-    work, known = callable_of(program, 1), values_of(numbers, POINTS)
-
-    def call(rows, given):
-        work(rows, rows, given, given)
-
-    run_it, found = Loops(call), np.empty(len(numbers))
-    for k, point in enumerate(POINTS.T):
-        run_it(found, np.ascontiguousarray(point))
-        np.testing.assert_allclose(found, known[:, k], rtol=1e-12, atol=1e-12)
+    known = values_of(numbers, POINTS)
+    np.testing.assert_allclose(in_machine_code(numbers, POINTS), known, rtol=1e-12, atol=1e-12)
     if shutil.which("gcc"):
         np.testing.assert_allclose(in_c(program, POINTS, single=False), known, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(in_c(program, POINTS, single=True), known, rtol=1e-4, atol=1e-4)
-
-
-def slopes_at(function, x, y):
-    graph = Graph()
-    given = [graph.given(Place("numbers", k)) for k in range(2)]
-    number = graph.number(traced(function)(*given))
-    by = [along([number], {one.place: graph.constant(1.0)})[0] for one in given]
-    with np.errstate(all="ignore"):
-        return values_of([graph.number(0.0 if one is None else one) for one in by], np.array([[x], [y]]))[:, 0]
 
 
 @pytest.mark.parametrize(
@@ -124,7 +108,9 @@ def slopes_at(function, x, y):
     ],
 )
 def test_slopes_at_kinks_are_finite(function, point, slopes):
-    np.testing.assert_allclose(slopes_at(function, *point), slopes, atol=1e-15)
+    with np.errstate(all="ignore"):
+        found = values_of(slopes_of(function, 1)[1:], np.array(point)[:, None])[:, 0]
+    np.testing.assert_allclose(found, slopes, atol=1e-15)
 
 
 def test_ends_are_those_of_numpy():
@@ -141,19 +127,3 @@ def test_ends_are_those_of_numpy():
         np.testing.assert_array_equal(
             values_of(numbers, points), np.array([both(*one) for one in points.T.tolist()]).T
         )
-
-
-@pytest.mark.parametrize(
-    "function",
-    [
-        lambda x, y: np.interp(x, [0.0, 2.0, 1.0], [0.0, 1.0, 2.0]),  # not in order: NumPy promises nothing
-        lambda x, y: np.linalg.det(np.eye(5) * x),
-        lambda x, y: np.linalg.norm([x, y], 1),
-        lambda x, y: ~x,
-        lambda x, y: (x > 0.0) ^ y,
-    ],
-)
-def test_what_is_not_traced_raises_a_type_error(function):
-    graph = Graph()
-    with pytest.raises(TypeError):
-        traced(function)(*(graph.given(Place("numbers", k)) for k in range(2)))

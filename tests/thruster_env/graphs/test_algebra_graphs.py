@@ -90,6 +90,16 @@ UNTRACEABLE = {
     "equality": lambda x, y: 1.0 if (x, y) == (1.0, 2.0) else 2.0,
     "library": lambda x, y: math.gamma(x),
     "linear algebra": lambda x, y: np.linalg.eigvals([[x, y], [y, x]])[0],
+    "a table out of order, of which NumPy promises nothing": lambda x, y: np.interp(
+        x, [0.0, 2.0, 1.0], [x, y, 2.0]
+    ),
+    "a large determinant": lambda x, y: np.linalg.det(np.eye(5) * x),
+    "a norm of sums": lambda x, y: np.linalg.norm([x, y], 1),
+    "bits of a number": lambda x, y: ~x,
+    "a bit and a number": lambda x, y: (x > 0.0) ^ y,
+    "and of a number": lambda x, y: x & (x > 0.0),
+    "or of a number": lambda x, y: (x > 0.0) | 1.0,
+    "decimals": lambda x, y: round(x, 2),
 }
 
 

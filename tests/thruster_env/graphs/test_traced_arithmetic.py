@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from tests.fuzz.arithmetic import in_machine_code
 from thruster_env.core.compiled import fastmath_of
 from thruster_env.graphs.branches import along
 from thruster_env.graphs.graphs import Graph
-from thruster_env.graphs.loops import Loops
-from thruster_env.graphs.programs import Place, callable_of, program_of, values_of
+from thruster_env.graphs.programs import Place, program_of, values_of
 from thruster_env.graphs.tracing import traced
 
 EXPRESSIONS = {
@@ -74,18 +74,8 @@ def test_a_graph_has_what_python_has(numbers, name):
 
 
 def test_machine_code_has_what_python_has(numbers):
-    stores = [(Place("rows", k), one) for k, one in enumerate(numbers.values())]
-    work, found = callable_of(program_of(stores, {}), 1), []
-
-    def call(rows, given):
-        work(rows, rows, given, given)
-
-    run = Loops(call)
-    for point in POINTS:
-        rows = np.empty(len(numbers))
-        run(rows, np.array(point))
-        found.append(rows)
-    for name, values in zip(numbers, np.transpose(found), strict=True):
+    found = in_machine_code(list(numbers.values()), np.array(POINTS).T)
+    for name, values in zip(numbers, found, strict=True):
         np.testing.assert_allclose(values, expected(name), rtol=1e-15, err_msg=name)
 
 
@@ -120,23 +110,11 @@ def test_slopes_of_rests_are_those_of_their_branches(point):
         *(math.copysign, math.hypot, lambda x, y: (x > y) * x + abs(x > 0.0)),
     ]
     for function in functions:
-        graph = Graph()
-        x, y = (graph.given(Place("numbers", k)) for k in range(2))
-        z = graph.number(traced(function)(x, y))
-        slopes = [along([z], {one.place: graph.constant(1.0)})[0] for one in (x, y)]
-        found = values_of([graph.number(0.0 if one is None else one) for one in slopes], np.array(point)[:, None])
+        found = values_of(slopes_of(function, 1)[1:], np.array(point)[:, None])
         for k, slope in enumerate(found[:, 0]):
             step = 1e-6 * np.eye(2)[k]
             ends = [function(*(np.array(point) + sign * step)) for sign in (1.0, -1.0)]
             assert slope == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-8)
-
-
-def test_floats_have_no_bits():
-    graph = Graph()
-    x = graph.given("x")
-    for function in (lambda x: x & (x > 0.0), lambda x: (x > 0.0) | 1.0, lambda x: round(x, 2)):
-        with pytest.raises(TypeError):
-            traced(function)(x)
 
 
 def test_a_users_division_is_none_by_a_reciprocal_and_who_rounds_computes_as_written():
@@ -167,12 +145,12 @@ AT_ZERO = {
 }
 
 
-def slopes_of(function):
+def slopes_of(function, times=2):
     """A function of (x, y) as a number, and its slopes along both, at first and again: 1 + 2 + 4 numbers."""
     graph = Graph()
     x, y = graph.given(Place("numbers", 0)), graph.given(Place("numbers", 1))
     found, before = [graph.number(traced(function)(x, y))], 0
-    for _ in range(2):
+    for _ in range(times):
         level, before = found[before:], len(found)
         for one in level:
             for axis in (x, y):
@@ -196,15 +174,9 @@ def test_machine_code_has_them_too():
     x, y = graph.given(Place("numbers", 0)), graph.given(Place("numbers", 1))
     values = [graph.number(traced(function)(x, y)) for function, _ in AT_ZERO.values()]
     slopes = [along(values, {axis.place: graph.constant(1.0)}) for axis in (x, y)]
-    in_order = [0.0 if one is None else one for pair in zip(*slopes, strict=True) for one in pair]
-    stores = [(Place("rows", k), graph.number(one)) for k, one in enumerate(in_order)]
-    work, rows = callable_of(program_of(stores, {}), 1), np.full(2 * len(AT_ZERO), math.nan)
-
-    def call(rows, numbers):
-        work(rows, rows, numbers, numbers)
-
-    Loops(call)(rows, np.zeros(2))
-    np.testing.assert_array_equal(rows.reshape(-1, 2), [expected for _, expected in AT_ZERO.values()])
+    in_order = [graph.number(0.0 if one is None else one) for pair in zip(*slopes, strict=True) for one in pair]
+    found = in_machine_code(in_order, np.zeros((2, 1))).reshape(-1, 2)
+    np.testing.assert_array_equal(found, [expected for _, expected in AT_ZERO.values()])
 
 
 def test_a_root_that_is_never_zero_needs_no_choice():

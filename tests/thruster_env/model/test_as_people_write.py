@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from filters import StateSpaceModel, make_filter, run
+from filters import make_filter, run
 from filters.c.programs import programs_of
+from tests.models import state_space
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.derivatives import runge_kutta
@@ -60,16 +61,9 @@ def gauges(x, c):
 
 
 def chain():
-    return StateSpaceModel(
-        transition=runge_kutta(chain_rates, 6),
-        observe=gauges,
-        constants=Chain(),
-        process_noise_cov=[1e-6] * 3 + [1e-4] * 3,
-        measurement_noise_cov=[1e-2] * 3,
-        prior_mean=[0.1, 0.7, -0.2, 0.0, 0.3, 0.0],
-        prior_cov=[0.01] * 6,
-        inputs=1,
-    )
+    noise = {"q": [1e-6] * 3 + [1e-4] * 3, "r": [1e-2] * 3}
+    prior = {"mean": [0.1, 0.7, -0.2, 0.0, 0.3, 0.0], "cov": [0.01] * 6}
+    return state_space(runge_kutta(chain_rates, 6), gauges, **noise, **prior, constants=Chain())
 
 
 INERTIA = np.array([[2.0, 0.1, 0.0], [0.1, 1.5, 0.0], [0.0, 0.0, 1.0]])
@@ -99,16 +93,8 @@ def gyroscope(x, c):
 
 
 def body():
-    return StateSpaceModel(
-        transition=turn,
-        observe=gyroscope,
-        constants=(0.05, 0.2),
-        process_noise_cov=[1e-4] * 3,
-        measurement_noise_cov=[1e-2] * 4,
-        prior_mean=[0.5, -0.4, 1.0],
-        prior_cov=[0.1] * 3,
-        inputs=2,
-    )
+    noise, prior = {"q": [1e-4] * 3, "r": [1e-2] * 4}, {"mean": [0.5, -0.4, 1.0], "cov": [0.1] * 3}
+    return state_space(turn, gyroscope, **noise, **prior, constants=(0.05, 0.2), inputs=2)
 
 
 @dataclass(frozen=True)
@@ -181,16 +167,8 @@ def boat_step(x, u, c):
 
 
 def boat():
-    return StateSpaceModel(
-        transition=boat_step,
-        observe=Observer(0.5),
-        constants=(0.1,),
-        process_noise_cov=[1e-4] * 4,
-        measurement_noise_cov=[1e-2] * 2,
-        prior_mean=[0.3, 0.1, 0.2, -0.3],
-        prior_cov=[0.05] * 4,
-        inputs=2,
-    )
+    noise, prior = {"q": [1e-4] * 4, "r": [1e-2] * 2}, {"mean": [0.3, 0.1, 0.2, -0.3], "cov": [0.05] * 4}
+    return state_space(boat_step, Observer(0.5), **noise, **prior, constants=(0.1,), inputs=2)
 
 
 MODELS = chain, body, boat

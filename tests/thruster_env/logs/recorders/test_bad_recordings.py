@@ -79,9 +79,9 @@ def test_what_is_no_such_file_is_refused(tmp_path, ending, capfd):
 
 
 @pytest.mark.parametrize("ending", SOME)
-def test_a_file_that_is_cut_off_or_damaged_is_read_in_part_or_refused(tmp_path, ending, capfd):
+def test_a_file_that_is_cut_off_is_read_in_part_or_refused(tmp_path, ending, capfd):
     """Two recorders may lose their power in the middle of the data; no other file is read in part."""
-    path, rng = write_good(tmp_path / f"a{ending}"), np.random.default_rng(1)
+    path = write_good(tmp_path / f"a{ending}")
     whole, data = read(path, None), path.read_bytes()
     name = max(whole, key=lambda one: len(whole[one].values))
     for share in (0.02, 0.3, 0.6, 0.9, 0.999):
@@ -92,15 +92,6 @@ def test_a_file_that_is_cut_off_or_damaged_is_read_in_part_or_refused(tmp_path, 
             np.testing.assert_array_equal(some.values, whole[name].values[: len(some.values)])
         elif ending not in (".ulg", ".bin"):
             refused(path)
-    for _ in range(40 if ending != ".h5" else 12):  # which a process of its own reads each time
-        damaged = bytearray(data)
-        for place in rng.integers(0, len(data), 8):
-            damaged[place] = rng.integers(256)
-        path.write_bytes(damaged)
-        try:
-            fields(path)
-        except ValueError as error:
-            assert "\n" not in str(error) and len(str(error)) < 700  # noqa: PT017 - whether it fails is open
     assert capfd.readouterr() == ("", "")
 
 
