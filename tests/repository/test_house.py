@@ -209,7 +209,8 @@ COMMAND = {*TERMINAL, "pydantic"}  # Typer's
 FITTING = {"numpy", "filters", "llvmlite", "scipy.linalg", "scipy.optimize", "scipy.special"}
 MAY_LOAD = {  # what imports, and commands of the command line, may load
     "import thruster_env": set(),
-    "import filters": {"numpy", "filters"},
+    "import filters": {"filters"},
+    "from filters import ExtendedKalmanFilter": {"numpy", "filters"},
     "import tuning": {"tuning"},
     "import gymnasium, thruster_env; gymnasium.make('BowThruster-v0')": {"gymnasium", "numpy", "llvmlite"},
     "thruster --help": TERMINAL,
@@ -217,6 +218,25 @@ MAY_LOAD = {  # what imports, and commands of the command line, may load
     "thruster inspect": {*COMMAND, "numpy", "scipy.linalg"},
     "thruster fit acc.csv": COMMAND | FITTING,
 }
+
+
+def test_every_name_of_filters_has_one_home():
+    import filters
+
+    names = [name for names in filters.MODULES.values() for name in names]
+    assert len(names) == len(set(names))
+    assert set(names) == {*filters.__all__, "thruster_model"}
+    assert {*filters.__all__} <= {*dir(filters)}
+    source = ast.parse(Path(filters.__file__).read_text())
+    block = next(node for node in source.body if isinstance(node, ast.If))
+    typed = {
+        alias.name: part.module
+        for part in ast.walk(block)
+        if isinstance(part, ast.ImportFrom)
+        for alias in part.names
+    }
+    assert typed == {name: filters.HOMES[name] for name in filters.__all__}
+    assert all(getattr(filters, name) is not None for name in filters.__all__)
 
 
 @pytest.mark.parametrize("started", MAY_LOAD)
