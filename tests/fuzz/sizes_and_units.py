@@ -43,14 +43,6 @@ OF_ONE_STEP = ("kf", "kf-steady", "imm", "mmae", "fuzzy")  # refuse another dt
 SMOOTHED = ("kf", "ekf", "ukf", "ckf", "iekf", "enkf", "imm", "mmae")
 
 
-class Step(NamedTuple):
-    """The constants of the chain."""
-
-    dt: float
-    size: int
-    seen: int
-
-
 class Clock(NamedTuple):
     """The constants of a model of any step length."""
 
@@ -86,38 +78,6 @@ def units(rng: np.random.Generator, seconds: float) -> str:
         counts["estimates"] += 1
         counts[_compare_checks(rng, n)] += 1
     return _line("changes of units", counts)
-
-
-def probabilities_of_modes(rng: np.random.Generator, seconds: float) -> str:
-    """imm and mmae, of whose modes some have no probability, agree with a naive computation in logarithms."""
-    from tests.filters.test_multiple_models import naive
-
-    counts: Counter = Counter()
-    for _ in _until(seconds):
-        n, m, modes, steps = (int(rng.integers(low, high)) for low, high in ((1, 4), (1, 4), (2, 5), (2, 12)))
-        base = random_affine(n, m, 1, seed=int(rng.integers(2**31)))
-        scales = 10.0 ** rng.uniform(-6.0, 3.0, size=(modes, 2))
-        models = [
-            base.replace(
-                process_noise_cov=q * base.process_noise_cov, measurement_noise_cov=r * base.measurement_noise_cov
-            )
-            for q, r in scales
-        ]
-        numbers = {"modes": models, "mode_filter": "kf", "probabilities": _probabilities(rng, modes)}
-        name = str(rng.choice(["imm", "mmae"]))
-        if name == "imm":
-            numbers["transition"] = np.array([_probabilities(rng, modes) for _ in range(modes)])
-        with interpreted():
-            filter_ = make_filter(name, base, **numbers)
-            inputs = rng.normal(size=(1, steps, 1))
-            z = rng.normal(size=(1, steps + 1, m)) * 10.0 ** rng.uniform(-2.0, 4.0, size=(1, steps + 1, 1))
-            found, expected = run(filter_, None, inputs, z), naive(filter_, inputs[0], z[0])
-        assert not found.divergences.any(), (name, numbers)
-        scale = abs(z).max()
-        np.testing.assert_allclose(found.means[0], expected[0], rtol=1e-6, atol=1e-7 * scale)
-        np.testing.assert_allclose(found.log_likelihoods[0], expected[2], rtol=1e-7, atol=1e-7)
-        counts[name] += 1
-    return _line("mixtures of modes", counts)
 
 
 def drawn(rng: np.random.Generator, n: int, m: int) -> tuple[StateSpaceModel, np.ndarray, np.ndarray]:
@@ -311,12 +271,6 @@ def _accepted(cov: np.ndarray, n: int) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _probabilities(rng: np.random.Generator, count: int) -> np.ndarray:
-    found = rng.random(count) * (rng.random(count) < 0.6)
-    found[rng.integers(count)] += 0.1
-    return found / found.sum()
 
 
 def _same(found: np.ndarray, expected: np.ndarray) -> None:

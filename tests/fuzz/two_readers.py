@@ -25,12 +25,7 @@ from thruster_env.env.model_env import ReplayEnv
 ROWS = 25
 DT = 0.01
 CELLS = (
-    "",
-    " ",
-    '" 2 "',
-    "5.1 N",
-    "5\t",
-    "\u00a05",
+    *("", " ", '" 2 "', "5.1 N", "5\t", "\u00a05"),
     *"nan NaN NA n/a N/A null None <NA> NaT -- off ? - . e5 1e 5,1 1_0 0x10 1e999 -1e999 1e-400".split(),
     *"""inf -inf infinity +3 .5 5. 1E-3 1e+2 1d5 ٣ １ '3' true # "5.1" "5.1 5"1 "" "1""2" """.split(),
 )

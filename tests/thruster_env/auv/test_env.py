@@ -182,8 +182,6 @@ def test_an_env_survives_json(name):
 
 
 WRONG = [
-    ({"sensors": "sonar"}, "sensors must be one of default, motion"),
-    ({"sensors": ["u", "u"]}, "sensors must name each channel once"),
     ({"sensors": {"u": [{"name": "fog"}]}}, "each entry of sensors must be a mapping whose name is one of"),
     ({"preset": "titanic"}, "preset must be one of segorogeni"),
     ({"current": [0.1, 0.2]}, r"current must be three velocities \(north, east, down\)"),

@@ -6,7 +6,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import filters  # noqa: F401 - its wrappers
-from filters import EstimateState, EstimateStates
+from filters import EstimateStates
 from filters.logs.estimate import estimate
 from tests.thruster_env.logs.test_logs import MODEL
 from thruster_env.env.model_env import ReplayEnv
@@ -48,18 +48,6 @@ def test_an_episode_is_the_log(log):
     with pytest.raises(ValueError, match="a log must be reset after its last row"):
         for _ in range(40):
             env.step([0.0])
-
-
-@pytest.mark.parametrize("name", ["kf", "enkf"])
-def test_a_wrapped_replay_is_the_estimate_to_the_last_bit(log, name):
-    found = estimate(log, name, MODEL, seed=3)
-    rows = ridden(EstimateState(ReplayEnv(log, MODEL), name), seed=3)
-    for key, values in (
-        ("estimate", found.means),
-        ("estimate_cov", found.covs),
-        ("innovation_cov", found.innovation_covs),
-    ):
-        np.testing.assert_array_equal([info[key] for _, info in rows], values)
 
 
 def test_vector_wrappers_use_the_recorded_inputs_too(log):

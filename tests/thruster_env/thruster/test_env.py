@@ -244,8 +244,6 @@ def test_a_voltage_beyond_the_maximum_is_the_maximum(action):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"preset": "canoe"}, "preset must be one of .*, but got 'canoe'"),
-        ({"measurement_noise_cov": -1}, "measurement_noise_cov must be positive semidefinite .*, but got -1"),
         ({"reference": math.nan}, "reference must be a finite number, but got nan"),
         ({"reference": "full ahead"}, "reference must be a finite number, but got 'full ahead'"),
         ({"render_mode": "ansi"}, "render_mode must be None or 'human' or 'rgb_array', but got 'ansi'"),

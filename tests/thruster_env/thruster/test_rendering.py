@@ -62,15 +62,6 @@ def test_a_frame_is_an_rgb_array():
     assert picture.flags["C_CONTIGUOUS"] and picture.flags["WRITEABLE"]
 
 
-def test_the_same_moments_give_the_same_frames():
-    moments = [FORWARD._replace(time=k * DT, omega_m=2.0 * k) for k in range(30)]
-    one, other = renderer(), renderer()
-    for moment in moments:
-        one.add(moment, BELIEF)
-        other.add(moment, BELIEF)
-        np.testing.assert_array_equal(one.draw(), other.draw())
-
-
 def test_a_moment_drawn_twice_gives_the_same_frame():
     r = renderer()
     for moment in (REST, FORWARD, FORWARD):
