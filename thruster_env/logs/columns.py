@@ -72,6 +72,7 @@ _BRACKETS = re.compile(r"^(?P<base>.*?\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 # Kinds of quantities, and names of times.
 INPUT, MEASUREMENT, STATE, OUTPUT = "input", "measurement", "state", "output"
 NO_COLUMN = "a log must have a column"  # with which the message on missing columns begins
+MANY_MISSING = 3  # columns, of which more are named by their symbols alone
 TIME = "time"
 TIME_NAMES = ("t", "time", "Time", "TIME", "timestamp", "stamp", "Zeit", "zeit")
 DATE_NAMES = ("timestamp", "datetime", "date_time", "date time", "date", "datum", "zeitstempel")
@@ -301,11 +302,18 @@ def _check_columns(
     missing = [channel for channel in needed if channel.key not in columns]
     if not missing:
         return
-    texts = [
-        f"the {channel.kind} {channel.quantity.label} (use --column {channel.quantity.symbol}=HEADER, or call it "
-        f"{plain(channel.quantity.name)})"
-        for channel in missing
-    ]
+    if len(missing) > MANY_MISSING:
+        by_unit: dict[str, list[str]] = {}
+        for channel in missing:
+            by_unit.setdefault(channel.quantity.unit, []).append(channel.quantity.symbol)
+        symbols = ", ".join(f"{', '.join(part)}{f' [{unit}]' * bool(unit)}" for unit, part in by_unit.items())
+        texts = [f"each of {symbols} (use --column {missing[0].quantity.symbol}=HEADER)"]
+    else:
+        texts = [
+            f"the {channel.kind} {channel.quantity.label} (use --column {channel.quantity.symbol}=HEADER, or call "
+            f"it {plain(channel.quantity.name)})"
+            for channel in missing
+        ]
     if needs_time and TIME not in columns:
         texts.append("times (use --column time=HEADER, or --dt)")
     if all(channel.quantity.symbol.startswith("mag_") for channel in missing):
