@@ -250,7 +250,9 @@ def estimate_with(
 
 def _joined(log: Log, parts: Sequence[LogEstimate]) -> LogEstimate:
     """The estimates of a log from those of its parts, whose gaps have been predicted over."""
-    rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in LogEstimate._fields[2:7]}
+    rows: dict[str, Any] = {}
+    for name in LogEstimate._fields[2:7]:  # means to log_likelihoods
+        rows[name] = np.concatenate([getattr(part, name) for part in parts])
     restarts = next((part.restarts for part in parts if part.restarts is not None), None)
     return parts[0]._replace(
         log=log, divergences=sum(part.divergences for part in parts), restarts=restarts, **rows

@@ -216,10 +216,10 @@ def read_log(
     if form is not None:
         asked = [text for text in description.columns.values() if isinstance(text, str)]
         recorded = Recorded(path, form, asked, description.stamps)
-        column_of = recorded.columns(wanted, description.columns, description.units, description.dt is None)
+        by_key = recorded.columns(wanted, description.columns, description.units, description.dt is None)
         if model.turns and not form.has_stamps:
-            column_of = column_of | quaternions.named_columns(model, [*recorded.samples], column_of)
-        table, column_of = recorded.table(column_of)
+            by_key |= quaternions.named_columns(model, [*recorded.samples], by_key)
+        table, column_of = recorded.table(by_key)
     else:
         check_stamps(description.stamps, None, path if is_file else name)
         if table is None:
