@@ -19,6 +19,7 @@ Estimation", Data 6(7):72, doi 10.3390/data6070072; data CC BY 4.0.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -238,6 +239,8 @@ def reproduce(data: Annotated[Path, Option(INPUT)], identify: Annotated[bool, Op
 def tables_from(data: Path) -> dict[str, Callable[[], str]]:
     """The tables of docs/attitude.md by name, from BROAD's folder."""
     tables = tables_of(rows(read_trials(data)))
-    return {
-        name: (lambda table=table: markdown_table(table.columns, table.rows)) for name, table in tables.items()
-    }
+
+    def markdown(name: str) -> str:
+        return markdown_table(tables[name].columns, tables[name].rows)
+
+    return {name: partial(markdown, name) for name in tables}

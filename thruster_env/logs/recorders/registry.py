@@ -6,6 +6,7 @@ The table has one row for each time of any chosen field.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,10 +28,17 @@ STAMP = "times"  # header of the rows' times
 MANY = 0.1  # of the samples of a channel outside the log: worth a word
 
 
+TABLES = Format(
+    tables.KIND,
+    (tables.ZIP,),
+    tables.ZIP_MAGIC,
+    partial(tables.topics_of_tables, read=read_table),
+    has_stamps=False,
+)
 FORMATS = (
     *(autopilots.ULOG, autopilots.DATAFLASH),
     *(bags.ROS1_BAG, bags.MCAP_FILE, bags.ROS2_BAG),
-    *(arrays.MATLAB, arrays.HDF5, tables.TABLES),
+    *(arrays.MATLAB, arrays.HDF5, TABLES),
 )
 ENDINGS = tuple(ending for form in FORMATS for ending in form.endings)
 
@@ -95,7 +103,7 @@ def format_of(path: str | Path) -> Format | None:
     if (path / METADATA).is_file():
         return next(form for form in FORMATS if ".db3" in form.endings)
     if tables.is_folder(path) or tables.has_clocks(path):
-        return tables.TABLES
+        return TABLES
     if path.is_dir() and named is not None:
         raise unreadable(named.kind, path, "it is a folder")
     if named is None and (path.suffix.lower() in SUFFIXES or not path.is_file()):

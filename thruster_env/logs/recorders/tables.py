@@ -7,19 +7,20 @@ times and none of all rows, such as gyro_time and acc_time, each begins a topic 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
 
 from thruster_env.logs.columns import DATE_NAMES, TIME_NAMES, parted
 from thruster_env.logs.grid import in_seconds
-from thruster_env.logs.recorders.topics import Format, Topic, Wanted, check_bytes, reading
-from thruster_env.logs.table import Table, read_table
+from thruster_env.logs.recorders.topics import Topic, Wanted, check_bytes, reading
 
-CSV, ZIP = ".csv", ".zip"
+KIND, CSV, ZIP, ZIP_MAGIC = "folder of CSV files", ".csv", ".zip", b"PK\x03\x04"
+ReadTable = Callable[[Path], Any]
 SINCE_START = ("seconds_elapsed", "elapsed")  # of some apps beside dates, more finely
 MOST_HEADER = 2**16  # bytes of a first line
 
@@ -39,40 +40,41 @@ def has_clocks(path: Path) -> bool:
     return not any(_is_time(header) for header in headers) and sum(map(_begins, headers)) > 1
 
 
-def topics_of_tables(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
+def topics_of_tables(path: Path, wanted: Wanted = None, *, read: ReadTable) -> Iterator[Topic]:
     """The topics of a folder, a zip or a CSV file with several clocks; columns that are no numbers are not read.
 
     Args:
         path: of the folder or file.
         wanted: columns that are read; None for all.
+        read: `thruster_env.logs.table.read_table`, which knows all formats.
 
     Raises:
         ValueError: if a file is no table, or has no times; the message names it.
     """
     if path.is_dir():
-        yield from _topics_of_folder(path, path)
+        yield from _topics_of_folder(path, path, read)
     elif path.suffix.lower() == CSV:
-        table = read_table(path)
+        table = read(path)
         names = list(table.names)
         firsts = [i for i, name in enumerate(names) if _begins(name)]
         for first, end in zip(firsts, [*firsts[1:], len(names)], strict=True):
             yield _topic("", table, names[first], names[first + 1 : end])
     else:
         with TemporaryDirectory() as folder:
-            with reading(TABLES.kind, path), ZipFile(path) as archive:
+            with reading(KIND, path), ZipFile(path) as archive:
                 members = [entry for entry in archive.infolist() if _is_member(entry.filename)]
                 check_bytes(sum(entry.file_size for entry in members), "a zip of CSV files", path)
                 for entry in members:
                     (Path(folder) / entry.filename).write_bytes(archive.read(entry))
                 if not members:
                     raise ValueError("it has no CSV file at its top")
-            yield from _topics_of_folder(Path(folder), path)
+            yield from _topics_of_folder(Path(folder), path, read)
 
 
-def _topics_of_folder(folder: Path, path: Path) -> Iterator[Topic]:
+def _topics_of_folder(folder: Path, path: Path, read: ReadTable) -> Iterator[Topic]:
     for file in sorted(file for file in folder.iterdir() if _is_member(file.name)):
         try:
-            table = read_table(file)
+            table = read(file)
         except ValueError as error:
             raise ValueError(str(error).replace(str(folder), str(path))) from None
         names = list(table.names)
@@ -82,7 +84,7 @@ def _topics_of_folder(folder: Path, path: Path) -> Iterator[Topic]:
         yield _topic(file.stem, table, time, [name for name in names if name not in clocks])
 
 
-def _topic(name: str, table: Table, time: str | None, columns: list[str]) -> Topic:
+def _topic(name: str, table: Any, time: str | None, columns: list[str]) -> Topic:
     """The columns of a table by one of its columns of times, in rows that have a time."""
     if time is None:
         return Topic(name, None, {}, unread={"": "no column of times"})
@@ -117,6 +119,3 @@ def _begins(header: str) -> bool:
     """Whether a header names times of the columns behind it, such as gyro_time [s]."""
     words = re.split(r"[^a-z]+", parted(header)[0].strip().lower())
     return len(words) > 1 and words[-1] in ("time", "timestamp", "stamp", "t")
-
-
-TABLES = Format("folder of CSV files", (ZIP,), b"PK\x03\x04", topics_of_tables, has_stamps=False)
