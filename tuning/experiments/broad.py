@@ -157,10 +157,10 @@ def identified(trials: Mapping[str, Trial], free: Sequence[str] = FREE) -> dict[
             columns = dict(zip(symbols, values.T, strict=True))
             tables.append({"time": np.arange(len(values)) / trial.rate, **columns})
     start = {"field": float(np.linalg.norm(values[0, 6:]))}
-    found = maximum_likelihood(
+    result = maximum_likelihood(
         ("attitude", tables), list(free), use_all=True, starts=1, start=start, progress=False
     )
-    return {name: float(found.values[name]) for name in free}
+    return {name: float(result.values[name]) for name in free}
 
 
 class Row(NamedTuple):
@@ -231,9 +231,9 @@ def reproduce(data: Annotated[Path, Option(INPUT)], identify: Annotated[bool, Op
             progress("", 0, 1)
             numbers = identified(trials)
     computed = rows(trials, numbers)
-    found = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
+    listed = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
     named = {row.name: {name: errors._asdict() for name, errors in row.by_trial.items()} for row in computed}
-    return Printed([*tables_of(computed).values(), f"Numbers: {found}."], {"numbers": numbers, "errors": named})
+    return Printed([*tables_of(computed).values(), f"Numbers: {listed}."], {"numbers": numbers, "errors": named})
 
 
 def tables_from(data: Path) -> dict[str, Callable[[], str]]:
