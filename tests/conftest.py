@@ -1,8 +1,11 @@
 """No test opens a window, in CI no test is skipped for want of a package, and compiling can be left out."""
 
 import gc
+import json
 import os
 import re
+import sys
+from typing import NamedTuple
 
 import pytest
 
@@ -77,3 +80,44 @@ def as_python():
     """Nothing is compiled: exactness needs none, and that both ways agree is for the contract to test."""
     with interpreted():
         yield
+
+
+class Done(NamedTuple):
+    """How a command ended."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def thruster(tmp_path, monkeypatch, capsys):
+    """Run the command in this process, in an empty folder."""
+    from tuning.cli.main import main
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["thruster", *map(str, arguments)])
+        capsys.readouterr()
+        try:
+            main()
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        return Done(code, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture
+def as_json(thruster):
+    """Run a command that must succeed, and read its JSON."""
+
+    def run(*arguments):
+        done = thruster(*arguments, "--json", "-")
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return run

@@ -1,5 +1,4 @@
 """Other people's estimators in the place of a filter: contract, evaluation, comparison, wrappers, command line."""
-# ruff: noqa: F811 - fixtures come by import and go by name
 
 import copy
 import math
@@ -12,7 +11,6 @@ from filters import EstimateState, make_filter, run
 from filters.estimators.foreign import Estimator
 from filters.wrappers.envs import EstimateStates
 from tests.models import random_affine, simulated
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import evaluate

@@ -12,7 +12,6 @@ import pytest
 
 pytest.importorskip("pyulog")
 from tests.thruster_env.logs.recorders.files import write_ulog
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 
 PAGE = (Path(__file__).parents[2] / "docs" / "boat.md").read_text()
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
@@ -37,7 +36,7 @@ def dive(folder, number, command):
 
 
 @pytest.mark.slow
-def test_every_line_leads_to_the_alarm(tmp_path, thruster):  # noqa: F811
+def test_every_line_leads_to_the_alarm(tmp_path, thruster):
     def run(words):
         if words[0] == "thruster":
             done = thruster(*words[1:])

@@ -1,5 +1,4 @@
 """The docs' programs run and their commands are understood; what cannot run stands here with its reason."""
-# ruff: noqa: F811 - a fixture comes by import and goes by name
 
 import re
 import shlex
@@ -9,7 +8,6 @@ from pathlib import Path
 import pytest
 import typer
 
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.cli.app import app
 
 ROOT = Path(__file__).parents[2]

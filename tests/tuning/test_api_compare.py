@@ -12,7 +12,6 @@ from tests import pendulum_problem
 from tests.linear_problem import LinearProblem
 from tests.models import wide_model
 from tests.small_problems import UNITS, pair
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
 from thruster_env.model.affine import affine_model
 from tuning.api.compare import default_filters
@@ -42,7 +41,7 @@ def comparison():
     return tuning.compare(["kf", "ekf"], SHORT, seeds=6, progress=False)
 
 
-def test_compare_is_the_command_in_one_call(as_json):  # noqa: F811
+def test_compare_is_the_command_in_one_call(as_json):
     told = as_json(
         *("compare", "--filter", "ekf", "--filter", "enkf", "--problem", "nominal", "--seeds", 3, "--seed", 2),
         *("--ensemble-size", "enkf=7", "--augment", "ambient_velocity:0.3"),

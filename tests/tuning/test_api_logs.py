@@ -9,7 +9,6 @@ import pytest
 
 import tuning
 from filters import affine_model
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
 from thruster_env.logs.write import write_log
 from thruster_env.thruster.parameters import read_preset
@@ -37,7 +36,7 @@ def found(recorded):
     return tuning.identify(tuning.read_logs(recorded, **WHOSE), FREE, noise=False, starts=1, progress=False)
 
 
-def test_estimate_is_the_command_in_one_call(as_json, runs, tmp_path):  # noqa: F811
+def test_estimate_is_the_command_in_one_call(as_json, runs, tmp_path):
     told = as_json("estimate", "run0.csv", *OF_LOGS, "--smoother", "--lag", 5, "--skip", 20, "--out", "theirs.csv")
     mine = tuning.estimate(tuning.read_logs("run0.csv", **WHOSE), smoother=True, lag=5, skip=20)
     assert mine.log_likelihood == told["log_likelihood"] and mine.findings.mean_nis == told["mean_nis"]
@@ -62,7 +61,7 @@ def test_a_baseline_has_no_nis(recorded):
     assert repr(mine).endswith("rows)") and "nan" not in mine._repr_html_()
 
 
-def test_identify_is_the_command_in_one_call(as_json, runs, tmp_path):  # noqa: F811
+def test_identify_is_the_command_in_one_call(as_json, runs, tmp_path):
     options = ("--free", ",".join(FREE), "--hold-noise", "--starts", 2, "--range", "voltage_gain=100:5000")
     told = as_json("identify", *runs, *OF_LOGS, *options, "--out", "theirs.toml")
     ranges = {"voltage_gain": (100, 5000)}

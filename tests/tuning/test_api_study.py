@@ -17,7 +17,6 @@ import tuning
 from filters import EstimateState
 from filters.c.project import c_filter
 from filters.monitoring import Monitor
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.problems.find import find_problem
 from tuning.reporting.tuning_report import next_steps, report
 
@@ -38,7 +37,7 @@ def plain(data):
     return json.loads(as_text(data))
 
 
-def test_tune_is_the_command_in_one_call(study, as_json, tmp_path):  # noqa: F811
+def test_tune_is_the_command_in_one_call(study, as_json, tmp_path):
     told = as_json("tune", "--filter", "ekf", "--problem", "mismatch", "--trials", TRIALS, "--out", "theirs.json")
     assert study.save("mine.json").name == "mine.json"
     mine, theirs = (json.loads((tmp_path / name).read_text()) for name in ("mine.json", "theirs.json"))

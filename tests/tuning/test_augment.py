@@ -9,7 +9,6 @@ import tuning
 from filters import EstimateState, Unknown, augmented_model, make_filter
 from filters.tuned_file import AUGMENTED, read_tuned_file
 from tests.models import scalar_model
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.tuned import read_tuned
 from tuning.policies.setup import make_configuration
 from tuning.problems.assumed import AugmentedProblem, augmented, name_and_unknown, unknowns_of
@@ -75,7 +74,7 @@ def test_a_study_is_found_by_its_name_and_estimates_the_flow(study):
 
 
 @pytest.mark.filterwarnings("ignore:.* was tuned for flow")  # the log's thruster is in still water
-def test_every_reader_of_the_file_makes_the_same_filter(study, file, tmp_path, thruster):  # noqa: F811
+def test_every_reader_of_the_file_makes_the_same_filter(study, file, tmp_path, thruster):
     kept = read_tuned_file(file)
     assert kept["problem"] == NAME and kept["filter"]["model"][AUGMENTED] == {"ambient_velocity": [0.4, 0.01, 0.0]}
     choice, problem, _ = read_tuned(file)

@@ -53,11 +53,6 @@ FEW = ("ekf", "kf", "enkf", "pf")  # kinds of most tests, for speed
 COSTS = {"ekf": lambda n: 0.1, "kf": lambda n: 0.07, "enkf": lambda n: 0.05 * n, "pf": lambda n: 0.02 * n}
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-
-
 @pytest.fixture
 def priced(monkeypatch):
     """Few kinds, and costs that do not depend on the machine."""

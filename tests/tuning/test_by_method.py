@@ -8,7 +8,6 @@ import pytest
 
 import tuning
 from tests.linear_problem import LinearProblem
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.methods.problems import linear
 from thruster_env.model.affine import affine_model
 from tuning.api import tune
@@ -92,13 +91,13 @@ def test_a_study_cannot_be_run_on_a_task():
         find_method("tpe").run("tpe", Task("kf", problem, problem.data([0])))
 
 
-def test_an_unknown_method_is_refused_in_one_line(thruster):  # noqa: F811
+def test_an_unknown_method_is_refused_in_one_line(thruster):
     unknown = thruster("methods", "magic")
     assert unknown.returncode == 2 and "method must be one of" in unknown.stderr and "'magic'" in unknown.stderr
 
 
 @pytest.mark.slow
-def test_the_command_follows_a_method(as_json, thruster):  # noqa: F811
+def test_the_command_follows_a_method(as_json, thruster):
     told = as_json("tune", "--filter", "enkf", "--problem", "nominal", "--method", "desroziers", "--trials", 4)
     assert told["method"]["name"] == "desroziers"
     assert told["method"]["runs"] % 32 == 0 and told["method"]["runs"] > 4 * 32

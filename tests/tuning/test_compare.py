@@ -13,7 +13,6 @@ from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.parallel import IN_PROCESS, task_map
 from thruster_env.model.affine import affine_model
-from tuning.cli.main import main
 from tuning.evaluation.compare import Leaderboard, Row, compare, contender, sized, winners
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison
@@ -154,27 +153,13 @@ def test_ctrl_c_keeps_the_rows_that_are_done():
 
 
 @pytest.fixture
-def thruster(tmp_path, monkeypatch, capsys):
-    """Run the command in this process, in an empty folder; return its exit code, output and errors."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "80")
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["thruster", "compare", *map(str, arguments)])
-        capsys.readouterr()
-        code = 0
-        try:
-            main()
-        except SystemExit as stop:
-            code = stop.code or 0
-        return code, *capsys.readouterr()
-
-    return run
+def command(thruster):
+    return lambda *arguments: thruster("compare", *arguments)
 
 
-def test_the_command_ranks_filters_on_scenarios(thruster, tmp_path):
+def test_the_command_ranks_filters_on_scenarios(command, tmp_path):
     options = ("--filter", "ekf", "--filter", "ekf-robust", "--seeds", 8, "--knows", "true")
-    code, out, _ = thruster(*options, "--scenario", "outliers", "--scenario", "nominal", "--json", "board.json")
+    code, out, _ = command(*options, "--scenario", "outliers", "--scenario", "nominal", "--json", "board.json")
     assert code == 0
     for word in ("one measured thrust in twenty", "RMSE on held-out seeds 500000 to 500007", "rad/s", "bound"):
         assert word in out
@@ -188,10 +173,10 @@ def test_the_command_ranks_filters_on_scenarios(thruster, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_takes_sizes_augmentation_and_scenario_files(thruster, tmp_path):
+def test_the_command_takes_sizes_augmentation_and_scenario_files(command, tmp_path):
     (tmp_path / "my.toml").write_text('base = "ambient"\nsteps = 100\nscale = [1.0, 0.05]\n')
     options = ("--filter", "ekf", "--filter", "enkf", "--filter", "low-pass", "--ensemble-size", "enkf=12")
-    code, out, _ = thruster(
+    code, out, _ = command(
         *options, "--augment", "ambient_velocity:0.4:0.01", "--scenario", "my.toml", "--seeds", 4, "--json", "-"
     )
     labels = ["ekf", "ekf + U_0", "enkf 12", "enkf 12 + U_0", "low-pass"]
@@ -200,17 +185,17 @@ def test_the_command_takes_sizes_augmentation_and_scenario_files(thruster, tmp_p
     assert filters["low-pass"]["nees"] is None and filters["low-pass"]["median_nees"] is None
 
 
-def test_the_command_takes_tuned_files(thruster, tmp_path):
+def test_the_command_takes_tuned_files(command, tmp_path):
     scenario = find_scenario("mismatch")
     choice = untuned_choice("enkf", scenario)
     evaluation = evaluate(choice.filter(scenario), scenario.data([1, 2]), scenario.scale)
     comparison = Comparison(evaluation, evaluation, evaluation, np.array(scenario.scale), range(2))
     result = StudyResult(choice, 1.0, [], [], 0.0, False)
     write_tuned(tmp_path / "mine.json", Plan("enkf", (scenario,)), result, [comparison], "s")
-    code, out, _ = thruster("mine.json", "--filter", "ekf", "--seeds", 4, "--ensemble-size", 20, "--knows", "true")
+    code, out, _ = command("mine.json", "--filter", "ekf", "--seeds", 4, "--ensemble-size", 20, "--knows", "true")
     assert code == 0 and "mismatch:" in out and "Over mine, paired" in out
     assert "Q and R: of mine the tuned ones; of ekf the plant's own (oracle; --knows true)." in out
-    code, out, _ = thruster("mine.json", "--seeds", 4, "--scenario", "nominal")
+    code, out, _ = command("mine.json", "--seeds", 4, "--scenario", "nominal")
     assert code == 0 and "On nominal no other filter can be compared with mine." in out
 
 
@@ -224,20 +209,20 @@ def small_unknown(r=1.0):
     return ModelProblem(truth, assumed, steps=60, scale=(1.0,))
 
 
-def test_where_nobody_knows_the_plants_noise_filters_have_the_scaled_default(thruster, tmp_path, monkeypatch):
+def test_where_nobody_knows_the_plants_noise_filters_have_the_scaled_default(command, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "of_their_own", SimpleNamespace(problem=small_unknown()))
     with interpreted():
-        code, out, errors = thruster("--filter", "ekf", "--problem", "of_their_own:problem", "--seeds", 2)
+        code, out, errors = command("--filter", "ekf", "--problem", "of_their_own:problem", "--seeds", 2)
     assert code == 0, errors
     assert "Q and R: the scaled default (--knows scaled)." in out
 
 
-def test_by_default_a_filter_without_a_scaled_default_has_what_its_model_came_with(thruster, monkeypatch):
+def test_by_default_a_filter_without_a_scaled_default_has_what_its_model_came_with(command, monkeypatch):
     monkeypatch.setitem(sys.modules, "of_their_own", SimpleNamespace(problem=small_unknown(r=1e12)))
     options = "--filter", "ekf", "--problem", "of_their_own:problem", "--seeds", 2
     with interpreted():
-        code, out, errors = thruster(*options)
-        refused, _, rule = thruster(*options, "--knows", "scaled")
+        code, out, errors = command(*options)
+        refused, _, rule = command(*options, "--knows", "scaled")
     assert code == 0, errors
     line = "Q and R: those that the model came with (--knows given). There is no scaled default: no factor on Q"
     assert line in " ".join(out.split())
@@ -269,6 +254,6 @@ def test_by_default_a_filter_without_a_scaled_default_has_what_its_model_came_wi
         (("--trials", "5", "--knows", "true"), "knows must be left out, or 'study', with trials, but got 'true'"),
     ],
 )
-def test_a_users_mistake_is_one_clear_line_and_exit_code_2(arguments, line, thruster):
-    code, _, errors = thruster(*arguments)
+def test_a_users_mistake_is_one_clear_line_and_exit_code_2(arguments, line, command):
+    code, _, errors = command(*arguments)
     assert code == 2 and line in errors and "Traceback" not in errors

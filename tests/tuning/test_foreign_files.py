@@ -1,5 +1,4 @@
 """Files that somebody else wrote run no code: tuned files and setups of policies are data, checked before use."""
-# ruff: noqa: F811 - fixtures come by import and go by name
 
 import json
 import pickle
@@ -10,7 +9,6 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates
 from tests.tuned_files import rewrite, write_untuned
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.api.report import report
 from tuning.api.verify import verify
 from tuning.evaluation.tuned import read_tuned

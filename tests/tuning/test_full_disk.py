@@ -41,7 +41,6 @@ def whole_lines(path):
 
 @pytest.fixture(scope="module")
 def data():
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
     return PLAN.training_data()
 
 

@@ -26,11 +26,6 @@ MISMATCH = find_scenario("mismatch")
 PLAN = Plan("ekf", (MISMATCH,), full_q=True)
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-
-
 def test_for_two_states_the_number_is_the_correlation_with_its_sign():
     cov = full_covariance((4.0, 9.0), [-0.5])
     np.testing.assert_allclose(cov, [[4.0, -3.0], [-3.0, 9.0]], rtol=1e-15)

@@ -10,11 +10,6 @@ from tuning.search.study import open_study
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-
-
 def storage_with_one_trial():
     storage = optuna.storages.InMemoryStorage()
     study = open_study("s", PLAN, storage)

@@ -14,7 +14,6 @@ from tuning.search.storage import JournalFile, open_storage
 
 @pytest.fixture
 def path(tmp_path):
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
     return str(tmp_path / "studies.journal")
 
 

@@ -4,7 +4,6 @@ import json
 import pickle
 
 import numpy as np
-import optuna
 import pytest
 
 from filters import run
@@ -42,11 +41,6 @@ MODEL = affine_model(
     prior_cov=[0.0],
 )
 GUESS = MODEL.replace(process_noise_cov=[1.0])
-
-
-@pytest.fixture(autouse=True)
-def quiet():
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
 
 
 def logs_of(*steps, truth=False, offset=0.0):

@@ -8,7 +8,6 @@ import pytest
 import tuning
 from filters import StateSpaceModel, make_filter, run
 from filters.starts import WIDE, cov_of_measured_starts, wide_cov
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuning.cli.test_cli_log_findings import OWN
 from thruster_env.logs.write import write_columns
 from thruster_env.model.affine import affine_model
@@ -92,7 +91,7 @@ def test_the_start_is_part_of_the_digest_said_and_refused_where_nothing_is_seen(
         RunsProblem([one[:2] for one in runs_far_off()], blind, start="measurement")
 
 
-def test_tune_offers_the_start_on_the_command_line_and_in_python(tmp_path, monkeypatch, thruster):  # noqa: F811
+def test_tune_offers_the_start_on_the_command_line_and_in_python(tmp_path, monkeypatch, thruster):
     (tmp_path / "own.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))

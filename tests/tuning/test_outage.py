@@ -39,7 +39,6 @@ def clock(monkeypatch):
 
 @pytest.fixture
 def storage(tmp_path):
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
     return open_storage(f"sqlite:///{tmp_path}/s.db")
 
 

@@ -24,11 +24,6 @@ MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outlie
 PLAN = Plan("ekf", (MISMATCH,))
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-
-
 def studied(plan, trials):
     return run_study(open_study("s", plan, optuna.storages.InMemoryStorage()), plan, trials)
 

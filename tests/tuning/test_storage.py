@@ -23,11 +23,6 @@ from tuning.search.study import open_study, run_study
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-
-
 @pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
 def test_a_trial_without_a_heartbeat_is_lost_and_tried_once_more(tmp_path, monkeypatch):
     monkeypatch.setattr(database, "HEARTBEAT_SECONDS", 1)

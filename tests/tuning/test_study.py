@@ -21,11 +21,6 @@ SCENARIO = find_scenario("mismatch")
 PLAN = Plan("ekf", (SCENARIO,))
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-
-
 def study_in(storage, name="s", seed=0):
     return open_study(name, PLAN._replace(seed=seed), storage)
 

@@ -1,5 +1,4 @@
 """Training of estimators with a network: loss, variants of runs, the loop, and the command."""
-# ruff: noqa: F811 - fixtures come by import and go by name
 
 import json
 
@@ -13,7 +12,6 @@ from filters.estimators.foreign import ForeignFilter
 from filters.learned.estimator import Track, unit_scales
 from filters.learned.filters import LEARNED, read
 from tests.models import plane_model
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.evaluate import values_of
 from tuning.learning import (
     HELD_OUT,

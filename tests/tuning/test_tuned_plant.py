@@ -1,5 +1,4 @@
 """A tuned file says what plant it is for, and keeps the scenarios of files that may move."""
-# ruff: noqa: F811 - fixtures come by import and go by name
 
 import json
 import shutil
@@ -15,7 +14,6 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates, thruster_model
 from filters.tuned_file import made_with
 from tests.tuned_files import of_version, rewrite, write_untuned
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from thruster_env.core.compiled import interpreted
 from thruster_env.effects.effects import Gusts
 from thruster_env.thruster.parameters import PRESETS, PresetFile, write_preset

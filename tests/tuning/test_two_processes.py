@@ -20,11 +20,6 @@ from tuning.search.workers import run_in_workers
 FINISHED = {TrialState.COMPLETE, TrialState.PRUNED}
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-
-
 def beside_another(path, trials):
     """A study of which another process finishes every other trial, begun while this one runs its own."""
     study, data = open_study("s", PLAN, open_storage(path)), PLAN.training_data()

@@ -1,5 +1,4 @@
 """From a user's own file to a tuned filter around an env, by the command line and by Python."""
-# ruff: noqa: F811 - fixtures come by import and go by name
 
 import copy
 import re
@@ -18,7 +17,6 @@ from filters.engine.batch import run
 from filters.tuned_file import read_tuned_file
 from tests import pendulum_problem
 from tests.tuned_files import rewrite
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from thruster_env.core.compiled import interpreted
 from tuning.api.verify import verify
 from tuning.evaluation.baselines import SCALED

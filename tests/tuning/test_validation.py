@@ -65,8 +65,6 @@ from tuning.search.validation import (
     validate,
 )
 
-optuna.logging.set_verbosity(optuna.logging.ERROR)
-
 
 @pytest.fixture(scope="module")
 def altitude(tmp_path_factory):

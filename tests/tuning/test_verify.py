@@ -22,7 +22,6 @@ PLAN = Plan("ekf", (find_scenario("mismatch"), find_scenario("nominal")))
 @pytest.fixture(scope="module")
 def content(tmp_path_factory):
     """What a tuned file of a small study on two scenarios holds."""
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
     result = run_study(open_study("s", PLAN, optuna.storages.InMemoryStorage()), PLAN, 2)
     comparisons = [evaluate_held_out(result.choice, scenario, PLAN.seed, 4) for scenario in PLAN.scenarios]
     path = tmp_path_factory.mktemp("tuned") / "tuned.json"

@@ -29,11 +29,6 @@ PLAN = Plan("enkf", (find_scenario("mismatch"),), prune=False)
 WORKERS = 3
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-
-
 def run_with_a_kill(storage, trials, workers, on_trial=lambda study, finished: None):
     """A study by several workers, of which one is killed in mid-trial, and the number of that trial."""
     study = open_study("s", PLAN, open_storage(storage))

@@ -1,10 +1,8 @@
 """What is not finite is not written to a file, nor judged: one line says from which step on."""
-# ruff: noqa: F811 - fixtures come by import and go by name
 
 import numpy as np
 import pytest
 
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from thruster_env.core.streams import episode_keys
 from thruster_env.thruster.equations import Simulation, simulate
 from thruster_env.thruster.plant import make_plant

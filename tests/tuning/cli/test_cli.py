@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -14,42 +13,6 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
 from thruster_env.thruster.parameters import TUNNEL, derive_constants
-from tuning.cli.main import main
-
-
-class Done(NamedTuple):
-    returncode: int
-    stdout: str
-    stderr: str
-
-
-@pytest.fixture
-def thruster(tmp_path, monkeypatch, capsys):
-    """Run the command in this process, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "100")
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["thruster", *map(str, arguments)])
-        capsys.readouterr()
-        try:
-            main()
-            code = 0
-        except SystemExit as stop:
-            code = stop.code or 0
-        return Done(code, *capsys.readouterr())
-
-    return run
-
-
-@pytest.fixture
-def as_json(thruster):
-    def run(*arguments):
-        done = thruster(*arguments, "--json", "-")
-        assert done.returncode == 0, done.stderr
-        return json.loads(done.stdout)
-
-    return run
 
 
 def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):

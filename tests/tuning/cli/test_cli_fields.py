@@ -8,7 +8,6 @@ import pytest
 from tests.thruster_env.logs.recorders.files import h5py, write_bag, write_ulog
 from tests.thruster_env.logs.recorders.test_formats import bag_topics
 from tests.tuned_files import write_untuned
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.logs.table import read_table
 
 COLUMNS = ("--column", "V_s=actuator_outputs.output[2]", "--column", "thrust=load_cell#1.force")
@@ -31,7 +30,7 @@ def columns_of(path):
 
 
 @pytest.mark.parametrize(("kind", "within"), [("double", 1e-9), ("float", 1e-5)])
-def test_an_estimate_of_a_ulog_is_that_of_the_csv_of_the_run(thruster, tmp_path, kind, within):  # noqa: F811
+def test_an_estimate_of_a_ulog_is_that_of_the_csv_of_the_run(thruster, tmp_path, kind, within):
     write_untuned(tmp_path / "tuned.json")
     assert thruster("simulate", "--out", "run.csv", "--steps", 300, "--seed", 4).returncode == 0
     recorded(tmp_path / "run.ulg", read_table(tmp_path / "run.csv"), kind)
@@ -48,7 +47,7 @@ def test_an_estimate_of_a_ulog_is_that_of_the_csv_of_the_run(thruster, tmp_path,
         assert off <= within * max(1.0, abs(of_table[name][some]).max()), name
 
 
-def test_fields_are_listed_and_sought(thruster, as_json, tmp_path):  # noqa: F811
+def test_fields_are_listed_and_sought(thruster, as_json, tmp_path):
     ticks = 10_000 * np.append(np.arange(50), np.arange(150, 200))
     rows = {"timestamp": ticks, "output[0]": np.arange(100.0), "output[1]": -5.0}
     name = "a_topic_of_a_name_so_long_that_no_terminal_of_eighty_columns_shows_it_in_one_line"
@@ -92,7 +91,7 @@ def test_fields_are_listed_and_sought(thruster, as_json, tmp_path):  # noqa: F81
         assert done.returncode == 2 and message in " ".join(done.stderr.split()), done.stderr
 
 
-def test_a_recorders_file_is_read_as_a_log_where_columns_are_told(thruster, as_json, tmp_path):  # noqa: F811
+def test_a_recorders_file_is_read_as_a_log_where_columns_are_told(thruster, as_json, tmp_path):
     assert thruster("simulate", "--out", "run.csv", "--steps", 200, "--seed", 4).returncode == 0
     recorded(tmp_path / "run.ulg", read_table(tmp_path / "run.csv"))
     data = as_json("log", "run.ulg", *COLUMNS)

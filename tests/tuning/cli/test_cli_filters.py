@@ -1,28 +1,12 @@
 """`thruster filters`: every filter with its numbers, in words that fit the terminal."""
 
 import json
-import sys
 
 import pytest
 
 from filters.registry import FILTERS, filter_type
 from thruster_env.core.text_tables import console
 from tuning.cli.filters import entry
-from tuning.cli.main import main
-
-
-@pytest.fixture
-def thruster(monkeypatch, capsys):
-    """Run the command in this process; returns exit code, standard output and standard error."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["thruster", *arguments])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as stop:
-            main()
-        return stop.value.code or 0, *capsys.readouterr()
-
-    return run
 
 
 @pytest.mark.parametrize("width", [80, 120])

@@ -4,10 +4,9 @@ import numpy as np
 from scipy.io import savemat
 
 from tests.thruster_env.logs.recorders.test_bad_recordings import write_good
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 
 
-def test_the_columns_of_a_table_that_is_no_thrusters_are_listed(thruster, as_json, tmp_path):  # noqa: F811
+def test_the_columns_of_a_table_that_is_no_thrusters_are_listed(thruster, as_json, tmp_path):
     rows = "\n".join(f"{0.5 * k},{k},{'on' if k else 'off'}" for k in range(9))
     (tmp_path / "tank.csv").write_text(f"time_s,level [m],valve\n{rows}\n")
     said = thruster("log", "tank.csv").stdout
@@ -23,7 +22,7 @@ def test_the_columns_of_a_table_that_is_no_thrusters_are_listed(thruster, as_jso
     assert done.returncode == 2 and "a log must have a column for the input" in " ".join(done.stderr.split())
 
 
-def test_what_is_not_read_and_what_is_damaged_is_said(thruster, tmp_path):  # noqa: F811
+def test_what_is_not_read_and_what_is_damaged_is_said(thruster, tmp_path):
     data = write_good(tmp_path / "a.bin").read_bytes()
     (tmp_path / "a.bin").write_bytes(data[:3000] + bytes(57) + data[3057:])
     assert "bytes in 1 place of the log belong to no message." in thruster("log", "a.bin").stdout

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import tuning
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.logs.write import write_columns
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.logs.problem import log_problem
@@ -56,7 +55,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_log_is_shown_with_what_was_found(folder, thruster, as_json):  # noqa: F811
+def test_a_log_is_shown_with_what_was_found(folder, thruster, as_json):
     data = as_json("log", "gap.csv", *MODEL, "--plot", "gap.png")
     (gap,) = data["findings"]
     assert data["pieces"] == [[0, 300], [340, 360]]
@@ -71,7 +70,7 @@ def test_a_log_is_shown_with_what_was_found(folder, thruster, as_json):  # noqa:
     assert thruster("log", "whole.csv", *MODEL, "--plot", "whole.txt").returncode == 2
 
 
-def test_an_estimate_does_not_praise_a_stuck_sensor(folder, thruster, as_json):  # noqa: F811
+def test_an_estimate_does_not_praise_a_stuck_sensor(folder, thruster, as_json):
     data = as_json("estimate", "stuck.csv", *MODEL)
     assert data["findings"][0]["kind"] == "stuck"
     assert (
@@ -88,7 +87,7 @@ def test_an_estimate_does_not_praise_a_stuck_sensor(folder, thruster, as_json): 
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_study_of_logs_and_its_page_say_what_was_found(folder, thruster):  # noqa: F811
+def test_a_study_of_logs_and_its_page_say_what_was_found(folder, thruster):
     logs = ("--log", "gap.csv", "--log", "stuck.csv", *MODEL)
     done = thruster("tune", "--filter", "kf", *logs, "--trials", 3, "--out", "tuned.json")
     said = " ".join(done.stdout.split())
@@ -134,7 +133,7 @@ def test_a_model_that_blows_up_is_told_its_substeps(folder):
     )
 
 
-def test_recorders_of_two_rates_are_told_the_option(folder, thruster):  # noqa: F811
+def test_recorders_of_two_rates_are_told_the_option(folder, thruster):
     slow = table()
     slow["time_s"] = slow["time_s"] * 1.01
     write_columns(folder / "slow.csv", slow, "exact")
@@ -148,7 +147,7 @@ def test_recorders_of_two_rates_are_told_the_option(folder, thruster):  # noqa: 
     assert both.dt == 0.1 and len(both.logs) == 2
 
 
-def test_estimate_tells_of_alarms(folder, thruster, as_json):  # noqa: F811
+def test_estimate_tells_of_alarms(folder, thruster, as_json):
     data = as_json("estimate", "stuck.csv", *MODEL, "--monitor", "100000", "--out", "e.csv", "--plot", "e.png")
     tests = {one["test"] for one in data["alarms"]}
     assert "stuck" in tests and {one["channel"] for one in data["alarms"]} == {"z"}

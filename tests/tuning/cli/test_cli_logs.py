@@ -6,13 +6,12 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from filters import thruster_model
 from filters.logs.estimate import estimate
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.logs.read import read_log
 from thruster_env.thruster.parameters import PRESETS, PresetFile, write_preset
 
 
 @pytest.fixture
-def simulated(thruster):  # noqa: F811
+def simulated(thruster):
     def make(*names):
         for seed, name in enumerate(names):
             assert thruster("simulate", "--out", name, "--steps", 300, "--seed", seed).returncode == 0
@@ -20,7 +19,7 @@ def simulated(thruster):  # noqa: F811
     return make
 
 
-def test_a_log_is_written_as_it_is_read(thruster, tmp_path):  # noqa: F811
+def test_a_log_is_written_as_it_is_read(thruster, tmp_path):
     """With dates, another unit and stamps off the grid: the exported program in C reads what comes of it."""
     rng, rows = np.random.default_rng(0), ["when (UTC),U_kV,load [mN],x"]
     for k in range(40):
@@ -44,7 +43,7 @@ def test_a_log_is_written_as_it_is_read(thruster, tmp_path):  # noqa: F811
         assert done.returncode == 2 and (tmp_path / "grid.csv").read_bytes() == before
 
 
-def test_a_simulated_log_goes_through_estimate(simulated, as_json, thruster, tmp_path):  # noqa: F811
+def test_a_simulated_log_goes_through_estimate(simulated, as_json, thruster, tmp_path):
     simulated("run.csv")
     data = as_json("estimate", "run.csv", "--filter", "ekf", "--out", "est.csv", "--plot", "est.png")
     assert data["rows"] == 301 and data["first_row"] == 50 and data["files"] == ["est.csv", "est.png"]
@@ -58,7 +57,7 @@ def test_a_simulated_log_goes_through_estimate(simulated, as_json, thruster, tmp
     assert as_json("estimate", "again.npz")["log_likelihood"] == pytest.approx(data["log_likelihood"], rel=1e-6)
 
 
-def test_what_is_simulated_has_the_sensors_that_are_asked_for(thruster, as_json):  # noqa: F811
+def test_what_is_simulated_has_the_sensors_that_are_asked_for(thruster, as_json):
     options = "--steps", 100, "--sensor", "thrust", "--sensor", "speed"
     data = as_json("simulate", "--out", "run.csv", *options)
     assert data["columns"][-2:] == ["measured_thrust_N", "measured_speed_rad_per_s"]
@@ -71,7 +70,7 @@ def test_what_is_simulated_has_the_sensors_that_are_asked_for(thruster, as_json)
     assert set(as_json("estimate", "run.csv", *options[2:])["one_step_ahead"]) == {"thrust", "speed"}
 
 
-def test_a_simulated_log_may_be_without_truth(thruster, as_json):  # noqa: F811
+def test_a_simulated_log_may_be_without_truth(thruster, as_json):
     options = "--steps", 60, "--seed", 3, "--sensor", "thrust", "--sensor", "speed"
     as_json("simulate", "--out", "whole.csv", *options)
     data = as_json("simulate", "--out", "run.csv", *options, "--measured-only")
@@ -87,7 +86,7 @@ def test_a_simulated_log_may_be_without_truth(thruster, as_json):  # noqa: F811
     )
 
 
-def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_json):  # noqa: F811
+def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_json):
     simulated("run.csv")
     columns = "--column", "speed=omega_m_rad_per_s", "--column", "thrust=thrust_N"
     data = as_json("estimate", "run.csv", "--sensor", "speed", *columns)
@@ -139,7 +138,7 @@ def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_jso
         (("tune", "--blocks", "3"), "--blocks must come with --log, but got --blocks 3 without one"),
     ],
 )
-def test_a_mistake_with_a_log_is_one_line_and_nothing_is_written(arguments, line, thruster, tmp_path):  # noqa: F811
+def test_a_mistake_with_a_log_is_one_line_and_nothing_is_written(arguments, line, thruster, tmp_path):
     times = 0.01 * np.arange(61)
     rows = [f"{t:.2f},{6 * np.sin(t):.4f},{np.cos(9 * t):.4f}" for t in times]
     (tmp_path / "run.csv").write_text("time_s,voltage_V,measured_thrust_N\n" + "\n".join(rows) + "\n")
@@ -149,7 +148,7 @@ def test_a_mistake_with_a_log_is_one_line_and_nothing_is_written(arguments, line
     assert {path.name for path in tmp_path.iterdir()} <= {"run.csv", "out"}
 
 
-def test_rows_in_which_nothing_was_measured_tell_nothing(thruster, tmp_path):  # noqa: F811
+def test_rows_in_which_nothing_was_measured_tell_nothing(thruster, tmp_path):
     rows = [f"{0.01 * k:.2f},{k % 7},{k * 0.1 if k < 30 else ''}" for k in range(200)]
     (tmp_path / "run.csv").write_text("time_s,voltage_V,measured_thrust_N\n" + "\n".join(rows) + "\n")
     assert "Nothing was measured in the rows that count, from 50 on" in " ".join(
@@ -157,7 +156,7 @@ def test_rows_in_which_nothing_was_measured_tell_nothing(thruster, tmp_path):  #
     )
 
 
-def test_clock_offsets_of_a_preset_file_are_taken_off(thruster, as_json, tmp_path):  # noqa: F811
+def test_clock_offsets_of_a_preset_file_are_taken_off(thruster, as_json, tmp_path):
     thruster("simulate", "--out", "run.csv", "--steps", 200)
     table = (tmp_path / "run.csv").read_text().splitlines()
     rows = [line.split(",") for line in table]

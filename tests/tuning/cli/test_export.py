@@ -5,7 +5,6 @@ import subprocess
 import numpy as np
 
 from tests.tuned_files import write_untuned
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 
 
 def built(folder, name):
@@ -20,7 +19,7 @@ def columns(path, names):
     return np.array([table[name] for name in names])
 
 
-def test_the_program_writes_what_estimate_writes(thruster, as_json, tmp_path):  # noqa: F811
+def test_the_program_writes_what_estimate_writes(thruster, as_json, tmp_path):
     tuned = write_untuned(tmp_path / "tuned.json")
     assert thruster("simulate", "--steps", 60, "--out", "run.csv").returncode == 0
     assert thruster("estimate", "run.csv", tuned, "--out", "estimate.csv").returncode == 0
@@ -35,7 +34,7 @@ def test_the_program_writes_what_estimate_writes(thruster, as_json, tmp_path):  
     np.testing.assert_allclose(of_c, ours, rtol=1e-8, atol=1e-9)
 
 
-def test_an_ensemble_with_a_monitor_writes_what_estimate_writes(thruster, as_json, tmp_path):  # noqa: F811
+def test_an_ensemble_with_a_monitor_writes_what_estimate_writes(thruster, as_json, tmp_path):
     """Of a log whose sensor is stuck."""
     tuned = write_untuned(tmp_path / "tuned.json", name="etkf")
     assert thruster("simulate", "--steps", 100, "--out", "run.csv").returncode == 0
@@ -58,7 +57,7 @@ def test_an_ensemble_with_a_monitor_writes_what_estimate_writes(thruster, as_jso
     assert ours[-1, 79] >= 1.0 and not ours[-1, :70].any()
 
 
-def test_what_cannot_be_exported_is_refused(thruster, tmp_path):  # noqa: F811
+def test_what_cannot_be_exported_is_refused(thruster, tmp_path):
     tuned = write_untuned(tmp_path / "tuned.json")
     for arguments, message in [
         (("--language", "ada"), "a language must be one of c, but got 'ada'"),

@@ -3,7 +3,6 @@
 import pytest
 
 from tests import altitude_problem
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.logs.write import write_log
 from tuning.evaluation.baselines import given_noise
 from tuning.evaluation.held_out import evaluate_held_out
@@ -12,7 +11,7 @@ from tuning.experiments.identification import TRUTH, record
 ALTITUDE = "tests.altitude_problem:problem"
 
 
-def test_what_the_model_came_with_is_evaluated_and_is_no_rule_of_thumb(as_json, thruster):  # noqa: F811
+def test_what_the_model_came_with_is_evaluated_and_is_no_rule_of_thumb(as_json, thruster):
     told = as_json("evaluate", "--given", "--problem", ALTITUDE, "--seeds", 12)
     problem = altitude_problem.problem()
     mine = given_noise("ekf", problem)
@@ -24,7 +23,7 @@ def test_what_the_model_came_with_is_evaluated_and_is_no_rule_of_thumb(as_json, 
     assert done.returncode == 0 and "Parameters of the ukf filter" in done.stdout and "given" in done.stdout
 
 
-def test_the_covariance_of_what_was_given_is_checked(as_json, tmp_path):  # noqa: F811
+def test_the_covariance_of_what_was_given_is_checked(as_json, tmp_path):
     options = "evaluate", "--given", "--problem", ALTITUDE, "--seeds", 8, "--consistency"
     told = as_json(*options, "c.png")
     assert told["consistency"] and (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
@@ -44,13 +43,13 @@ def test_the_covariance_of_what_was_given_is_checked(as_json, tmp_path):  # noqa
         ),
     ),
 )
-def test_where_nothing_was_given_one_line_says_so(thruster, options, said):  # noqa: F811
+def test_where_nothing_was_given_one_line_says_so(thruster, options, said):
     done = thruster("evaluate", "--given", *options)
     assert done.returncode == 2 and said in " ".join(done.stderr.split())
 
 
 @pytest.mark.slow
-def test_a_preset_that_was_identified_is_not_made_worse_by_tuning(as_json, tmp_path):  # noqa: F811
+def test_a_preset_that_was_identified_is_not_made_worse_by_tuning(as_json, tmp_path):
     for place, log in enumerate(record(0, 3, 300)):
         write_log(tmp_path / f"run{place}.csv", log)
     logs = [f"run{place}.csv" for place in range(3)]

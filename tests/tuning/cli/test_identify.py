@@ -9,7 +9,6 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from tests.models import scalar_model
 from tests.thruster_env.thruster.test_t200 import OTHER, recorded_rows, write_table
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.streams import episode_keys
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import write_log
@@ -35,7 +34,7 @@ def logs(tmp_path):
 
 
 @pytest.mark.slow
-def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_json, logs, tmp_path):  # noqa: F811
+def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_json, logs, tmp_path):
     found = as_json("identify", *logs, *OF_LOGS, "--free", FREE, "--starts", 1, "--out", "mine.toml")
     assert found["held_out"] == ["run2.csv"] and found["files"] == ["mine.toml"]
     for name, value in found["values"].items():
@@ -93,7 +92,7 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("arguments", "message"), MISTAKES)
-def test_a_mistake_is_one_line_and_nothing_is_written(thruster, logs, tmp_path, arguments, message):  # noqa: F811
+def test_a_mistake_is_one_line_and_nothing_is_written(thruster, logs, tmp_path, arguments, message):
     done = thruster(*arguments)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     assert re.search(message, done.stderr), done.stderr
@@ -101,7 +100,7 @@ def test_a_mistake_is_one_line_and_nothing_is_written(thruster, logs, tmp_path, 
 
 
 @pytest.mark.slow
-def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tmp_path):  # noqa: F811
+def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tmp_path):
     truth = OTHER.thruster._replace(
         **{name: 1.5 * getattr(OTHER.thruster, name) for name in ("motor_damping", "voltage_gain", "load_gain")},
         added_mass=0.6,
@@ -131,7 +130,7 @@ def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tm
     assert done.returncode == 2 and "a step response must have a step of the voltage" in done.stderr
 
 
-def test_scenarios_are_of_another_thruster_by_its_preset_file(thruster, tmp_path):  # noqa: F811
+def test_scenarios_are_of_another_thruster_by_its_preset_file(thruster, tmp_path):
     path = tmp_path / "mine.toml"
     write_preset(path, PresetFile(TUNNEL_PHYSICAL._replace(voltage_gain=1300.0), (-0.5, 0.7)))
     made = of_preset(find_problem("nominal"), str(path), sequences=4)
@@ -147,7 +146,7 @@ def test_scenarios_are_of_another_thruster_by_its_preset_file(thruster, tmp_path
     )
 
 
-def test_no_command_writes_over_a_log_or_its_description(thruster, logs, tmp_path):  # noqa: F811
+def test_no_command_writes_over_a_log_or_its_description(thruster, logs, tmp_path):
     (tmp_path / "run0.toml").write_text("dt = 0.01\n")
 
     def files():

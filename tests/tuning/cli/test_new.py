@@ -14,7 +14,6 @@ from filters.registry import filter_type
 from filters.sensitivity import likelihood
 from tests.filters.test_differentiated import swing_if
 from tests.models import pendulum, simulated, swing
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.compiled import interpreted
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.parameters import TUNNEL_PHYSICAL, read_preset
@@ -24,7 +23,7 @@ from tuning.search.parameters import filter_parameters
 
 
 @pytest.fixture
-def new(thruster, monkeypatch, tmp_path):  # noqa: F811
+def new(thruster, monkeypatch, tmp_path):
     """Write a file and say what its module is called; modules are forgotten afterwards."""
     monkeypatch.syspath_prepend(tmp_path)
     known = set(sys.modules)
@@ -139,7 +138,7 @@ def test_an_env_is_estimated_and_is_a_problem(new):
     assert problem.name == "a_new_env:problem" and len(problem.data([3, 4]).states[0]) == 301
 
 
-def test_a_model_estimates_the_log_that_it_writes(new, as_json, monkeypatch, tmp_path):  # noqa: F811
+def test_a_model_estimates_the_log_that_it_writes(new, as_json, monkeypatch, tmp_path):
     name = new("model", "a_new_model")
     with interpreted():
         runpy.run_path(str(tmp_path / f"{name}.py"), run_name="__main__")
@@ -148,7 +147,7 @@ def test_a_model_estimates_the_log_that_it_writes(new, as_json, monkeypatch, tmp
     assert found["nis_band"][0] < found["mean_nis"] < found["nis_band"][1]
 
 
-def test_a_preset_is_a_thruster(new, as_json):  # noqa: F811
+def test_a_preset_is_a_thruster(new, as_json):
     name = new("preset", "a_new_preset")
     found = read_preset(f"{name}.toml").parameters
     for one, other in zip(found, TUNNEL_PHYSICAL, strict=True):
@@ -171,7 +170,7 @@ def test_a_preset_is_a_thruster(new, as_json):  # noqa: F811
         (("problem", "none/x"), "must be where it can be written"),
     ],
 )
-def test_what_cannot_be_new_is_refused(thruster, tmp_path, arguments, line):  # noqa: F811
+def test_what_cannot_be_new_is_refused(thruster, tmp_path, arguments, line):
     (tmp_path / "there.py").write_text("mine\n")
     (tmp_path / "none").write_text("a file\n")
     done = thruster("new", *arguments)

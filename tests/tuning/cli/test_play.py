@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.thruster.model import thruster_model
 from thruster_env.thruster.rendering import ChartEntry, Overlay
 from tuning.cli import play
@@ -21,20 +20,20 @@ def frames(monkeypatch):
     return kept
 
 
-def test_pi_follows_a_reference_under_an_estimate(as_json, frames):  # noqa: F811
+def test_pi_follows_a_reference_under_an_estimate(as_json, frames):
     found = as_json("play", "--policy", "PI".lower(), "--steps", 12, "--filter", "EKF", "--out", "x.gif")
     assert found == {"steps": 12, "total_reward": found["total_reward"], "seconds": 0.12, "video": "x.gif"}
     ((path, pictures, rate),) = frames
     assert path.name == "x.gif" and rate == 25 and len(pictures) == 4 and pictures[0].shape[2] == 3
 
 
-def test_alone_it_plays_pi(as_json, frames):  # noqa: F811
+def test_alone_it_plays_pi(as_json, frames):
     alone = as_json("play", "--steps", 8, "--out", "x.gif")
     assert alone == as_json("play", "--policy", "pi", "--steps", 8, "--out", "x.gif") and alone["steps"] == 8
 
 
 @pytest.mark.parametrize("option", [("--voltage", 8), ("--excitation", "prbs")])
-def test_voltages_drive_the_thruster(as_json, frames, monkeypatch, option):  # noqa: F811
+def test_voltages_drive_the_thruster(as_json, frames, monkeypatch, option):
     seen = []
     monkeypatch.setattr(play, "_played", spy(play._played, seen))
     found = as_json("play", *option, "--steps", 8, "--preset", "t200", "--seed", 3, "--out", "x.gif")
@@ -52,7 +51,7 @@ def spy(function, seen):
     return called
 
 
-def test_a_log_is_shown_as_it_was_recorded(thruster, as_json, frames, monkeypatch):  # noqa: F811
+def test_a_log_is_shown_as_it_was_recorded(thruster, as_json, frames, monkeypatch):
     thruster("simulate", "--out", "run.csv", "--steps", 30, "--voltage", 9)
     shown = []
     monkeypatch.setattr("thruster_env.thruster.rendering.Renderer.add", lambda self, *both: shown.append(both))
@@ -69,7 +68,7 @@ def test_a_log_is_shown_as_it_was_recorded(thruster, as_json, frames, monkeypatc
     )
 
 
-def test_where_a_log_has_no_truth_the_estimate_moves_the_propeller(thruster, tmp_path):  # noqa: F811
+def test_where_a_log_has_no_truth_the_estimate_moves_the_propeller(thruster, tmp_path):
     times = 0.01 * np.arange(40)
     rows = [f"{t:.2f},9,{10 * (1 - np.exp(-20 * t)):.4f}" for t in times]
     (tmp_path / "bare.csv").write_text("time_s,voltage_V,measured_thrust_N\n" + "\n".join(rows) + "\n")
@@ -100,7 +99,7 @@ def test_where_a_log_has_no_truth_the_estimate_moves_the_propeller(thruster, tmp
         (("--voltage", 3, "--filter", "ekf", "--tuned", "t.json"), "but got both, t.json and ekf"),
     ],
 )
-def test_a_mistake_is_one_line(thruster, tmp_path, arguments, line):  # noqa: F811
+def test_a_mistake_is_one_line(thruster, tmp_path, arguments, line):
     done = thruster("play", *arguments)
     assert done.returncode == 2 and line in done.stderr and not list(tmp_path.glob("*.gif"))
 

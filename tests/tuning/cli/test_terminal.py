@@ -13,7 +13,6 @@ from docs.scripts import DOCS, PAGES, made_by
 from filters.consistency.nees import Interval
 from filters.registry import FILTERS
 from tests.linear_problem import LinearProblem
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.checks import any_case, listening, meant, one_of
 from thruster_env.core.text_tables import Table
 from tuning.api.tune import file_name
@@ -28,7 +27,7 @@ from tuning.search.study import STOPPING, stop_on_interrupt
 WITHOUT_JSON = ("explore",)  # what it finds is exported from its page
 
 
-def test_what_is_random_has_a_seed_and_all_write_json(thruster):  # noqa: F811
+def test_what_is_random_has_a_seed_and_all_write_json(thruster):
     commands = set(COMMANDS) - {"reproduce"}
     without = {name for name in commands if "--seed " not in thruster(name, "--help").stdout}
     rest = {"inspect", "filters", "fit", "new", "methods", "report", "verify", "export", "log", "bollard"}
@@ -45,7 +44,7 @@ def test_tables_and_pictures_of_scripts_and_experiments_stand_on_their_page(page
     assert not missing + [name for name in made_by(page, "FIGURES") if f"{Path(name).name})" not in text]
 
 
-def test_names_are_taken_in_any_case(as_json):  # noqa: F811
+def test_names_are_taken_in_any_case(as_json):
     found = as_json("inspect", "--preset", "T200", "--out", "x.png")
     assert found["preset"] == "t200"
     assert as_json("filters", "EnKF")["filters"][0]["name"] == "enkf"
@@ -69,7 +68,7 @@ def test_names_are_taken_in_any_case(as_json):  # noqa: F811
         (("evaluate",), "but got none"),
     ],
 )
-def test_a_misspelt_name_comes_with_the_nearest_one(thruster, arguments, end):  # noqa: F811
+def test_a_misspelt_name_comes_with_the_nearest_one(thruster, arguments, end):
     done = thruster(*arguments)
     assert done.returncode == 2 and end in done.stderr and done.stderr.count("\n") == 1
 
@@ -112,13 +111,13 @@ def test_the_first_ctrl_c_is_acknowledged_at_once():
         assert stopped() and told == [STOPPING]
 
 
-def test_a_refused_study_leaves_no_journal(thruster, tmp_path):  # noqa: F811
+def test_a_refused_study_leaves_no_journal(thruster, tmp_path):
     for arguments in (("--method", "none"), ("--objective", "none"), ("--filter", "none")):
         assert thruster("tune", "--filter", "ekf", *arguments).returncode == 2
     assert not list(tmp_path.rglob("*.journal"))
 
 
-def test_a_preset_beyond_its_range_is_warned_about(thruster):  # noqa: F811
+def test_a_preset_beyond_its_range_is_warned_about(thruster):
     done = thruster("inspect", "--preset", "t200", "--voltage", 20, "--out", "x.png")
     assert done.returncode == 0 and "t200 is valid up to 13.3 V, but is driven by 20 V" in done.stderr
     assert "warning" not in thruster("inspect", "--preset", "t200", "--voltage", 13, "--out", "x.png").stderr

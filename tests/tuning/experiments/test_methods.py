@@ -9,7 +9,6 @@ import pytest
 from scipy.stats import ttest_1samp, ttest_rel
 
 from docs.scripts import DOCS
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.experiments import methods_runs as runs
 from tuning.experiments.methods_problems import (
     CASES,
@@ -141,7 +140,7 @@ def test_a_ring_is_tuned_by_its_inflation_alone():
     assert run_method(case, "likelihood", 0, FAST).last is None
 
 
-def test_the_command_prints_its_tables_and_the_pages_have_them(as_json, thruster, tmp_path):  # noqa: F811
+def test_the_command_prints_its_tables_and_the_pages_have_them(as_json, thruster, tmp_path):
     told = as_json("reproduce", "methods", "--quick", "--method", "likelihood", "--method", "start")
     assert (tmp_path / told["files"][0]).read_bytes().startswith(b"\x89PNG")
     pages = "".join((DOCS / name).read_text(encoding="utf-8") for name in ("methods.md", "appendix/methods.md"))

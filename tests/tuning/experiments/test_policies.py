@@ -1,5 +1,4 @@
 """`thruster reproduce policies`: its statistics, its plan, its runs and what it writes."""
-# ruff: noqa: F811 - fixtures come by import and go by name
 
 import json
 from itertools import pairwise
@@ -9,7 +8,6 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.experiments import policies as runs
 from tuning.experiments.policies import (
     BEST,

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.core.streams import episode_keys
 from thruster_env.model.simulate import simulate
 from tuning.experiments.recordings import (
@@ -173,14 +172,14 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_command_compares_with_the_recorders_own_estimate(as_json, folder, tmp_path):  # noqa: F811
+def test_the_command_compares_with_the_recorders_own_estimate(as_json, folder, tmp_path):
     found = as_json("reproduce", "recordings", "--data", folder)
     assert [row["run"] for row in found["ratios"]] == ["CLLookupStep", "Ramp", "mean"]
     assert {OURS, OWN, STATIC_MAP, LOOKUP} <= set(found["estimators"][0])
     assert float(found["clocks"][1]["offset, s"]) == pytest.approx(OFFSET, abs=1e-2)
 
 
-def test_a_folder_without_recordings_is_refused(thruster, tmp_path):  # noqa: F811
+def test_a_folder_without_recordings_is_refused(thruster, tmp_path):
     refused = thruster("reproduce", "recordings", "--data", tmp_path)
     assert refused.returncode == 2 and "recordings must be .csv files in" in refused.stderr
     (tmp_path / "x.csv").write_text("t_s,u_cmd_V\n0,1\n1,2\n", encoding="utf-8")

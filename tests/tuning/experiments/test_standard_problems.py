@@ -12,7 +12,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from filters import EstimateState, make_filter, run
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.experiments import benchmark, lorenz63, lorenz96, pendulum, range_bearing
@@ -189,7 +188,7 @@ def small(why=""):
 
 @pytest.mark.usefixtures("as_python")
 class TestReproduce:
-    def test_the_command_shows_published_scores_and_why_ours_differ(self, thruster, monkeypatch):  # noqa: F811
+    def test_the_command_shows_published_scores_and_why_ours_differ(self, thruster, monkeypatch):
         monkeypatch.setattr("tuning.experiments.benchmark.find_benchmark", lambda name: small("unlike"))
         done = thruster("reproduce", "lorenz63", "--runs", 2, "--json", "-")
         assert done.returncode == 0, done.stderr
@@ -219,7 +218,7 @@ class TestReproduce:
             (("lorenz84",), "No such command 'lorenz84'"),
         ],
     )
-    def test_a_wrong_argument_is_one_line(self, thruster, arguments, rule):  # noqa: F811
+    def test_a_wrong_argument_is_one_line(self, thruster, arguments, rule):
         done = thruster("reproduce", *arguments)
         assert done.returncode == 2 and rule in done.stderr and not done.stdout
 
@@ -271,7 +270,7 @@ def test_a_study_tunes_inflation_and_nothing_else():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_the_pendulum_goes_from_a_file_to_a_filter_around_the_env(tmp_path, thruster):  # noqa: F811
+def test_the_pendulum_goes_from_a_file_to_a_filter_around_the_env(tmp_path, thruster):
     plan = Plan("ekf", (checked_problem(find_problem("tuning.experiments.pendulum:problem")),))
     result = run_study(open_study("pendulum", plan, optuna.storages.InMemoryStorage()), plan, 4)
     path, comparison = tmp_path / "pendulum.json", evaluate_held_out(result.choice, plan.scenarios[0], 0, 4)

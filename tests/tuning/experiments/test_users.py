@@ -8,7 +8,6 @@ from scipy.stats import kstest, norm
 
 from filters.consistency.nees import Interval
 from tests.linear_problem import LinearProblem
-from tests.tuning.cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tuning.evaluation.evaluate import score, score_ratio
 from tuning.experiments import users
 from tuning.experiments.users import Case, Paired, Panel, chance_if_no_worse, found_problems, holm, run_panel
@@ -111,7 +110,7 @@ def test_an_error_is_kept_and_the_others_go_on(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_quick_study_goes_on_where_it_was(as_json, thruster, tmp_path, monkeypatch):  # noqa: F811
+def test_the_quick_study_goes_on_where_it_was(as_json, thruster, tmp_path, monkeypatch):
     arguments = "reproduce", "users", "--quick", "--trials", "3", "--out", str(tmp_path)
     first = as_json(*arguments)
     assert [one["problem"] for one in first["cases"]] == ["altitude", "battery"]

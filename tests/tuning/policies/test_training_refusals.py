@@ -11,7 +11,6 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from tests.learners import SMALL, contents, copied, learn, setup_of, short_episodes, trained  # noqa: F401 - some are fixtures
-from tests.tuning.cli.test_cli import thruster  # noqa: F401 - a fixture
 from tuning.plants.thruster import find_scenario
 from tuning.policies.algorithms import check_installed
 from tuning.policies.environments import make_environments
