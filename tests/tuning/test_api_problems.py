@@ -11,10 +11,8 @@ import thruster_env  # noqa: F401 - registers the env
 import tuning
 from filters import EstimateState
 from tests.pendulum_problem import problem as pendulum
-from tests.slow import slow_but
 from tests.small_problems import pair
 from thruster_env.logs.log import Log
-from thruster_env.logs.read import read_log
 from thruster_env.logs.write import write_log
 from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
@@ -27,13 +25,12 @@ from tuning.problems.log_problem import LogProblem
 
 def cart(dt=0.1):
     return affine_model(
-        a=[[1.0, dt], [0.0, 0.9]],
-        b=[[0.0], [dt]],
-        c=[[1.0, 0.0]],
-        process_noise_cov=[1e-4, 1e-3],
-        measurement_noise_cov=[1e-2],
-        prior_mean=[0.0, 0.0],
-        prior_cov=[1.0, 1.0],
+        A=[[1.0, dt], [0.0, 0.9]],
+        B=[[0.0], [dt]],
+        C=[[1.0, 0.0]],
+        Q=[1e-4, 1e-3],
+        R=[1e-2],
+        P0=[1.0, 1.0],
         states=[("place", "p", "m"), ("speed", "v", "m/s")],
         input_quantities=[("push", "F", "N")],
         measurements=[("tape", "z", "m")],
@@ -146,25 +143,6 @@ def test_two_logs_of_one_name_are_told_apart(logs):
         problem_of((cart(), [logs[0], logs[1].named("log 0")]))
     with pytest.raises(ValueError, match="dt must come with a file or a table, but log 0 is a Log already"):
         problem_of(tuning.read_logs(logs, model=cart(), dt=0.2))
-
-
-def test_a_table_is_read_as_a_file_is(logs, tmp_path):
-    write_log(tmp_path / "run.csv", logs[0])
-    found = read_log(table_of(logs[0]), cart(), name="mine")
-    assert found.name == "mine" and found.digest == read_log(tmp_path / "run.csv", cart()).digest
-
-
-@pytest.mark.parametrize("name", slow_but(["nominal", "published_tunnel", "auv:motion"], ["nominal"]))
-def test_an_env_of_a_scenario_makes_its_data(name):
-    problem = find_problem(name)
-    env, data = problem.make_env(), problem.data([3])
-    assert env.spec.max_episode_steps == problem.steps
-    _, info = env.reset(seed=3)
-    for k in range(20):
-        there = np.isfinite(data.measurements[0, k])  # of several sensors some are slower
-        assert there.any()
-        np.testing.assert_allclose(info["measurement"][there], data.measurements[0, k][there], rtol=1e-12)
-        info = env.step(data.inputs[0, k, : env.action_space.shape[0]])[4]
 
 
 @pytest.mark.parametrize("noise", [None, (0.01, 0.02, 0.25)], ids=["exact", "noisy"])

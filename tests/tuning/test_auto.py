@@ -3,6 +3,7 @@
 import json
 import math
 import warnings
+from functools import cache
 
 import numpy as np
 import optuna
@@ -62,7 +63,9 @@ def priced(monkeypatch):
     )
 
 
+@cache
 def studied(plan, count):
+    """A study, run once for all tests: the first trials of a longer one are those of a shorter one."""
     return run_study(open_study("s", plan, optuna.storages.InMemoryStorage()), plan, count)
 
 
@@ -88,7 +91,7 @@ def test_a_choice_of_any_kind_survives_its_trial_parameters(kind):
 
 
 def test_numbers_of_a_kind_are_chosen_for_that_kind_alone_and_noise_for_all(priced):
-    result = studied(PLAN, 30)
+    result = studied(PLAN, 40)
     for trial in result.trials:
         kind = trial.params[FILTER_TYPE]
         own = {key for key in trial.params if " " in key}
@@ -97,7 +100,7 @@ def test_numbers_of_a_kind_are_chosen_for_that_kind_alone_and_noise_for_all(pric
 
 
 def test_each_kind_is_tried_with_the_noise_that_true_states_show(priced):
-    trials = studied(PLAN._replace(prune=False), 16).trials
+    trials = studied(PLAN._replace(prune=False), 26).trials[:16]
     assert [trial.user_attrs.get(UNTUNED) for trial in trials[:2]] == ["ekf", None]
     assert choice_of("auto", trials[0].params, MISMATCH) == untuned_choice("ekf", MISMATCH)
     in_race = set(race_of(PLAN, trials).running)
@@ -155,9 +158,9 @@ def test_what_is_over_the_budget_ends_at_once_and_never_wins(priced):
 
 
 def test_a_filter_over_the_budget_is_tried_with_fewer_members(priced):
-    result = studied(PLAN, 12)
-    untuned = next(trial for trial in result.trials if trial.params[FILTER_TYPE] == "enkf")
-    (smaller,) = [trial for trial in result.trials if SMALLER in trial.user_attrs]  # none for pf: 200 are too many
+    trials = studied(PLAN, 40).trials[:12]
+    untuned = next(trial for trial in trials if trial.params[FILTER_TYPE] == "enkf")
+    (smaller,) = [trial for trial in trials if SMALLER in trial.user_attrs]  # none for pf: 200 are too many
     assert smaller.user_attrs[SMALLER] == untuned.number and smaller.params["enkf N"] == 18
     assert {**smaller.params, "enkf N": 30} == untuned.params and not is_over_budget(smaller)
 
@@ -193,13 +196,12 @@ def test_without_a_budget_a_front_of_error_against_cost_tells_the_kinds(priced):
 
 
 def test_the_same_seed_gives_the_same_study_and_one_that_goes_on_the_same_race(priced):
-    first, second = ([trial.params for trial in studied(PLAN, 14).trials] for _ in range(2))
-    assert first == second
+    first = studied(PLAN, 40).trials[:14]
+    assert [trial.params for trial in first] == [trial.params for trial in studied(PLAN, 14).trials]
     storage = optuna.storages.InMemoryStorage()
     run_study(open_study("s", PLAN, storage), PLAN, 9)
     parts = run_study(open_study("s", PLAN, storage), PLAN, 14).trials
-    whole = [trial.params[FILTER_TYPE] for trial in studied(PLAN, 14).trials]
-    assert [trial.params[FILTER_TYPE] for trial in parts] == whole
+    assert [trial.params[FILTER_TYPE] for trial in parts] == [trial.params[FILTER_TYPE] for trial in first]
 
 
 def finished(number, name, values, state=TrialState.COMPLETE):

@@ -4,17 +4,24 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import tuning
+from filters import make_filter
+from filters.consistency.nees import blow_up_sentence, root_mean_square
+from filters.consistency.report import sentences
 from tests import pendulum_problem
 from tests.models import wide_model
 from tests.small_problems import pair, thruster
+from thruster_env.model.affine import affine_model
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.tune import run_tuning
+from tuning.evaluation.evaluate import check_consistency
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
 from tuning.problems.excitation import Steps
 from tuning.problems.find import find_problem
-from tuning.problems.model_problem import ModelProblem
+from tuning.problems.model_problem import ModelProblem, RunsProblem
 from tuning.problems.problem import Parameter
+from tuning.reporting.tuning_report import as_json, report
 from tuning.search.plan import Plan
 
 pytestmark = pytest.mark.usefixtures("as_python")
@@ -169,3 +176,44 @@ def test_what_is_wrong_with_held_out_data_is_said_before_the_search(tmp_path, mo
     with pytest.raises(ValueError, match="inputs of problem .* must be finite"):
         run_tuning(Plan("ekf", (pair(inputs=inputs),)), 2, Console(quiet=True), str(journal))
     assert not journal.exists()
+
+
+def model(factor, r=1e9):
+    return affine_model(
+        A=[[factor]], B=[[1.0]], C=[[1.0]], Q=[1e-2], R=[r], P0=[1.0], measurements=[("log speed", "z", "m/s")]
+    )
+
+
+def problem(factor):
+    rng, runs = np.random.default_rng(0), []
+    for _ in range(9):
+        u, x = np.sign(rng.normal(size=80)), np.zeros(81)
+        for k in range(80):
+            x[k + 1] = 0.9 * x[k] + u[k]
+        runs.append((u, x[:, None] + 0.1 * rng.normal(size=(81, 1))))
+    return RunsProblem(runs, model(factor), dt=0.1, first_scored_step=5)
+
+
+def test_a_study_of_a_model_that_blows_up_names_substeps_and_dt_and_not_more_trials():
+    study = tuning.tune(problem(-3e4), "kf", trials=3, progress=False, consistent=False)
+    said = " ".join(one for one in report(study) if isinstance(one, str))
+    assert "diverges between samples" in said and "more substeps" in said and "dt = 0.1 s" in said
+    assert "More trials" not in said and "What may help" not in said
+    assert as_json(study)["blows_up"][0].startswith("The model diverges between samples: its prediction of")
+
+
+@pytest.mark.parametrize("factor", [-3e4, 0.9])
+def test_the_advice_of_the_page_is_substeps_where_it_blows_up_and_noise_elsewhere(factor):
+    mine = problem(factor)
+    data = mine.data(range(9))
+    said = sentences(check_consistency(make_filter("kf", model(factor, 1e-4)), data, mine.dt))[-1]
+    assert ("more substeps" in said and "dt = 0.1 s" in said and "raise" not in said) == (factor < 0)
+    assert ("raise R" in said or "raise Q" in said) == (factor > 0)
+
+
+def test_a_prediction_a_thousand_spreads_off_is_a_blow_up_and_numbers_beyond_all_too():
+    z = np.array([[1.0], [-1.0], [np.nan]])
+    for off, told in ((999.0, False), (1001.0, True), (1e300, True), (np.inf, True)):
+        assert bool(blow_up_sentence(np.array([[off], [off], [np.nan]]), z, ["speed"])) == told
+    assert root_mean_square(np.array([3e200, 4e200, np.nan])) == pytest.approx(12.5**0.5 * 1e200)
+    assert blow_up_sentence(np.full((3, 1), np.nan), z, ["speed"], 0.1) == ""

@@ -136,15 +136,7 @@ def singular(first_scored_step=0, runs=6, steps=60):
     """Runs of a position and a velocity that one noise drives, without true states."""
     rng, drive = np.random.default_rng(0), np.array([0.005, 0.1])
     a, c = np.array([[1.0, 0.1], [0.0, 0.95]]), np.array([[1.0, 0.0]])
-    model = affine_model(
-        a=a,
-        b=np.zeros((2, 0)),
-        c=c,
-        process_noise_cov=np.outer(drive, drive),
-        measurement_noise_cov=[0.04],
-        prior_mean=[0.0, 0.0],
-        prior_cov=[0.5, 0.5],
-    )
+    model = affine_model(A=a, C=c, Q=np.outer(drive, drive), R=[0.04], P0=[0.5, 0.5])
     found = []
     for _ in range(runs):
         x, rows = rng.normal(size=2), []
@@ -204,15 +196,7 @@ def test_an_answer_is_no_worse_than_the_numbers_of_the_model(as_python, monkeypa
 @pytest.mark.parametrize(("method", "options"), [("em", {}), ("em", {"full_r": True}), ("squarem", {})])
 def test_em_leaves_the_variance_of_a_channel_that_is_never_measured(as_python, method, options):
     rng = np.random.default_rng(0)
-    model = affine_model(
-        a=[[0.9]],
-        b=np.zeros((1, 0)),
-        c=[[1.0], [1.0]],
-        process_noise_cov=[0.01],
-        measurement_noise_cov=[0.04, 0.09],
-        prior_mean=[0.0],
-        prior_cov=[0.1],
-    )
+    model = affine_model(A=[[0.9]], C=[[1.0], [1.0]], Q=[0.01], R=[0.04, 0.09], P0=[0.1])
     runs = [{"measurements": np.column_stack([rng.normal(size=20), np.full(20, np.nan)])} for _ in range(4)]
     problem = RunsProblem(runs, model, held_out=[2, 3], name="half of it")
     task = Task("kf", problem, problem.data([0, 1]), options={"prior": False, **options}, budget=Budget(runs=400))

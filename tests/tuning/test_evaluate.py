@@ -1,20 +1,24 @@
+import math
 import pickle
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
-from filters import affine_model, make_filter, thruster_model
+from filters import affine_model, make_filter, run, thruster_model
 from filters.bounds import posterior_bound, riccati_covariances
 from filters.consistency.nees import normalized_squares
+from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from thruster_env.model import simulate
 from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
 from tuning.evaluation.held_out import summary
-from tuning.evaluation.runs import _means_over_steps
+from tuning.evaluation.runs import _means_over_steps, log_scores_of
 from tuning.plants.thruster import find_scenario
 from tuning.problems import data as in_parts
 from tuning.problems.data import held_out_seeds
-from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
+from tuning.search.plan import LARGEST
+from tuning.search.space import oracle_choice, untuned_choice
 
 
 @pytest.fixture(scope="module")
@@ -35,18 +39,6 @@ def ekf(nominal, data):
 @pytest.fixture(scope="module")
 def untuned_ekf(nominal, data):
     return evaluate(untuned_choice("ekf", nominal).filter(nominal), data, nominal.scale)
-
-
-def test_rmse_is_pooled_over_runs_and_steps_from_50_on(nominal, data, ekf):
-    from filters import run
-
-    estimates = run(
-        oracle_choice("ekf", nominal).filter(nominal), data.filter_keys, data.inputs, data.measurements
-    )
-    errors = (estimates.means - data.states)[:, 50:]
-    np.testing.assert_allclose([r.value for r in ekf.rmse], np.sqrt((errors**2).mean((0, 1))), rtol=1e-12)
-    expected = np.mean([r.value / s for r, s in zip(ekf.rmse, nominal.scale, strict=True)])
-    assert ekf.score.value == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", ["ekf", "enkf"])
@@ -90,13 +82,6 @@ def test_rmse_of_thrust_is_that_of_the_model_s_thrust_at_the_estimate(nominal, d
     assert ekf.output_rmse["T"].low < ekf.output_rmse["T"].value < ekf.output_rmse["T"].high
 
 
-def test_steps_without_a_measurement_do_not_lower_the_mean_nis(nominal, data):
-    lost = np.random.default_rng(0).random(data.measurements.shape) < 0.3
-    gappy = data._replace(measurements=np.where(lost, np.nan, data.measurements))
-    evaluation = evaluate(oracle_choice("ekf", nominal).filter(nominal), gappy, nominal.scale)
-    assert evaluation.nis.low < 1.0 < evaluation.nis.high
-
-
 def test_a_filter_without_covariance_is_judged_by_its_errors_only(nominal, data):
     few = data.slice(0, 3)
     with interpreted():
@@ -105,12 +90,6 @@ def test_a_filter_without_covariance_is_judged_by_its_errors_only(nominal, data)
     assert np.isfinite(evaluation.rmse).all() and np.isfinite(evaluation.output_rmse["T"]).all()
     said = summary(evaluation)
     assert said["nees"] is said["nis"] is said["log_likelihood"] is None
-
-
-def test_a_choice_survives_its_trial_parameters(nominal):
-    choice = untuned_choice("enkf", nominal).with_size(17)
-    again = choice_of("enkf", parameters_of(choice), nominal)
-    assert again == choice
 
 
 def test_bad_scales_and_unequal_seeds_are_refused(nominal, data, ekf):
@@ -216,3 +195,72 @@ def test_many_states_are_whitened_as_few_are():
 def test_means_over_steps_are_numpys_to_the_last_bit(shape):
     values = np.random.default_rng(0).lognormal(sigma=3.0, size=shape)
     assert np.array_equal(_means_over_steps(values), values.mean(axis=1))
+
+
+PROBLEM = LinearProblem()
+
+
+DATA = PROBLEM.data(range(3))
+
+
+FILTER = make_filter("kf", PROBLEM.model())
+
+
+with interpreted():  # each worker of pytest imports this file
+    ESTIMATES = run(FILTER, DATA.filter_keys, DATA.inputs, DATA.measurements)
+
+
+def scores(scale, covs=ESTIMATES.covs, data=DATA):
+    steps = log_scores_of(FILTER, ESTIMATES._replace(covs=covs), data, scale)
+    assert steps.shape == (3, 61)
+    return np.nanmean(steps, axis=1)
+
+
+def by_hand(places, counted=None):
+    found = []
+    for b in range(3):
+        steps = [k for k in range(DATA.first_scored, 71) if counted is None or counted[b, k]]
+        found.append(
+            np.mean(
+                [
+                    multivariate_normal(
+                        ESTIMATES.means[b, k, places], ESTIMATES.covs[b, k][np.ix_(places, places)]
+                    ).logpdf(DATA.states[b, k, places])
+                    for k in steps
+                ]
+            )
+        )
+    return found
+
+
+@pytest.mark.parametrize(
+    ("scale", "places"),
+    [((0.3, 0.3, 0.3), [0, 1, 2]), ((0.3, math.inf, 0.1), [0, 2]), ((math.inf, 1.0, math.inf), [1])],
+)
+def test_the_log_score_is_the_density_of_the_states_that_count(scale, places):
+    np.testing.assert_allclose(scores(scale), by_hand(places), rtol=1e-9)
+
+
+def test_a_state_that_does_not_count_and_is_known_to_the_last_digit_earns_nothing():
+    sure = ESTIMATES.covs.copy()
+    sure[..., 1, :] = sure[..., :, 1] = 0.0
+    sure[..., 1, 1] = 1e-300
+    scale = (0.3, math.inf, 0.3)
+    np.testing.assert_allclose(scores(scale, sure), by_hand([0, 2]), rtol=1e-9)
+
+
+def test_a_singular_covariance_has_the_least_score_and_is_not_left_out():
+    singular = ESTIMATES.covs.copy()
+    singular[1, 40:, 1, :] = singular[1, 40:, :, 1] = 0.0
+    singular[2] = np.nan
+    first, some, none = scores(PROBLEM.scale, singular)
+    assert first == pytest.approx(by_hand([0, 1, 2])[0]) and none == -LARGEST
+    assert some == pytest.approx(-LARGEST * 31 / 61, rel=1e-3)
+
+
+def test_only_scored_steps_count_and_without_truth_there_is_no_score():
+    counted = np.ones((3, 71), dtype=bool)
+    counted[0, 30:] = counted[2, ::2] = False
+    found = scores(PROBLEM.scale, data=DATA._replace(counted=counted))
+    np.testing.assert_allclose(found, by_hand([0, 1, 2], counted), rtol=1e-9)
+    assert np.isnan(log_scores_of(FILTER, ESTIMATES, DATA._replace(states=None), None)).all()

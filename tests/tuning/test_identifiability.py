@@ -36,13 +36,12 @@ def likelihood_of(c, seed=0, count=24, steps=100):
     def model(logarithms):
         q11, q22, r = np.exp(logarithms)
         return affine_model(
-            a=[[0.9, 0.0], [0.0, 0.6]],
-            b=[[0.5], [1.0]],
-            c=c,
-            process_noise_cov=[[q11, 0.0], [0.0, q22]],
-            measurement_noise_cov=r * np.eye(len(c)),
-            prior_mean=[0.0, 0.0],
-            prior_cov=[1.0, 1.0],
+            A=[[0.9, 0.0], [0.0, 0.6]],
+            B=[[0.5], [1.0]],
+            C=c,
+            Q=[[q11, 0.0], [0.0, q22]],
+            R=r * np.eye(len(c)),
+            P0=[1.0, 1.0],
         )
 
     keys = episode_keys(range(seed, seed + count))

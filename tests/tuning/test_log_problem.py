@@ -4,6 +4,7 @@ import json
 import pickle
 
 import numpy as np
+import optuna
 import pytest
 
 from filters import run
@@ -19,6 +20,7 @@ from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.experiments.benchmark import run_in_memory
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import identify
+from tuning.plants.thruster import find_scenario
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem
 from tuning.problems.log_parts import LEAD, parts_of
@@ -31,15 +33,7 @@ from tuning.search.study import open_study, run_study
 from tuning.search.workers import orders_of, plan_of
 
 Q, R = 0.04, 0.25
-MODEL = affine_model(
-    a=[[0.9]],
-    b=[[0.5]],
-    c=[[1.0]],
-    process_noise_cov=[Q],
-    measurement_noise_cov=[R],
-    prior_mean=[0.0],
-    prior_cov=[0.0],
-)
+MODEL = affine_model(A=[[0.9]], B=[[0.5]], C=[[1.0]], Q=[Q], R=[R], P0=[0.0])
 GUESS = MODEL.replace(process_noise_cov=[1.0])
 
 
@@ -213,3 +207,62 @@ def test_a_study_that_never_saw_the_truth_comes_close_to_one_that_did():
     data = problem.data(problem.held_out_seeds(0, 24))
     by_seen, by_blind = (evaluate(choice.filter(problem), data, problem.scale) for choice in (seen, blind))
     assert score_ratio(by_blind, by_seen).value < 1.02 and seen != blind
+
+
+PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
+
+
+def storage_with_one_trial():
+    storage = optuna.storages.InMemoryStorage()
+    study = open_study("s", PLAN, storage)
+    study.tell(propose(study)[0], 1.0)
+    return storage
+
+
+def propose(study):
+    trial = study.ask(PLAN.space())
+    return trial, tuple(trial.params.values())
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "random", "nsga-ii"])
+def test_two_that_join_at_the_same_number_of_trials_never_propose_alike(sampler):
+    plan, storage = PLAN._replace(sampler=sampler), optuna.storages.InMemoryStorage()
+    both = [open_study("s", plan, storage)]
+    both[0].tell(propose(both[0])[0], 1.0)  # the untuned filter, which is queued
+    both = [open_study("s", plan, storage) for _ in range(2)]
+    proposed = []
+    for study in [*both, *both[::-1], *both]:
+        trial, point = propose(study)
+        proposed.append(point)
+        study.tell(trial, 1.0)
+    assert len(set(proposed)) == len(proposed)
+
+
+def test_so_do_two_that_begin_a_study_at_once(monkeypatch):
+    storage = optuna.storages.InMemoryStorage()
+    get_trials = optuna.Study.get_trials
+    with monkeypatch.context() as patch:  # neither sees what the other has queued
+        patch.setattr(optuna.Study, "get_trials", lambda *args, **kwargs: [])
+        both = [open_study("s", PLAN, storage) for _ in range(2)]
+    assert optuna.Study.get_trials is get_trials
+    queued = [propose(study)[1] for study in both]
+    assert queued[0] == queued[1]  # the untuned filter, which does no harm
+    points = [propose(study)[1] for study in both + both]
+    assert len(set(points)) == len(points)
+
+
+def test_a_single_process_proposes_the_same_again():
+    def points(storage):
+        study = open_study("s", PLAN, storage)
+        study.enqueue_trial({"Q11": 1.0})  # as a study does after good trials
+        found = []
+        for _ in range(5):
+            trial, point = propose(study)
+            found.append(point)
+            study.tell(trial, 1.0)
+        return found
+
+    first = points(optuna.storages.InMemoryStorage())
+    assert first == points(optuna.storages.InMemoryStorage()) and len(set(first)) == 5
+    resumed = points(storage_with_one_trial())
+    assert resumed == points(storage_with_one_trial()) and not set(resumed[1:]) & set(first)

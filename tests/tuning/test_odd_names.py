@@ -29,13 +29,12 @@ ODD = [
 
 def model(name, unit="N"):
     return affine_model(
-        a=[[0.9]],
-        b=[[0.5]],
-        c=[[1.0]],
-        process_noise_cov=[0.01],
-        measurement_noise_cov=[0.04],
-        prior_mean=[0.0],
-        prior_cov=[1.0],
+        A=[[0.9]],
+        B=[[0.5]],
+        C=[[1.0]],
+        Q=[0.01],
+        R=[0.04],
+        P0=[1.0],
         states=[(name, "x", unit)],
         input_quantities=[(name, "u", unit)],
         measurements=[(f"{name} read", "z", unit)],

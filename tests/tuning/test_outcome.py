@@ -3,9 +3,7 @@
 import optuna
 import pytest
 
-from filters.consistency.nees import Interval
 from tuning.evaluation.baselines import SCALED
-from tuning.evaluation.sizes import SizeRow, sufficient_size
 from tuning.plants.thruster import find_scenario
 from tuning.search.among_types import BASELINE
 from tuning.search.plan import Plan
@@ -33,13 +31,6 @@ def trial(value, outside=None):
 def test_the_best_trial_has_the_least_error_of_the_consistent_ones_else_of_all(trials, best):
     assert best_trial([trial(*each) for each in trials]).value == best
     assert best_trial([]) is None
-
-
-def test_a_smaller_ensemble_of_a_consistent_trial_is_consistent_too():
-    found = (5, 1.0, 0.2), (10, 1.3, -0.1), (20, 1.0, -0.1)
-    rows = [SizeRow(n, None, Interval(ratio, ratio, ratio), outside) for n, ratio, outside in found]
-    assert sufficient_size(rows) == 5 and sufficient_size(rows, consistent=True) == 20
-    assert sufficient_size(rows[:1], consistent=True) == 5
 
 
 def test_a_study_names_its_best_trial_to_programs_that_know_no_constraints(tmp_path):

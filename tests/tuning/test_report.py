@@ -1,22 +1,27 @@
 """The report of a tuning: one page that needs nothing else, and its tables."""
 
+import json
 import logging
-import sys
+import re
+from html import unescape
 from html.parser import HTMLParser
+from math import nan
 
 import numpy as np
 import optuna
 import pytest
 
-from filters.consistency.nees import Interval
+from filters.consistency.nees import Interval, span
+from thruster_env.core.files import BLUE, MOST_POINTS, RUST, panels, thinned
+from thruster_env.core.text_tables import typeset
 from tuning.api.report import report as write_report
-from tuning.cli.main import main
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.plants.thruster import find_scenario
-from tuning.reporting.page import Code, Picture, Section, Table, Words, html_page, markdown_page
+from tuning.reporting.page import Code, Picture, Section, Table, Words, figure_svg, html_page, markdown_page
 from tuning.reporting.search_figures import FEWEST_TRIALS, counted_trials, early_trials, importances
 from tuning.reporting.sections import advice
+from tuning.reporting.tables import about, limit_cell, unless_blank
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.storage import open_storage
@@ -210,13 +215,102 @@ def test_what_is_said_is_escaped():
         (("foreign", "--storage", STORAGE), "a report needs the plan of the study, but study 'foreign' has None"),
     ],
 )
-def test_a_mistake_is_one_clear_line(arguments, line, folder, monkeypatch, capsys):
+def test_a_mistake_is_one_clear_line(arguments, line, folder, thruster):
     (folder / "text.txt").write_text("hello\n")
     open_study("empty", Plan("ekf", (MISMATCH,)), open_storage(STORAGE))
     optuna.create_study(study_name="foreign", storage=open_storage(STORAGE))
     before = {path.name for path in folder.iterdir()}
-    monkeypatch.setattr(sys, "argv", ["thruster", "report", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 2 and line in capsys.readouterr().err
+    done = thruster("report", *arguments)
+    assert done.returncode == 2 and line in done.stderr
     assert {path.name for path in folder.iterdir()} == before
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    figure, (left, right) = panels(2, 2, (3.0, 2.0))
+    x = np.linspace(0.0, 5.0, 40)
+    left.plot(x, 2.0 * x - 3.0, color=BLUE, label="a line")
+    left.plot([0.0, 5.0], [1.0, 1.0], color=RUST, label="two points")
+    left.set(xlabel="time [s]", ylabel="speed $\\omega_m$ [rad/s]", xlim=(0.0, 5.0), ylim=(-4.0, 8.0))
+    right.plot(x, np.exp(x))
+    right.set(yscale="log", ylabel="$U_a$ [m/s]")
+    return figure_svg(figure, "q7")
+
+
+def test_text_is_text_and_colours_are_those_of_the_page(drawn):
+    svg, _ = drawn
+    assert ">time [s]</text>" in svg and "<metadata" not in svg and "http" not in svg
+    assert not re.search(r"#[0-9a-fA-F]{6}\b", svg) and "var(--c-0b6fa4)" in svg and "var(--c-b5541c)" in svg
+    ids = re.findall(r'\bid="([^"]*)"', svg)
+    assert all(one.startswith("q7-") for one in ids) and len(ids) == len(set(ids))
+    assert set(re.findall(r'href="#([^"]*)"|url\(#([^)]*)\)', svg)) <= {(one, "") for one in ids} | {
+        ("", one) for one in ids
+    }
+
+
+def test_values_are_read_off_where_they_are_drawn(drawn):
+    svg, readings = drawn
+    left, right = json.loads(unescape(readings))
+    assert [label for _, label in left["lines"]] == ["a line"] and left["label"] == "time [s]"
+    assert right["log"] == [False, True] and right["lines"][0][1] == "U_a [m/s]"
+    group = svg[svg.index(f'id="{left["lines"][0][0]}"') :]
+    path = re.search(r' d="([^"]*)"', group)[1]
+    points = np.array(re.findall(r"(-?[\d.]+) (-?[\d.]+)", path), float)
+    (x0, top, x1, bottom), (low, high) = left["box"], left["y"]
+    times = left["x"][0] + (points[:, 0] - x0) / (x1 - x0) * np.diff(left["x"])
+    values = low + (bottom - points[:, 1]) / (bottom - top) * (high - low)
+    np.testing.assert_allclose([times[0], times[-1]], [0.0, 5.0], atol=0.01)
+    np.testing.assert_allclose(values, 2.0 * times - 3.0, atol=0.05)
+
+
+def test_a_thinned_line_keeps_its_extremes_and_its_ends():
+    x = np.arange(20_000.0)
+    y = np.sin(x / 700)
+    y[[4321, 17_000]] = 9.0, -9.0
+    y[5000:5040] = np.nan
+    times, values = thinned(x, y)
+    assert len(times) <= MOST_POINTS and (np.diff(times) > 0).all()
+    assert np.nanmax(values) == 9.0 and np.nanmin(values) == -9.0 and times[np.nanargmax(values)] == 4321
+    _, above = thinned(x, y, np.fmax)
+    assert np.nanmax(above) == 9.0 and len(above) == MOST_POINTS // 2
+    short = x[:100], y[:100]
+    assert all(np.array_equal(one, other) for one, other in zip(thinned(*short), short, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("unit", "page"), [("m^3/s", "m³/s"), ("(m/s)^2", "(m/s)²"), ("1/s", "1/s"), ("s^-1", "s⁻¹"), ("m", "m")]
+)
+def test_units_are_typeset_in_words_and_tables(unit, page):
+    assert typeset(unit) == page
+    assert (
+        page in Words([f"It is 1 {unit}."]).html() and page in Table("", ["", f"q [{unit}]"], [["a", "1"]]).html()
+    )
+
+
+def test_a_number_that_rounds_to_zero_has_no_minus():
+    cells = [
+        unless_blank(value, form) for value, form in ((-0.3, "+.0f"), (-0.004, ".2f"), (-1.2, "+.0f"), (nan, ""))
+    ]
+    assert cells == ["0", "0.00", "-1", ""]
+
+
+def test_small_errors_on_a_terminal_have_powers_of_ten():
+    value = Interval(8.59e-6, 8.37e-6, 8.81e-6)
+    assert about(value, 8) == "8.59e-06 ±2e-07" and limit_cell(7.5e-6, 8) == "7.50e-06"
+    assert about(value._replace(value=0.1, low=0.09, high=0.11), 4) == "0.1000 ±0.0100"
+    assert about(value._replace(value=float("nan")), 8) == limit_cell(float("nan"), 8) == ""
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ((26.0, 25.0, 27.0), "26 % [25, 27]"),
+        ((26.0, 25.86, 26.14), "26.0 % [25.9, 26.1]"),
+        ((26.0, 25.99, 26.01), "26.00 % [25.99, 26.01]"),
+        ((26.0, 26.0, 26.0), "26 %"),
+        ((26.0, 26.0 - 1e-6, 26.0 + 1e-6), "26 %"),
+        ((0.0, -0.2, 0.6), "0 % [0, 1]"),
+    ],
+)
+def test_the_ends_of_an_interval_differ_or_are_left_out(value, said):
+    assert span(Interval(*value), 0, " %") == said

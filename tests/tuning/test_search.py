@@ -1,6 +1,8 @@
 """What a study searches, minimises and keeps: objectives, consistency, pruning, samplers, several scenarios."""
 
 import importlib.util
+import pickle
+from functools import cache
 
 import numpy as np
 import optuna
@@ -18,13 +20,26 @@ from tuning.search.among_types import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFT
 from tuning.search.plan import LARGEST, NIS_BAND, Plan, nis_violation
 from tuning.search.space import choice_of, distributions, oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.search.trials import BLOCK, SAMPLERS, best_trial, box, enqueue_new, make_sampler, measure, violation
+from tuning.search.trials import (
+    BLOCK,
+    NEEDS,
+    SAMPLERS,
+    best_trial,
+    box,
+    enqueue_new,
+    make_sampler,
+    measure,
+    read_state,
+    violation,
+)
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))
 PLAN = Plan("ekf", (MISMATCH,))
 
 
+@cache
 def studied(plan, trials):
+    """A study, run once for all tests: the first trials of a longer one are those of a shorter one."""
     return run_study(open_study("s", plan, optuna.storages.InMemoryStorage()), plan, trials)
 
 
@@ -44,7 +59,7 @@ def test_the_winner_of_a_study_has_the_best_log_score_at_hardly_any_cost_in_erro
 
 
 def test_a_common_factor_on_q_and_r_is_what_makes_a_trial_consistent():
-    result = studied(PLAN, 3)
+    result = studied(PLAN, 40)
     untuned, rescaled = result.trials[:2]
     assert violation(untuned) > 0 and rescaled.user_attrs[RESCALED] == 1
     factors = {name: rescaled.params[name] / untuned.params[name] for name in ("Q11", "Q22", "R")}
@@ -93,7 +108,7 @@ def test_a_trial_ends_early_only_if_it_is_worse_on_the_same_seeds():
 
 
 def test_the_reported_values_are_the_scores_of_single_seeds():
-    result = studied(PLAN, 1)
+    result = studied(PLAN, 40)
     data = MISMATCH.data(range(32))
     for seed in (0, 9, 31):
         alone = data.slice(seed, seed + 1)
@@ -181,7 +196,7 @@ def test_a_trial_whose_nis_is_not_finite_is_inconsistent_and_has_no_twin(monkeyp
         return evaluation._replace(nis=evaluation.nis._replace(value=np.nan))
 
     monkeypatch.setattr(trials, "compute_metrics", lost)
-    result = studied(PLAN, 3)
+    result = studied.__wrapped__(PLAN, 3)
     assert len(result.trials) == 3 and all(violation(trial) == LARGEST for trial in result.trials)
     assert not any(RESCALED in trial.user_attrs for trial in result.trials)
 
@@ -233,3 +248,48 @@ def test_a_search_reaches_what_lies_outside_the_box_that_it_begins_in(sampler):
     lowest = np.minimum(1e-5, best / 10.0)
     assert (lowest <= values * (1 + 1e-9)).all() and (values <= 1e2).all()
     assert values.min() < 1e-5
+
+
+class Attack:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return open, (str(self.marker), "w")
+
+
+def test_a_trial_s_state_is_read_as_data_and_no_code_runs(tmp_path, monkeypatch):
+    monkeypatch.setitem(NEEDS, "cma-es", (None, None))  # the package is not there yet where this matters
+    marker = tmp_path / "marker"
+    state = {"cma:optimizer:0": pickle.dumps(Attack(marker)).hex()}
+    trial = optuna.trial.create_trial(value=1.0, system_attrs=state)
+    sampler = make_sampler("cma-es", 0, 0, {})
+    with pytest.raises(ValueError, match="must be that of an optimizer, but a trial's names .*open$"):
+        sampler._restore_optimizer([trial])
+    assert not marker.exists()
+    assert sampler._restore_optimizer([optuna.trial.create_trial(value=1.0)]) is None
+
+
+def test_arrays_are_read_and_what_is_damaged_is_one_clear_line():
+    arrays = {"mean": np.arange(3.0), "n": np.float64(2.5), "transposed": np.eye(2).T}
+    found = read_state(pickle.dumps(arrays).hex())
+    assert found["n"] == 2.5 and (found["mean"] == arrays["mean"]).all()
+    for text in ("", "80", pickle.dumps(arrays).hex()[:-20], "no digits"):
+        with pytest.raises(ValueError) as error:
+            read_state(text)
+        assert "\n" not in str(error.value)
+
+
+def test_a_study_goes_on_as_with_optuna_s_own():
+    pytest.importorskip("cmaes", reason="optional: an extra that tests do without")
+
+    def values(sampler):
+        study = optuna.create_study(sampler=sampler)
+        study.optimize(lambda t: t.suggest_float("x", -5, 5) ** 2 + t.suggest_float("y", -5, 5) ** 2, n_trials=30)
+        return [trial.value for trial in study.trials]
+
+    ours = make_sampler("cma-es", 0, 0, {})
+    seed = int(np.random.SeedSequence([0, 0, 0]).generate_state(1)[0])
+    assert values(ours) == values(optuna.samplers.CmaEsSampler(seed=seed))

@@ -8,8 +8,8 @@ from tuning.evaluation import sizes
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, left_out, sufficient_size
 from tuning.plants.thruster import find_scenario
-from tuning.problems.data import held_out_seeds, size_seeds, training_seeds
-from tuning.search.plan import HELD_OUT_SEEDS, SIZE_SEEDS, TRAINING_SEEDS, Plan
+from tuning.problems.data import size_seeds
+from tuning.search.plan import SIZE_SEEDS, Plan
 from tuning.search.space import untuned_choice
 
 MISMATCH = find_scenario("mismatch")
@@ -38,15 +38,6 @@ def test_an_estimate_below_1_01_is_not_enough_where_its_interval_reaches_beyond(
 )
 def test_the_smallest_size_that_suffices_need_not_be_the_best_on_every_scenario(ends, size):
     assert sufficient_size(rows_of([(end, end, end) for end in ends])) == size
-
-
-def test_the_seeds_of_a_size_are_those_of_no_trial_and_of_no_proof():
-    for seed in (0, 3):
-        chosen = {*size_seeds(seed, SIZE_SEEDS)}
-        others = {*training_seeds(seed, TRAINING_SEEDS), *held_out_seeds(seed, HELD_OUT_SEEDS)}
-        assert len(chosen) == SIZE_SEEDS and not chosen & others
-        assert not chosen & {*training_seeds(seed + 1, 20_000), *held_out_seeds(seed, 20_000)}
-    assert MISMATCH.data(size_seeds(0, 2)).seeds == (250_000, 250_001)
 
 
 def test_the_table_is_of_those_seeds_and_paired(monkeypatch):

@@ -1,9 +1,11 @@
 """Databases as storages: tables, signs of life, lost answers, an end of patience, the proxy."""
 
+import re
 import socket
 import subprocess
 import sys
 import time
+import types
 
 import optuna
 import pytest
@@ -11,14 +13,23 @@ import sqlalchemy
 from optuna.trial import TrialState
 from rich.console import Console
 
+from tuning.api.report import find_subject
 from tuning.api.tune import run_tuning
 from tuning.plants.thruster import find_scenario
 from tuning.problems.find import find_problem
 from tuning.search import storage as database
 from tuning.search.plan import Plan
 from tuning.search.space import distributions
-from tuning.search.storage import PROCESS, RETRY_OF, open_storage, retry_once
-from tuning.search.study import open_study, run_study
+from tuning.search.storage import (
+    PATIENCE_SECONDS,
+    PROCESS,
+    RETRY_OF,
+    open_storage,
+    public_url,
+    retry_once,
+    without_secrets,
+)
+from tuning.search.study import open_study, run_study, run_trials
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 
@@ -164,3 +175,219 @@ def test_a_proxy_stands_between_a_study_and_its_database(tmp_path, monkeypatch):
     finally:
         server.terminate()
         server.wait()
+
+
+WRITES = ("set_trial_user_attr", "set_trial_state_values", "set_study_user_attr", "record_heartbeat")
+
+
+class Clock:
+    """Time that passes when somebody sleeps."""
+
+    def __init__(self):
+        self.now, self.alarm = 0.0, (float("inf"), None)
+
+    def monotonic(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += seconds
+        if self.now >= self.alarm[0]:
+            self.alarm[1]()
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(database, "time", types.SimpleNamespace(monotonic=clock.monotonic, sleep=clock.sleep))
+    return clock
+
+
+@pytest.fixture
+def storage(tmp_path):
+    return open_storage(f"sqlite:///{tmp_path}/s.db")
+
+
+@pytest.fixture
+def refuse(storage, monkeypatch):
+    """Makes a database refuse some of its methods, until it is told otherwise."""
+    away = types.SimpleNamespace(methods=())
+
+    def refusing(name, method):
+        def call(*args, **kwargs):
+            if name in away.methods:
+                raise optuna.exceptions.StorageInternalError("read-only transaction")
+            return method(*args, **kwargs)
+
+        return call
+
+    for name in (*WRITES, "get_all_trials"):
+        monkeypatch.setattr(storage._backend, name, refusing(name, getattr(storage._backend, name)))
+    return lambda *methods: setattr(away, "methods", methods)
+
+
+@pytest.mark.filterwarnings("ignore:no answer from the database")
+def test_one_deadline_counts_for_all_calls(storage, refuse, clock):
+    study = optuna.create_study(storage=storage)
+    refuse(*WRITES)
+    rule = f"a database must answer within {PATIENCE_SECONDS} s, but got: read-only transaction"
+    with pytest.raises(ValueError, match=rule):
+        study.set_user_attr("a", 1)
+    assert PATIENCE_SECONDS < clock.now <= PATIENCE_SECONDS + 1
+    for _ in range(3):  # each would have had a minute of its own
+        assert study.get_trials() == []  # reading works, and is no sign that writing does
+        with pytest.raises(ValueError, match=rule):
+            study.set_user_attr("b", 1)
+    assert clock.now <= PATIENCE_SECONDS + 1
+
+
+def test_after_an_outage_the_next_one_has_a_deadline_of_its_own(storage, refuse, clock):
+    study = optuna.create_study(storage=storage)
+    for _ in range(2):
+        refuse(*WRITES)
+        clock.now, clock.alarm = 0.0, (50.0, refuse)  # which then refuses nothing
+        with pytest.warns(UserWarning, match="no answer from the database, trying for 60 s: read-only") as told:
+            study.set_user_attr("a", 1)
+        assert len(told) == 1 and 50 <= clock.now < 52
+
+
+def test_a_sign_of_life_that_gets_lost_ends_no_thread(storage, refuse, clock):
+    study = optuna.create_study(storage=storage)
+    number = storage.create_new_trial(study._study_id)
+    refuse("record_heartbeat")
+    for _ in range(20):
+        storage.record_heartbeat(number)
+        clock.now += 10.0
+    refuse()
+    storage.record_heartbeat(number)
+    refuse("set_study_user_attr")
+    before = clock.now
+    with (
+        pytest.warns(UserWarning, match="no answer"),
+        pytest.raises(ValueError, match="a database must answer within 60 s"),
+    ):
+        study.set_user_attr("a", 1)  # the outage of before is over
+    assert clock.now > before + PATIENCE_SECONDS
+
+
+@pytest.mark.filterwarnings("ignore:no answer from the database")
+@pytest.mark.parametrize("refused", [WRITES, (*WRITES, "get_all_trials")])
+def test_a_study_whose_database_stays_away_ends_with_what_it_said(storage, refuse, clock, capfd, refused):
+    study = open_study("s", PLAN, storage)
+
+    def after(study, finished):
+        if finished == 2:
+            refuse(*refused)
+
+    with pytest.raises(ValueError, match="a database must answer within 60 s, but got: read-only"):
+        run_trials(study, PLAN, PLAN.training_data(), 5, after)
+    assert clock.now <= PATIENCE_SECONDS + 1
+    assert "Traceback" not in capfd.readouterr().err
+    refuse()
+    assert sum(trial.state.is_finished() for trial in study.get_trials()) == 2
+
+
+SHOWN = {
+    "postgresql+psycopg2://tuner:secret@host:5432/studies": "postgresql+psycopg2://host:5432/studies",
+    "postgresql://tuner@10.77.5.1/studies": "postgresql://10.77.5.1/studies",
+    "postgresql://host/studies?user=tuner&password=secret": "postgresql://host/studies",
+    "postgresql://tuner@host/studies?password=se@cret": "postgresql://***",
+    "postgresql:///studies?host=/run&password=se@cret": "postgresql:///studies",
+    "postgresql://tuner:se/cret@host/studies": "postgresql://host/studies",
+    "postgresql://tuner:se@cret@host/studies": "postgresql://host/studies",
+    "postgresql://tuner:se/cr@et@host:5432/studies?sslmode=require": "postgresql://host:5432/studies",
+    "postgresql://tuner:se?cret@host/studies": "postgresql://***",
+    "postgresql://tuner:se#cret@host/studies": "postgresql://***",
+    "postgresql://tuner:secret/studies": "postgresql://***",
+    "postgresql://tuner:secret": "postgresql://***",
+    "postgresql://tuner:secret@[::1]:5432/studies": "postgresql://[::1]:5432/studies",
+    "mysql+pymysql://tuner:se%40cret@host/studies": "mysql+pymysql://host/studies",
+    "tuner:secret@host://studies": "***",
+    "postgresql:/tuner:secret@host/studies": "postgresql:***",
+    "postgresql+psycopg2:tuner:secret@host/studies": "postgresql+psycopg2:***",
+    "grpc://tuner:secret@host:13000": "grpc://host:13000",
+    "sqlite:////data/a@b/s.db?password=secret": "sqlite:////data/a@b/s.db",
+    "out/studies.journal": "out/studies.journal",
+    "/data/a@b/studies.journal": "/data/a@b/studies.journal",
+    "postgresql/studies.journal": "postgresql/studies.journal",
+}
+
+
+@pytest.mark.parametrize(("storage", "shown"), SHOWN.items(), ids=list(SHOWN))
+def test_scheme_host_and_database_are_shown_and_nothing_else(storage, shown):
+    assert public_url(storage) == shown
+    said = f"could not connect to {storage}: password secret, or cret@host, or se"
+    said = without_secrets(said, storage)
+    if shown != storage:
+        assert storage not in said and shown in said
+        assert not re.search(r"\bsecret\b|se.cret", said) or "secret" not in storage
+
+
+@pytest.mark.parametrize(
+    ("storage", "said", "clean"),
+    [
+        (
+            "postgresql://tuner:pa@ss@host/studies",  # as SQLAlchemy hands the rest to a driver
+            'could not translate host name "ss@host" to address',
+            'could not translate host name "***@host" to address',
+        ),
+        ("grpc://tuner:secret/x", "Port could not be cast to integer value as 'secret'", "value as '***'"),
+        ("mysql://tuner:p%40ss@host/s", "access denied with p@ss or p%40ss, passed", "with *** or ***, passed"),
+        (
+            "postgresql://host/s?password=hush",
+            'invalid dsn: "host=host password=hush"',
+            '"host=host password=***"',
+        ),
+        ("postgresql://tuner:pw@host/s", 'authentication failed for user "tuner"', 'for user "tuner"'),
+        ("out/studies.journal", "a journal: out", "a journal: out"),
+    ],
+)
+def test_a_message_loses_every_part_of_a_password(storage, said, clean):
+    assert without_secrets(said, storage).endswith(clean)
+
+
+SECRET = [
+    "postgresql+psycopg2://tuner:secret@localhost:1/s",
+    "postgresql+psycopg2://localhost:1/s?user=tuner&password=secret",
+    "postgresql+psycopg2://tuner:sec/secret@localhost:1/s",
+    "postgresql+psycopg2://tuner:sec@secret@localhost:1/s",
+    "postgresql+psycopg2://tuner:secret/s",
+    "grpc://tuner:secret/s",
+    "nonsense://tuner:secret@localhost/s",
+    "postgresql:/tuner:secret@localhost/s",
+]
+
+
+@pytest.mark.parametrize("url", SECRET)
+def test_a_storage_that_cannot_be_reached_tells_no_password(url, tmp_path, monkeypatch):
+    pytest.importorskip("psycopg2")
+    pytest.importorskip("grpc")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(database, "PROXY_SECONDS", 0.01)
+    with pytest.raises(
+        ValueError, match=f"storage must be .* but got {url.partition(':')[0].replace('+', '.')}:"
+    ) as e:
+        open_storage(url)
+    assert "secret" not in str(e.value) and "tuner:" not in str(e.value) and "\n" not in str(e.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_outage_tells_no_password(tmp_path, monkeypatch):
+    monkeypatch.setattr(database, "PATIENCE_SECONDS", 0.6)
+    storage, url = open_storage(f"sqlite:///{tmp_path}/s.db"), "postgresql://tuner:secret@host/s"
+    study = optuna.create_study(storage=storage)
+
+    def away(*arguments):
+        cause = sqlalchemy.exc.OperationalError("SELECT 1", {}, Exception(f"no answer from {url}"))
+        raise optuna.exceptions.StorageInternalError("away") from cause
+
+    monkeypatch.setattr(storage._backend, "url", url)
+    monkeypatch.setattr(storage._backend, "set_study_user_attr", away)
+    said = "no answer from postgresql://host/s$"
+    with pytest.warns(UserWarning, match=said), pytest.raises(ValueError, match=said):
+        study.set_user_attr("a", 1)
+
+
+def test_a_report_of_a_study_that_is_not_there_tells_no_password(monkeypatch):
+    monkeypatch.setattr("tuning.api.report._load", lambda name, storage: None)
+    with pytest.raises(ValueError, match="of a study in postgresql://host/s, but got 'none'"):
+        find_subject("none", "postgresql://tuner:secret@host/s")

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from filters import make_filter, run
+import tuning
+from filters import bounds, make_filter, run
+from filters.bounds import posterior_variances
 from filters.consistency.nees import RESAMPLES, normalized_squares, whitened
 from filters.consistency.report import consistency_report
 from tests.linear_problem import LinearProblem
@@ -14,7 +16,7 @@ from tuning.likelihood.identifiability import identify
 from tuning.problems.check import check_data, checked_problem
 from tuning.problems.data import Data, mask_of, only, padded
 from tuning.problems.log_problem import LogProblem
-from tuning.problems.model_problem import RunsProblem, log_of
+from tuning.problems.model_problem import RunsProblem, average_bound, log_of
 from tuning.reporting.time_figures import one_run
 from tuning.search.among_types import close_size
 from tuning.search.plan import Plan
@@ -142,10 +144,7 @@ def test_what_all_runs_have_is_scored_as_before_to_the_last_bit():
 
 
 def test_a_restart_in_the_padding_is_none():
-    unstable = affine_model(
-        a=[[30.0]], b=[[1.0]], c=[[1.0]], process_noise_cov=[1.0], measurement_noise_cov=[1.0],
-        prior_mean=[0.0], prior_cov=[1.0],
-    )  # fmt: skip
+    unstable = affine_model(A=[[30.0]], B=[[1.0]], C=[[1.0]], Q=[1.0], R=[1.0], P0=[1.0])
     filter_ = make_filter("kf", unstable)
     z = [np.zeros((rows, 1)) for rows in (400, 5)]
     data = Data((0, 1), np.zeros((2, 399, 1)), padded(z, 400), np.zeros((2, 2)), 0, counted=mask_of((400, 5), 400))
@@ -233,3 +232,41 @@ def test_a_mask_of_another_shape_and_a_run_without_a_scored_step_are_refused():
         check_data(data._replace(counted=np.ones((5, 3), dtype=bool)), MODEL, "x")
     with pytest.raises(ValueError, match="each run of problem x must have a step that is scored, from 30 on"):
         check_data(data._replace(first_scored=30), MODEL, "x")
+
+
+@pytest.mark.parametrize(("scored", "lags"), [(40, 20), (21, 20), (11, 10), (2, 1), (1, 1)])
+def test_a_consistency_report_has_as_many_lags_as_its_steps_allow(scored, lags):
+    problem = LinearProblem(steps=60, first_scored=61 - scored)
+    found = check_consistency(make_filter("kf", problem.model()), problem.data(range(6)))
+    assert len(found.whiteness.correlations) == lags and np.isnan(found.whiteness.p_value) == (scored == 1)
+
+
+@pytest.mark.slow
+def test_the_page_of_runs_of_sixty_steps_is_written(tmp_path):
+    problem = LinearProblem(steps=60, first_scored=50)
+    study = tuning.tune(problem, "kf", trials=3, progress=False)
+    page = tuning.report(study, tmp_path / "short.html").page
+    assert "Is the covariance consistent?" in page.read_text()
+
+
+def chain(n):
+    """A stable chain of n states, the first of which is measured."""
+    a = 0.9 * np.eye(n) + 0.05 * np.eye(n, k=1)
+    return affine_model(
+        A=a, B=np.ones((n, 1)), C=np.eye(n)[:1], Q=0.1 * np.eye(n), R=[0.2], x0=np.zeros(n), P0=np.eye(n)
+    )
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_the_bound_of_a_large_model_is_over_the_scored_steps_of_the_sequences_taken(monkeypatch, same):
+    lengths, model, rng = (20, 12, 31, 17), chain(13), np.random.default_rng(0)
+    monkeypatch.setattr(bounds, "MOST_WORK", 2 * 2 * 30 * 13**3)
+    inputs = np.zeros((4, 30, 1)) if same else rng.normal(size=(4, 30, 1))
+    counted = mask_of(lengths, 31)
+    data = Data((0, 1, 2, 3), inputs, np.zeros((4, 31, 1)), np.zeros((4, 2)), 5, counted=counted)
+    found = average_bound(model, data, truths=2)
+    each = posterior_variances(model, data.seen.inputs, truths=2)  # a linear model's do not follow from inputs
+    assert len(each) == (1 if same else 2)
+    taken = range(4) if same else (0, 2)
+    rows = np.concatenate([each[0, 5 : lengths[place]] for place in taken])
+    np.testing.assert_allclose(found, np.sqrt(rows.mean(axis=0)), rtol=1e-9)

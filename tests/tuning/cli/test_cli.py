@@ -12,7 +12,12 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
+from tests import altitude_problem
+from thruster_env.logs.write import write_log
 from thruster_env.thruster.parameters import TUNNEL, derive_constants
+from tuning.evaluation.baselines import given_noise
+from tuning.evaluation.held_out import evaluate_held_out
+from tuning.experiments.identification import TRUTH, record
 
 
 def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):
@@ -115,8 +120,6 @@ def test_inspect_shows_the_published_model_beside_ours(thruster, as_json, tmp_pa
 
 
 BAD = [
-    (("tune", "--filter", "none"), "filter must be one of kf, kf-steady, ekf, "),
-    (("tune", "--scenario", "none"), "problem must be one of"),
     (
         ("tune", "--filter", "ekf", "--method", "gradient", "--worst"),
         "method='gradient' (--method) must minimise the mean over problems, but got worst (--worst)",
@@ -125,22 +128,14 @@ BAD = [
         ("tune", "--filter", "enkf", "--method", "gradient"),
         "a filter whose likelihood has a gradient must be one of kf",
     ),
-    (("tune", "--trials", "0"), "trials must be a whole number of at least 1, but got 0"),
-    (("tune", "--storage", "sqlite:////no/such/folder/x.db"), "storage must be a database that can be reached"),
     (("tune", "--storage", "text.txt"), "storage must be a journal file"),
     (("tune", "--filter", "ekf", "--trials", "1", "--out", "text.txt/x.json"), "must be where it can be written"),
-    (("evaluate", "--tuned", "missing.json"), "a tuned file must be readable"),
     (("evaluate", "text.txt"), "a tuned file must be whole JSON"),
     (
         ("evaluate", "--tuned", "old.json"),
         "a tuned file must be of version 2, 3 or 4, but old.json is of version 1: tune again",
     ),
     (("verify", "missing.json"), "a tuned file must be readable"),
-    (
-        ("report", "missing"),
-        "a report must be of a tuned file or of a study in out/studies.journal, but got 'missing'",
-    ),
-    (("evaluate",), "give either a tuned file or a filter (--filter NAME)"),
     (("evaluate", "a.json", "--tuned", "b.json"), "a tuned file must be one, but got a.json and --tuned b.json"),
     (("evaluate", "--filter", "ekf", "--seeds", "1"), "held-out seeds must be a whole number of at least 2"),
     (
@@ -149,7 +144,6 @@ BAD = [
     ),
     (("evaluate", "--filter", "ekf", "--consistency", "text.txt/x.png"), "must be where it can be written"),
     (("evaluate", "--filter", "open-loop", "--consistency", "x.png"), "must be of a filter with a covariance"),
-    (("inspect", "--preset", "none"), "preset must be one of"),
     (("inspect", "--dt", "-1"), "dt must be positive, but got -1.0"),
     (("inspect", "--voltage", "30"), "voltage must be within plus and minus 24, but got 30.0"),
     (("inspect", "--out", "picture.tex"), "--out must end in .png, .svg or .pdf, but got 'picture.tex'"),
@@ -158,8 +152,6 @@ BAD = [
     (("simulate", "--out", "run.txt"), "--out must end in .csv, .parquet or .npz, but got 'run.txt'"),
     (("simulate", "--out", "run.csv", "--measurement-noise", "-1"), "no negative variance"),
     (("simulate", "--out", "run.csv", "--voltage", "nan"), "voltage must be a finite number, but got nan"),
-    (("reproduce", "none"), "none"),
-    (("nothing",), "nothing"),
 ]
 
 
@@ -187,3 +179,58 @@ def test_the_installed_command_interrupted_keeps_its_trials_and_says_so(tmp_path
     stdout, stderr = process.communicate(timeout=60)
     assert process.returncode == 130 and "Traceback" not in stderr
     assert "Interrupted: this is the result of the finished trials" in stdout
+
+
+ALTITUDE = "tests.altitude_problem:problem"
+
+
+def test_what_the_model_came_with_is_evaluated_and_is_no_rule_of_thumb(as_json, thruster):
+    told = as_json("evaluate", "--given", "--problem", ALTITUDE, "--seeds", 12)
+    problem = altitude_problem.problem()
+    mine = given_noise("ekf", problem)
+    assert told["filter"]["name"] == "ekf" and told["filter"]["model"] == altitude_problem.GIVEN == mine.model
+    found = evaluate_held_out(mine, problem, 0, 12).tuned
+    assert told["given"]["score"] == pytest.approx(list(found.score), rel=1e-9)
+    assert told["noise"]["score"][0] < told["given"]["score"][0]
+    done = thruster("evaluate", "--given", "--problem", ALTITUDE, "--filter", "ukf", "--seeds", 3)
+    assert done.returncode == 0 and "Parameters of the ukf filter" in done.stdout and "given" in done.stdout
+
+
+def test_the_covariance_of_what_was_given_is_checked(as_json, tmp_path):
+    options = "evaluate", "--given", "--problem", ALTITUDE, "--seeds", 8, "--consistency"
+    told = as_json(*options, "c.png")
+    assert told["consistency"] and (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    (
+        (
+            ("--scenario", "nominal"),
+            "given (--given) must be used with a problem whose model has a given Q and R, but got nominal",
+        ),
+        (("tuned.json",), "given (--given) must come without a tuned file, but got both, with 'tuned.json'"),
+        (
+            ("--problem", ALTITUDE, "--filter", "low-pass"),
+            "given (--given) must be used with a filter that has a Q and R, but got low-pass",
+        ),
+    ),
+)
+def test_where_nothing_was_given_one_line_says_so(thruster, options, said):
+    done = thruster("evaluate", "--given", *options)
+    assert done.returncode == 2 and said in " ".join(done.stderr.split())
+
+
+@pytest.mark.slow
+def test_a_preset_that_was_identified_is_not_made_worse_by_tuning(as_json, tmp_path):
+    for place, log in enumerate(record(0, 3, 300)):
+        write_log(tmp_path / f"run{place}.csv", log)
+    logs = [f"run{place}.csv" for place in range(3)]
+    of_logs = ("--sensor", "thrust", "--sensor", "speed")
+    free = ("--free", ",".join(name for name in TRUTH if not name.startswith(("Q", "R"))), "--starts", 1)
+    as_json("identify", *logs, "--preset", "tunnel_physical", *of_logs, *free, "--out", "mine.toml")
+    options = [part for log in logs for part in ("--log", log)]
+    told = as_json("tune", "--filter", "ekf", *options, "--preset", "mine.toml", *of_logs, "--trials", 12)
+    (held_out,) = told["held_out"].values()
+    assert held_out["tuned"]["log_likelihood"] >= held_out["given"]["log_likelihood"]
+    assert {"given"} <= {one["name"] for one in told["choice"]["met"]}

@@ -65,7 +65,7 @@ def test_names_are_taken_in_any_case(as_json):
         (("tunne",), "Did you mean 'tune'?"),
         (("tune", "--trails", "3"), "--trials"),
         (("evaluate", "--filter", "zzz"), "but got 'zzz'\n"),
-        (("evaluate",), "but got none"),
+        (("evaluate",), "give either a tuned file or a filter (--filter NAME), but got none"),
     ],
 )
 def test_a_misspelt_name_comes_with_the_nearest_one(thruster, arguments, end):

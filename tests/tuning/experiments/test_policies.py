@@ -51,14 +51,6 @@ def result(observe, returns, kind="ppo", errors=1.0, seed=0):
     )
 
 
-def test_the_interval_of_a_return_is_that_of_the_mean_over_episodes():
-    returns = np.random.default_rng(3).normal(-2.0, 0.5, 400)
-    interval = as_interval(typical_return([result("ekf", returns)]))
-    assert interval.value == pytest.approx(returns.mean())
-    half = 1.966 * returns.std(ddof=1) / 20
-    assert (interval.high - interval.low) / 2 == pytest.approx(half, rel=1e-3)
-
-
 def test_training_seeds_widen_the_interval_of_a_return_and_of_an_error():
     noise = np.random.default_rng(3).normal(0.0, 0.01, (5, 100))
     levels = np.array([-1.0, -1.1, -1.2, -1.3, -1.4])
@@ -67,12 +59,6 @@ def test_training_seeds_widen_the_interval_of_a_return_and_of_an_error():
     for found in (as_interval(typical_return(made)), as_interval(typical_error(made, "steady"))):
         assert abs(found.value) == pytest.approx(1.2, abs=0.01)
         assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.02)
-
-
-def test_episodes_are_shared_so_a_constant_difference_is_certain():
-    hard = np.random.default_rng(0).normal(-5.0, 3.0, 50)
-    difference = typical_return([result("ekf", hard + 0.25)]) - typical_return([result("raw", hard)])
-    assert as_interval(difference) == pytest.approx((0.25, 0.25, 0.25))
 
 
 def with_parts(made, **parts):

@@ -1,6 +1,3 @@
-import json
-import sys
-
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
@@ -8,7 +5,6 @@ from scipy.linalg import solve_discrete_are
 from filters import KalmanFilter, run
 from thruster_env.model.simulate import simulate
 from thruster_env.thruster.linear import PUBLISHED
-from tuning.cli.main import main
 from tuning.experiments.thruster_papers import (
     NOISE_LEVELS,
     STEPS,
@@ -184,17 +180,8 @@ def test_wrong_arguments(arguments, rule):
         compare(**{"case": "tunnel", "q": 0.5, **arguments})
 
 
-def command_line(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["thruster", "reproduce", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return stop.value.code or 0
-
-
-def test_json_on_standard_output_is_whole(monkeypatch, capsys):
-    few = ("--runs", "4", "--members", "5", "--seed", "3")
-    assert command_line(monkeypatch, "thruster-papers", *few, "--json", "-") == 0
-    data = json.loads(capsys.readouterr().out)
+def test_json_on_standard_output_is_whole(as_json):
+    data = as_json("reproduce", "thruster-papers", "--runs", 4, "--members", 5, "--seed", 3)
     assert data["settings"] == {"runs": 4, "members": 5, "seed": 3}
     assert [(r["case"], r["q"]) for r in data["results"]] == [(c, q) for c in SYSTEMS for q in NOISE_LEVELS]
     for result in data["results"]:
@@ -205,19 +192,3 @@ def test_json_on_standard_output_is_whole(monkeypatch, capsys):
     for study in data["studies"].values():
         assert len(study["rows"]) == 16 and study["source"] and study["statements"]
         assert all(row["why"] and len(row["published"]) == 2 for row in study["rows"])
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("healey1995",),
-        ("thruster-papers", "--runs", "1"),
-        ("thruster-papers", "--members", "1"),
-        ("thruster-papers", "--runs", "many"),
-    ],
-)
-def test_a_users_mistake_ends_with_code_2(monkeypatch, capsys, arguments):
-    assert command_line(monkeypatch, *arguments) == 2
-    output = capsys.readouterr()
-    assert output.err and not output.out
-    assert "Traceback" not in output.err

@@ -5,7 +5,6 @@ import pytest
 
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, FuzzyKalmanFilter, affine_model, run
 from tests.slow import slow_but
-from tests.tuning.experiments.test_studies import command_line
 from tuning.cli import output
 from tuning.experiments import vehicle_papers as estimators
 from tuning.experiments.vehicle_papers import (
@@ -206,12 +205,12 @@ def quick(monkeypatch, as_python):
 
 
 @pytest.mark.parametrize("paper", slow_but(PAPERS, [*PAPERS][1:]))
-def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, tmp_path, paper):
+def test_a_paper_is_reproduced_at_the_command_line(quick, thruster, monkeypatch, tmp_path, paper):
     monkeypatch.setattr(output.console, "width", 100)
     table, picture = tmp_path / "table.json", tmp_path / "paths.png"
     options = ["--runs", "2", "--steps", "2", "--json", str(table), "--series", str(picture)]
-    assert command_line(monkeypatch, paper, *options) == 0
-    shown = capsys.readouterr().out
+    code, shown, _ = thruster("reproduce", paper, *options)
+    assert code == 0
     assert "…" not in shown and max(map(len, shown.splitlines())) <= 100
     words = " ".join(shown.split())
     for said in ("0.082", "EnKF8", "has the conclusions", "H P H' + R", "Picture:"):
@@ -228,22 +227,6 @@ def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, t
         assert by_path["III", "vehicle"]["fuzzy 0..1"]["published"]["rmse"]["psi"] == 1e-5
         assert "4.83" in words
     assert all(one["why"] for filters in by_path.values() for one in filters.values() if one["published"])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "rule"),
-    [
-        (("ngatini2019", "--members", "5"), "No such option: --members"),
-        (("nurhadi2022", "--steps", "5"), "No such option: --steps"),
-        (("ngatini2017", "--runs", "1"), "runs must be a whole number of at least 2"),
-        (("ngatini2017", "--steps", "1"), "steps must be a whole number of at least 2"),
-        (("ngatini2017", "--series", "a.tex"), "--series must end in .png, .svg or .pdf"),
-    ],
-)
-def test_a_wrong_argument_is_one_line(monkeypatch, capsys, arguments, rule):
-    assert command_line(monkeypatch, *arguments) == 2
-    said = capsys.readouterr()
-    assert rule in " ".join(said.err.split()) and not said.out
 
 
 def test_errors_of_yaw_are_the_short_way_round():

@@ -41,15 +41,7 @@ def linear(a=A, c=C, q=Q, r=R, p0=P0, steps=60, runs=4, seed=0, missing=0.0, tru
     some = drawn(a, c, q, r, p0, steps, runs + 2, seed, missing)
     if not truth:
         some = [{"measurements": one["measurements"]} for one in some]
-    model = affine_model(
-        a=a,
-        b=np.zeros((len(a), 0)),
-        c=c,
-        process_noise_cov=q,
-        measurement_noise_cov=r,
-        prior_mean=np.zeros(len(a)),
-        prior_cov=p0,
-    )
+    model = affine_model(A=a, C=c, Q=q, R=r, P0=p0)
     given = {"scale": (1.0,) * len(a)} if truth else {}
     return RunsProblem(some, model, held_out=[runs, runs + 1], name="a linear model", **(given | options))
 

@@ -6,6 +6,7 @@ import pytest
 from filters import affine_model
 from tests.slow import slow_but
 from tests.tuning.methods.problems import A, Q, R, at, linear, task_of
+from tests.tuning.test_series import NILE
 from thruster_env.model.simulate import simulate
 from tuning.evaluation.residuals import estimated_from
 from tuning.experiments.methods_problems import ring
@@ -23,15 +24,6 @@ from tuning.methods.task import Budget, Task, find_method, stationary
 from tuning.problems.model_problem import ModelProblem, RunsProblem
 from tuning.problems.problem import Parameter
 from tuning.search.plan import LIKELIHOOD
-
-# Flow of the Nile at Aswan, 1871 to 1970 [1e8 m^3]: Durbin, Koopman (2012), "Time series analysis by state space
-# methods", 2nd ed., where Q is 1469.1 and R 15099 (section 2.10).
-NILE = """
-1120 1160 963 1210 1160 1160 813 1230 1370 1140 995 935 1110 994 1020 960 1180 799 958 1140 1100 1210 1150
-1250 1260 1220 1030 1100 774 840 874 694 940 833 701 916 692 1020 1050 969 831 726 456 824 702 1120 1100 832
-764 821 768 845 864 862 698 845 744 796 1040 759 781 865 845 944 984 897 822 1010 771 676 649 846 812 742 801
-1040 860 874 848 890 744 749 838 1050 918 986 797 923 975 815 1020 906 901 1170 912 746 919 718 714 740
-"""
 
 
 def level(q=1000.0, r=10000.0, start=0.0, wide=1e7):
@@ -163,13 +155,7 @@ def motivating(q=0.2, r=0.4):
     """The example's model, at the Q and R of its first gain."""
     g = MOTIVATING["g"]
     return affine_model(
-        a=MOTIVATING["a"],
-        b=np.zeros((3, 0)),
-        c=MOTIVATING["c"],
-        process_noise_cov=q * np.outer(g, g),
-        measurement_noise_cov=r,
-        prior_mean=[10.0] * 3,
-        prior_cov=[1e-12] * 3,
+        A=MOTIVATING["a"], C=MOTIVATING["c"], Q=q * np.outer(g, g), R=r, x0=[10.0] * 3, P0=[1e-12] * 3
     )
 
 
@@ -288,31 +274,25 @@ def test_fisher_scoring_ends_where_l_bfgs_ends():
     assert len(tasks["scoring"].answers) < len(tasks["likelihood"].answers)
 
 
-def test_als_refuses_what_it_cannot_do():
-    from tuning.plants.thruster import find_scenario
-
-    problem = find_scenario("nominal")
-    task = Task("ekf", problem, problem.data(range(2)))
-    with pytest.raises(ValueError, match="method 'als' needs a linear model"):
-        find_method("als").run("als", task)
-    for method, option in (("als", "prior"), ("mehra", "full_q")):
-        with pytest.raises(ValueError, match=f"method '{method}' must come without {option}"):
-            find_method(method).run(method, task_of(linear(), options={option: True}))
-
-
-def test_what_methods_need_is_said_in_a_line():
-    blind = task_of(linear(truth=False))
-    assert blind.objective == LIKELIHOOD
-    with pytest.raises(ValueError, match="method 'mse' needs true states, but a linear model has none"):
-        find_method("mse").run("mse", blind)
-    with pytest.raises(ValueError, match="method must be one of .*, but got 'magic'"):
-        find_method("magic")
-    certain = Task("enkf", ring(steps=4), ring(steps=4).data(range(2)), options={"hold_r": True})
-    with pytest.raises(ValueError, match="method 'posterior' tunes the model, but .* has no free parameter of it"):
-        find_method("posterior").run("posterior", certain)
-    ensemble = task_of(linear(), filter_name="enkf")
-    with pytest.raises(ValueError, match="a filter for method 'em' must be one of kf"):
-        find_method("em").run("em", ensemble)
+@pytest.mark.parametrize(
+    ("method", "filter_name", "options", "rule"),
+    [
+        ("als", "kf", {"prior": True}, "method 'als' must come without prior"),
+        ("mehra", "kf", {"full_q": True}, "method 'mehra' must come without full_q"),
+        ("anderson", "kf", {}, "method 'anderson' tunes the inflation of an ensemble, but 'kf' has none"),
+        (
+            "posterior",
+            "enkf",
+            {"hold_r": True},
+            ("posterior", "enkf", {"hold_r": True}, "'posterior' tunes the model, but .* has no free parameter"),
+        ),
+    ],
+)
+def test_what_a_method_cannot_do_is_said_in_a_line(method, filter_name, options, rule):
+    problem = ring(steps=4) if filter_name == "enkf" else linear()
+    task = Task(filter_name, problem, problem.data(range(2)), options=options)
+    with pytest.raises(ValueError, match=rule):
+        find_method(method).run(method, task)
 
 
 def test_runs_are_counted_and_end_a_method():
@@ -344,10 +324,3 @@ def test_innovations_ask_for_inflation_where_the_spread_is_too_small():
         found[name] = task.best.numbers["inflation"]
         assert task.runs == 6 and task.best.model == start.model
     assert 1.0 <= found["right"] < 1.03 < found["small"] - 0.03
-
-
-def test_a_filter_without_an_ensemble_has_no_inflation():
-    with pytest.raises(
-        ValueError, match="method 'anderson' tunes the inflation of an ensemble, but 'kf' has none"
-    ):
-        find_method("anderson").run("anderson", task_of(linear()))
