@@ -155,19 +155,13 @@ def test_a_comparison_s_study_does_not_tune_the_ensemble_size():
 WRONG = [
     (lambda: tuning.compare(["ekf", "ekf"], SHORT, seeds=2), "must be of different filters, but got ekf, ekf"),
     (lambda: tuning.compare([]), "a comparison must have at least one filter, but got none"),
-    (
-        lambda: tuning.compare(["ekf", 3]),
-        "a tuned file, a Study or an estimator, but got 3",
-    ),
+    (lambda: tuning.compare(["ekf", 3]), "a tuned file, a Study or an estimator, but got 3"),
     (lambda: tuning.compare("no-filter"), "filter must be one of .*, but got 'no-filter'"),
     (
         lambda: tuning.compare("ekf", ensemble_size={"ekf": 5}),
         "must be for a filter with an ensemble, but got ekf: 5",
     ),
-    (
-        lambda: tuning.compare("enkf", ensemble_size=1),
-        "must be a whole number of at least 2, but got 1",
-    ),
+    (lambda: tuning.compare("enkf", ensemble_size=1), "must be a whole number of at least 2, but got 1"),
     (lambda: tuning.compare("ekf", knows="all"), "one of true, scaled, .*, noise, study, but got 'all'"),
     (lambda: tuning.compare("ekf", trials=2, knows="true"), "knows must be left out, or 'study', with trials"),
     (lambda: tuning.compare("ekf", seeds=1), "held-out seeds must be a whole number of at least 2, but got 1"),

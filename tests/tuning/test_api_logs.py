@@ -95,19 +95,13 @@ def test_runs_that_are_held_out_only_validate(recorded):
 
 
 WRONG = [
-    (
-        lambda log: tuning.estimate(log, "a.json", filter="ekf"),
-        "either a tuned file or a filter .*, but got both",
-    ),
+    (lambda log: tuning.estimate(log, "a.json", filter="ekf"), "either a tuned file or a filter .*, but got both"),
     (
         lambda log: tuning.estimate(tuning.read_logs(log, **WHOSE), 5),
         "tuned must be a tuned file or a Study, but got 5",
     ),
     (lambda log: tuning.identify(log, lambda dt: None), "free must be names of parameters, but got .*model=..."),
-    (
-        lambda log: tuning.read_logs(log, model="motor"),
-        "or a thruster's preset, but got 'motor'",
-    ),
+    (lambda log: tuning.read_logs(log, model="motor"), "or a thruster's preset, but got 'motor'"),
     (lambda log: tuning.read_logs(("tunnel", log), model="a:b"), "a pair .* must come without another model"),
     (lambda log: tuning.identify([]), "at least one log must be left to learn from"),
     (

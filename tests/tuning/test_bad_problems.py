@@ -1,4 +1,4 @@
-"""What is no problem, or does not fit, is one clear line."""
+"""What is no problem, or does not fit, is one clear line; a model that diverges is told its substeps."""
 
 import numpy as np
 import pytest

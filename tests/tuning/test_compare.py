@@ -239,10 +239,7 @@ def test_by_default_a_filter_without_a_scaled_default_has_what_its_model_came_wi
             ("auv:navigation",),
             "must be a name or a file, but got the problem auv:navigation: use problem (--problem)",
         ),
-        (
-            ("missing.safetensors", "--filter", "ekf"),
-            "a trained estimator must be a file, but there is none",
-        ),
+        (("missing.safetensors", "--filter", "ekf"), "a trained estimator must be a file, but there is none"),
     ],
 )
 def test_a_users_mistake_is_one_clear_line_and_exit_code_2(arguments, line, command):

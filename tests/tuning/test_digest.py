@@ -1,8 +1,6 @@
 """A problem's digest is another for other numbers, the same for the same ones however they are written."""
 
 import functools
-import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,9 +14,8 @@ from tests.small_problems import pair
 from tests.tuned_files import rewrite, write_untuned
 from tuning.cli.templates import env as template
 from tuning.evaluation.tuned import read_tuned
-from tuning.problems import model_problem
 from tuning.problems.check import digest_of, is_older
-from tuning.problems.model_problem import ModelProblem, RunsProblem, cached_numbers
+from tuning.problems.model_problem import ModelProblem, RunsProblem
 from tuning.problems.problem import Parameter
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
@@ -159,65 +156,3 @@ print(problem.digest, problem.data([1, 2]).inputs.tobytes().hex())
         for _ in range(2)
     ]
     assert printed[0] == printed[1]
-
-
-class Code:
-    """What tells a folder, as compiled code does."""
-
-    def __init__(self, folder):
-        self.folder = folder and str(folder)
-
-
-@pytest.fixture
-def ask(monkeypatch, tmp_path):
-    """Ask for two numbers in a fresh process, so to speak; `ask.computed` counts."""
-    monkeypatch.setattr(model_problem, "_known", {})
-
-    def ask(follows_from=b"it", value=(0.1, 1e-300), folder=tmp_path / "cache", fresh=True):
-        if fresh:
-            model_problem._known.clear()
-
-        def compute():
-            ask.computed += 1
-            return np.array(value)
-
-        return cached_numbers("bound", 2, follows_from, Code(folder), compute)
-
-    ask.computed = 0
-    return ask
-
-
-def test_another_process_finds_the_same_digits(ask, tmp_path):
-    first, second = ask(), ask()
-    assert first.tolist() == second.tolist() == [0.1, 1e-300] and ask.computed == 1
-    (file,) = (tmp_path / "cache").iterdir()
-    assert re.fullmatch(r"bound-[0-9a-f]{32}\.json", file.name)
-    first[:] = 0.0  # of the caller alone
-    assert ask(fresh=False).tolist() == [0.1, 1e-300]
-
-
-def test_what_they_follow_from_and_the_processor_tell_them_apart(ask, monkeypatch):
-    ask(), ask(b"something else", (3.0, 4.0))
-    assert ask().tolist() == [0.1, 1e-300] and ask(b"something else").tolist() == [3.0, 4.0] and ask.computed == 2
-    monkeypatch.setattr("thruster_env.graphs.machine_code.host", lambda: "another processor")
-    assert ask(value=(5.0, 6.0)).tolist() == [5.0, 6.0]
-
-
-@pytest.mark.parametrize("content", [b"", b"[1.0]", b"[1.0, NaN]", b'{"a": 1}', b'["x", 1]', b"\xff", b"[1, [2]]"])
-def test_a_damaged_file_is_as_none(ask, tmp_path, content):
-    ask()
-    (file,) = (tmp_path / "cache").iterdir()
-    file.write_bytes(content)
-    assert ask().tolist() == [0.1, 1e-300] and ask.computed == 2
-
-
-def test_without_a_folder_they_last_as_long_as_the_process(ask, tmp_path):
-    ask(folder=None), ask(folder=None, fresh=False)
-    assert ask.computed == 1
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    assert ask(folder=blocked / "below").tolist() == [0.1, 1e-300] and os.path.isfile(blocked)
-
-
-def test_numbers_that_are_not_finite_are_not_kept(ask):
-    assert np.isnan(ask(value=(np.nan, 1.0))).any() and ask().tolist() == [0.1, 1e-300]

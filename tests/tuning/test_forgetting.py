@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import tuning
-from docs.scripts.tuning import LIFT, RIGHT, SLOPES, UNKNOWNS, bought, lifted, plans
 from filters import affine_model, make_filter, run
 from filters.augmented import Unknown
 from filters.consistency.nees import Interval
@@ -20,7 +19,6 @@ from tuning.evaluation.baselines import baselines, rule_of_thumb, same_filter
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.worth import memory_sentence, slowest_sentence, warnings_of
-from tuning.plants.thruster import find_scenario
 from tuning.problems.assumed import augmented
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.model_problem import ModelProblem, log_of
@@ -46,12 +44,13 @@ class Drag(NamedTuple):
 def cart(q=0.0):
     """A cart whose position is measured to 20 mm and which nothing disturbs."""
     return affine_model(
-        A=[[1.0, DT], [0.0, 1.0]],
-        B=[[0.0], [DT]],
-        C=[[1.0, 0.0]],
-        Q=[q, q],
-        R=4e-4,
-        P0=[1.0, 1.0],
+        a=[[1.0, DT], [0.0, 1.0]],
+        b=[[0.0], [DT]],
+        c=[[1.0, 0.0]],
+        process_noise_cov=[q, q],
+        measurement_noise_cov=4e-4,
+        prior_mean=[0.0, 0.0],
+        prior_cov=[1.0, 1.0],
         states=["position", "velocity"],
     )
 
@@ -259,36 +258,3 @@ def test_a_table_of_filters_has_their_time_constants_and_none_of_those_without_a
     assert said.startswith("Longest time constant of the gain: kf 6.") and said.endswith(" s, open-loop -.")
     assert said in leaderboard_report(found)
     assert memory_sentence(evaluations["open-loop"], problem) == "Time constants of the gain: -."
-
-
-MISMATCH = find_scenario("mismatch")
-
-
-def test_the_factor_on_the_lift_is_that_of_the_parameters():
-    model = lifted(MISMATCH, measurement_noise_cov=0.3)
-    plain = MISMATCH.model(parameter_factors={"lift_coefficient": 1.15 * 0.8, "voltage_gain": 0.95})
-    constants = model.constants._replace(**{LIFT: 0.8})
-    state, voltage = np.array([150.0, 1.2]), np.array([7.0])
-    for name, arguments in (("observe", (state,)), ("transition", (state, voltage))):
-        ours, known = (
-            getattr(model, name)(*arguments, constants),
-            getattr(plain, name)(*arguments, plain.constants),
-        )
-        np.testing.assert_allclose(ours, known, rtol=1e-12)
-    assert len(SLOPES) == 8 and model.measurement_noise_cov[0, 0] == 0.3
-
-
-@pytest.mark.slow
-def test_lift_and_voltage_gain_as_states_buy_what_no_q_can():
-    names = "`ekf`, Q and R", "`ekf` + lift and K2", RIGHT
-    lines = bought(trials=1, rows=names, seeds=20).splitlines()[2:]
-    rows = [line.strip("| ").split(" | ") for line in lines]
-    ratios = [float(row[1].split()[0]) for row in rows]
-    assert [row[0] for row in rows] == ["`ekf`, scaled default", *names]
-    assert ratios[0] == 1.0 and 0.25 < ratios[3] < ratios[2] < 0.6 < ratios[1] < 1.0  # by the baselines alone
-    assert float(rows[2][4]) < 3.0 < 10.0 < float(rows[0][4])  # the NEES says that no covariance holds a bias
-
-
-def test_a_full_q_is_searched_where_the_table_says_so():
-    assert [plan.full_q for plan in plans().values()] == [False, True, False, False, False, False]
-    assert all("`ekf` + " not in name for name in plans()) and len(UNKNOWNS) == 5

@@ -215,10 +215,7 @@ def test_a_full_r_is_read_back_wherever_a_tuned_file_is(tmp_path):
     ("plan", "rule"),
     [
         (Plan("ekf", (of_two_sensors(),), full_r=True, hold_r=True), "R must be free to be full, but got hold_r"),
-        (
-            Plan("low-pass", (NOMINAL,), full_r=True),
-            "a full R needs a filter with a cov.* 'low-pass'",
-        ),
+        (Plan("low-pass", (NOMINAL,), full_r=True), "a full R needs a filter with a cov.* 'low-pass'"),
         (Plan("ekf", (of_own_numbers(0),), full_r=True), "a full R .* tunes drag, noise, offset"),
     ],
 )

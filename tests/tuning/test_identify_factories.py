@@ -22,12 +22,7 @@ FREE = (
     Parameter("rate", 0.1, 10.0, default=0.8),
     Parameter("r", 1e-3, 1.0, default=0.05),
 )
-REST = {
-    "process_noise_cov": [1e-4],
-    "prior_mean": [0.0],
-    "prior_cov": [1.0],
-    "inputs": 1,
-}
+REST = {"process_noise_cov": [1e-4], "prior_mean": [0.0], "prior_cov": [1.0], "inputs": 1}
 
 
 def transition(x, u, c):
@@ -40,11 +35,7 @@ def observe(x, c):
 
 def of_module(gain=2.0, rate=1.0, r=0.04):
     return StateSpaceModel(
-        transition=transition,
-        observe=observe,
-        measurement_noise_cov=[r],
-        constants=(gain, rate),
-        **REST,
+        transition=transition, observe=observe, measurement_noise_cov=[r], constants=(gain, rate), **REST
     )
 
 
@@ -55,11 +46,7 @@ def of_factory(gain=2.0, rate=1.0, r=0.04):
         return (x[0] + step * (c[0] * u[0] - c[1] * x[0]),)
 
     return StateSpaceModel(
-        transition=move,
-        observe=lambda x, c: (x[0],),
-        measurement_noise_cov=[r],
-        constants=(gain, rate),
-        **REST,
+        transition=move, observe=lambda x, c: (x[0],), measurement_noise_cov=[r], constants=(gain, rate), **REST
     )
 
 

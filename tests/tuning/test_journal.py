@@ -1,4 +1,4 @@
-"""A journal is synchronised where a trial ends, and what the running one reports waits for others."""
+"""A journal is synchronised where a trial ends, what the running one reports waits; a full disk loses no line."""
 
 import errno
 import json

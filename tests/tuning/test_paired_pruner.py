@@ -1,4 +1,4 @@
-"""Pruning decides as Optuna's test does, by a sum of ranks."""
+"""Pruning decides as Optuna's test does, by a sum of ranks, and a study ends where it ends without."""
 
 import warnings
 

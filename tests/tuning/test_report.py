@@ -1,4 +1,4 @@
-"""The report of a tuning: one page that needs nothing else, and its tables."""
+"""The report of a tuning: one page that needs nothing else, its tables, pictures and units."""
 
 import json
 import logging

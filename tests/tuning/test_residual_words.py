@@ -1,4 +1,4 @@
-"""What residuals of true states say of a model."""
+"""What residuals say of a model, and of bursts of garbage in logs, which are left out."""
 
 import json
 from dataclasses import replace

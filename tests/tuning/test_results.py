@@ -28,10 +28,7 @@ class Tank(Result):
         return {"levels": self.levels}
 
 
-def tank(
-    level: Annotated[float, Option(INPUT)] = 1.0,
-    repeats: Annotated[int, Option(RUNS, least=1)] = 2,
-) -> Tank:
+def tank(level: Annotated[float, Option(INPUT)] = 1.0, repeats: Annotated[int, Option(RUNS, least=1)] = 2) -> Tank:
     """Measure a tank several times.
 
     Args:

@@ -5,16 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from tuning.evaluation.baselines import (
-    NOISE,
-    ORACLE,
-    RULE,
-    SCALED,
-    TUNED,
-    baselines,
-    scaled,
-    scaled_default,
-)
+from tuning.evaluation.baselines import NOISE, ORACLE, RULE, SCALED, TUNED, baselines, scaled, scaled_default
 from tuning.evaluation.compare import contender
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out

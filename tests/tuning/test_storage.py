@@ -1,4 +1,4 @@
-"""Databases as storages: tables, signs of life, lost answers, an end of patience, the proxy."""
+"""Databases as storages: tables, signs of life, lost answers, one deadline, the proxy, and no password in a message."""
 
 import re
 import socket

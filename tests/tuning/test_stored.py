@@ -1,4 +1,4 @@
-"""What a tuned file and a study keep of long work: it reads as it was, and only where it follows from the same."""
+"""What a tuned file and a study keep of long work reads as it was; `verify` says whether a file's metrics hold."""
 
 import json
 import math

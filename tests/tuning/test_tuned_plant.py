@@ -45,14 +45,8 @@ def wrapped(path, count=None, **arguments):
 
 OTHERS = {
     "dt": ({"dt": 0.02}, r"dt 0.01 \(here 0.02\);"),
-    "preset": (
-        {"preset": "t200", "max_voltage": 13.0},
-        r"preset tunnel \(here t200\);",
-    ),
-    "parameters": (
-        {"preset": {**PRESETS["tunnel"]._asdict(), "area": 0.005}},
-        r"area 0.00445 \(here 0.005\);",
-    ),
+    "preset": ({"preset": "t200", "max_voltage": 13.0}, r"preset tunnel \(here t200\);"),
+    "parameters": ({"preset": {**PRESETS["tunnel"]._asdict(), "area": 0.005}}, r"area 0.00445 \(here 0.005\);"),
     "channel": ({"sensors": ["speed"]}, r"sensors thrust \(here speed\);"),
     "all": (
         {"dt": 0.005, "preset": "tunnel_physical", "sensors": ["thrust", "speed"]},

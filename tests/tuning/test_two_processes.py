@@ -1,4 +1,4 @@
-"""Two `tune` processes on one journal: at most one trial more than asked for, and none is left waiting."""
+"""Two processes on one journal, two hosts on one database: at most one trial more than asked for, none waits."""
 
 import os
 import re

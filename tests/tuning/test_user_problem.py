@@ -175,23 +175,11 @@ def test_a_problem_that_has_changed_is_not_what_a_file_was_tuned_on(tuned, tmp_p
 @pytest.mark.parametrize(
     ("text", "name", "line"),
     [
-        (
-            None,
-            "my_nothing:problem",
-            "that can be imported, but 'my_nothing:problem' is not: No module named",
-        ),
+        (None, "my_nothing:problem", "that can be imported, but 'my_nothing:problem' is not: No module named"),
         ("x = 1", "my_bad:problem", "that can be imported, but .* has no attribute 'problem'"),
-        (
-            "1 / 0",
-            "my_bad:problem",
-            "module must import, but 'my_bad:problem' raised ZeroDivisionError: ",
-        ),
+        ("1 / 0", "my_bad:problem", "module must import, but 'my_bad:problem' raised ZeroDivisionError: "),
         ("x = (", "my_bad:problem", "module must import, but 'my_bad:problem' raised SyntaxError: "),
-        (
-            "def f():\n    raise KeyError('a')",
-            "my_bad:f",
-            "without arguments, but .* raised KeyError: 'a'",
-        ),
+        ("def f():\n    raise KeyError('a')", "my_bad:f", "without arguments, but .* raised KeyError: 'a'"),
         ("def f(seed): pass", "my_bad:f", "without arguments, but 'my_bad:f' raised TypeError: "),
         ("x = 1", "my_bad:x", "a problem must be a tuning.problems.problem.Problem, but 'my_bad:x' is 1"),
         ("def f(): return 'a\\nb'", "my_bad:f", "must be a tuning.problems.problem.Problem, but 'my_bad:f' is"),

@@ -1,4 +1,4 @@
-"""Recorders' files on the command line: what is in them, and the same numbers as of a table."""
+"""Files of recorders and tables on the command line: what is in them, what is not read, the same numbers of both."""
 
 import csv
 

@@ -124,10 +124,7 @@ def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_jso
         (("estimate", "run.csv", "--clock-offset", "thrust=-0.6"), "thrust must be shorter than the log, 0.6 s"),
         (("estimate", "run.csv", "--out", "./run.csv"), "an output file must not replace an input file"),
         (("estimate", "run.csv", "--out", "est.csv", "--json", "run.csv"), "must not replace an input file"),
-        (
-            ("estimate", "run.csv", "--out", "est.csv", "--json", "."),
-            "must be where it can be written, but . is",
-        ),
+        (("estimate", "run.csv", "--out", "est.csv", "--json", "."), "must be where it can be written, but . is"),
         (("identify", "run.csv", "--json", "run.csv"), "must not replace an input file"),
         (
             ("simulate", "--out", "new.csv", "--sensor", "torque"),

@@ -112,13 +112,7 @@ def test_ctrl_c_when_all_is_done_is_one_line():
     assert (done.returncode, done.stderr) == (130, INTERRUPTED)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    slow_but(
-        ["filters kf", "filters kf --json -", "--help"],
-        ["filters kf"],
-    ),
-)
+@pytest.mark.parametrize("arguments", slow_but(["filters kf", "filters kf --json -", "--help"], ["filters kf"]))
 def test_ctrl_c_while_results_are_printed_leaves_them_whole(arguments):
     whole = process("", "thruster", arguments, stdout=subprocess.PIPE)
     done = process(AT_FIRST_OUTPUT, "thruster", arguments, stdout=subprocess.PIPE)
@@ -181,11 +175,7 @@ def interrupted_in_a_package_that_makes_something_else_of_it():
 
 @pytest.mark.parametrize(
     "function",
-    [
-        interrupt,
-        interrupted_where_python_cannot_say_so,
-        interrupted_in_a_package_that_makes_something_else_of_it,
-    ],
+    [interrupt, interrupted_where_python_cannot_say_so, interrupted_in_a_package_that_makes_something_else_of_it],
 )
 def test_no_ctrl_c_is_lost(ends, function):
     assert ends(function) == (130, INTERRUPTED)

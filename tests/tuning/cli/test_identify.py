@@ -153,20 +153,11 @@ def test_no_command_writes_over_a_log_or_its_description(thruster, logs, tmp_pat
 
     before = files()
     for line, message in [
-        (
-            f"identify run0.csv {WHOSE} --out run0.toml",
-            "beside run0.csv",
-        ),
-        (
-            f"identify run0.csv {WHOSE} --out run1.toml",
-            "beside run1.csv",
-        ),
+        (f"identify run0.csv {WHOSE} --out run0.toml", "beside run0.csv"),
+        (f"identify run0.csv {WHOSE} --out run1.toml", "beside run1.csv"),
         ("new preset run1.toml", "beside run1.csv"),
         ("simulate --steps 5 --out run1.csv", "logs are never overwritten, but run1.csv exists"),
-        (
-            f"estimate run0.csv {WHOSE} --out run1.csv",
-            "logs are never overwritten, but run1.csv exists",
-        ),
+        (f"estimate run0.csv {WHOSE} --out run1.csv", "logs are never overwritten, but run1.csv exists"),
         ("inspect --json run1.csv", "--json must be no log"),
         ("simulate --steps 5 --out new.csv --json run0.toml", "beside run0.csv"),
     ]:

@@ -27,13 +27,7 @@ from tuning.experiments.lidar import (
     okf_itself,
     row_of,
 )
-from tuning.experiments.methods_problems import (
-    CASES,
-    FAST,
-    QUICK,
-    REFERENCE,
-    ring,
-)
+from tuning.experiments.methods_problems import CASES, FAST, QUICK, REFERENCE, ring
 from tuning.experiments.methods_runs import (
     Result,
     Scored,

@@ -1,4 +1,4 @@
-"""A bench shows what evaluations and studies compute, and refuses what a knob cannot have."""
+"""A bench shows what evaluations and studies compute, refuses what a knob cannot have, and changes disturbances."""
 
 import json
 import pickle

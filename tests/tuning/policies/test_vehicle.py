@@ -33,12 +33,7 @@ def setup_of(task="path", observe="ekf", algo="ppo", scenario="auv:navigation", 
 
 @pytest.mark.parametrize(
     ("task", "observe"),
-    [
-        ("path", "raw"),
-        pytest.param("depth", "ekf", marks=pytest.mark.slow),
-        ("path", "true"),
-        ("depth", "stack"),
-    ],
+    [("path", "raw"), pytest.param("depth", "ekf", marks=pytest.mark.slow), ("path", "true"), ("depth", "stack")],
 )
 def test_a_policy_learns_and_is_scored(task, observe, tmp_path):
     setup = setup_of(task, observe)
