@@ -1,4 +1,4 @@
-"""Databases as storages: tables, signs of life, lost answers, one deadline, the proxy, and no password in a message."""
+"""Databases as storages: tables, signs of life, lost answers, one deadline, the proxy, no password in messages."""
 
 import re
 import socket

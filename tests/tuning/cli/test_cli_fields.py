@@ -1,4 +1,4 @@
-"""Files of recorders and tables on the command line: what is in them, what is not read, the same numbers of both."""
+"""Files of recorders and tables on the command line: what is in them, what is not read, the numbers of both."""
 
 import csv
 

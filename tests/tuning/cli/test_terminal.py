@@ -45,7 +45,7 @@ def test_tables_and_pictures_of_scripts_and_experiments_stand_on_their_page(page
 
 
 def test_names_are_taken_in_any_case(as_json):
-    found = as_json("inspect", "--preset", "T200", "--out", "x.png")
+    found = as_json("inspect", "--preset", "T200")
     assert found["preset"] == "t200"
     assert as_json("filters", "EnKF")["filters"][0]["name"] == "enkf"
     assert as_json("filters", "ekf", "--problem", "MisMatch")["problem"] == "mismatch"
@@ -118,10 +118,10 @@ def test_a_refused_study_leaves_no_journal(thruster, tmp_path):
 
 
 def test_a_preset_beyond_its_range_is_warned_about(thruster):
-    done = thruster("inspect", "--preset", "t200", "--voltage", 20, "--out", "x.png")
+    done = thruster("inspect", "--preset", "t200", "--voltage", 20)
     assert done.returncode == 0 and "t200 is valid up to 13.3 V, but is driven by 20 V" in done.stderr
-    assert "warning" not in thruster("inspect", "--preset", "t200", "--voltage", 13, "--out", "x.png").stderr
-    done = thruster("inspect", "--voltage", 60, "--max-voltage", 60, "--out", "x.png")
+    assert "warning" not in thruster("inspect", "--preset", "t200", "--voltage", 13).stderr
+    done = thruster("inspect", "--voltage", 60, "--max-voltage", 60)
     assert "tunnel is valid up to 24 V, but is driven by 60 V" in done.stderr
 
 

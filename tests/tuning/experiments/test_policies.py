@@ -51,6 +51,14 @@ def result(observe, returns, kind="ppo", errors=1.0, seed=0):
     )
 
 
+def test_the_interval_of_a_return_is_that_of_the_mean_over_episodes():
+    returns = np.random.default_rng(3).normal(-2.0, 0.5, 400)
+    interval = as_interval(typical_return([result("ekf", returns)]))
+    assert interval.value == pytest.approx(returns.mean())
+    half = 1.966 * returns.std(ddof=1) / 20
+    assert (interval.high - interval.low) / 2 == pytest.approx(half, rel=1e-3)
+
+
 def test_training_seeds_widen_the_interval_of_a_return_and_of_an_error():
     noise = np.random.default_rng(3).normal(0.0, 0.01, (5, 100))
     levels = np.array([-1.0, -1.1, -1.2, -1.3, -1.4])

@@ -218,7 +218,7 @@ class TestReproduce:
             (("lorenz84",), "No such command 'lorenz84'"),
             (("thruster-papers", "--runs", 1), "runs must be a whole number of at least 2"),
             (("thruster-papers", "--members", 1), "members must be a whole number of at least 2"),
-            (("thruster-papers", "--runs", "many"), "'many' is not a valid integer"),
+            (("thruster-papers", "--runs", "many"), "Invalid value for '--runs'"),
             (("ngatini2019", "--members", 5), "No such option: --members"),
             (("nurhadi2022", "--steps", 5), "No such option: --steps"),
             (("ngatini2017", "--runs", 1), "runs must be a whole number of at least 2"),

@@ -1,4 +1,4 @@
-"""A bench shows what evaluations and studies compute, refuses what a knob cannot have, and changes disturbances."""
+"""A bench shows what evaluations and studies compute, refuses what no knob has, and changes disturbances."""
 
 import json
 import pickle

@@ -280,12 +280,7 @@ def test_fisher_scoring_ends_where_l_bfgs_ends():
         ("als", "kf", {"prior": True}, "method 'als' must come without prior"),
         ("mehra", "kf", {"full_q": True}, "method 'mehra' must come without full_q"),
         ("anderson", "kf", {}, "method 'anderson' tunes the inflation of an ensemble, but 'kf' has none"),
-        (
-            "posterior",
-            "enkf",
-            {"hold_r": True},
-            ("posterior", "enkf", {"hold_r": True}, "'posterior' tunes the model, but .* has no free parameter"),
-        ),
+        ("posterior", "enkf", {"hold_r": True}, "'posterior' tunes the model, but .* has no free parameter"),
     ],
 )
 def test_what_a_method_cannot_do_is_said_in_a_line(method, filter_name, options, rule):
