@@ -14,6 +14,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from thruster_env.graphs.graphs import are_unknown, repeated
+
 
 class Matrix:
     """A matrix (rows, columns), vector (rows,) or number (), the result of an operation.
@@ -261,7 +263,9 @@ def transposed(a):
 @operation(of_product)
 def multiply(a, b):
     """The product a b; its derivative is in `operations`, with that of quotients."""
-    return a @ b
+    if a.ndim < 2 or b.ndim < 2 or a.dtype != object or b.dtype != object:
+        return a @ b
+    return repeated(lambda column: a @ column, b.T).T if are_unknown(b) else repeated(lambda row: row @ b, a)
 
 
 def plus(*slopes: Matrix | None) -> Matrix | None:

@@ -40,7 +40,7 @@ from filters.algebra.matrices import (
 from thruster_env.core import matrices
 from thruster_env.core.angles import wrapped
 from thruster_env.core.sources import Source, entrywise, is_array, matrix_reader, matrix_writer
-from thruster_env.graphs.graphs import Graph, called, where
+from thruster_env.graphs.graphs import ROWS, Graph, are_unknown, called, repeated, where
 from thruster_env.graphs.programs import CALLED, CALLED_IN_ROUNDS, Place, Program, program_of
 
 ROUNDS = 14  # enough for condition numbers of 1e16: the last rounds each double the number of correct digits
@@ -75,7 +75,16 @@ def mirrored(a):
 @operation(lambda a, *shapes: (a[0], a[0]), lambda *arguments: True)
 def congruence(a, p, pa):
     """The matrix A P A' of a symmetric P, from A and P A'."""
-    return mirrored.compute(a @ pa)
+    if a.dtype != object or pa.dtype != object:
+        return mirrored.compute(a @ pa)
+    result = np.empty((len(a), len(a)), dtype=object)
+    for k in range(0, len(a), ROWS):  # of these columns, rows below the diagonal's suffice
+        rows, columns = a[k:], slice(k, k + ROWS)
+        if are_unknown(a):
+            result[k:, columns] = repeated(lambda row, rows=rows: rows @ (p @ row), a[columns]).T
+        else:
+            result[k:, columns] = repeated(lambda column, rows=rows: rows @ column, pa.T[columns]).T
+    return mirrored.compute(result)
 
 
 @operation(same, lambda a: True)
@@ -165,6 +174,8 @@ def forward(c, lower):
 @operation(same)
 def quotient(c, of):
     """`divide`, from the factor of S. A vector may be a column, as in ensembles of NumPy's arrays."""
+    if c.ndim == 2 and c.dtype == object and c.shape[1] == len(of[1]):
+        return repeated(lambda row: quotient.compute(row, of), c)
     lower, d = of
     x = forward(c.ravel() if c.shape == (len(d), 1) else c, lower)
     for i in reversed(range(len(d))):

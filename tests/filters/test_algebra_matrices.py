@@ -35,6 +35,9 @@ from filters.algebra.points import (
     units,
     without_first,
 )
+from filters.pages.kernels import Stage, works_of
+from thruster_env.graphs.graphs import ROWS
+from thruster_env.graphs.loops import Loops
 from thruster_env.graphs.programs import Place
 
 RNG = np.random.default_rng(0)
@@ -195,3 +198,31 @@ def test_a_covariance_that_is_none_has_no_density():
     assert np.isnan(log_density(np.ones(2), np.array([[1.0, 2.0], [2.0, 1.0]]), seen))
     with pytest.raises(TypeError, match="no derivative"):
         slopes_of([points.dot(x := input_matrix("x", (2,)), x)], {x: input_matrix("dx", (2,), like=x)})
+
+
+@pytest.mark.parametrize(("n", "m"), [(7, 6), (9, 8)])
+def test_functions_that_code_has_once_for_many_rows_compute_what_numpy_does(n, m):
+    values = {"P": covariance_of(n), "H": RNG.normal(size=(m, n)), "R": covariance_of(m)}
+    inputs, offset = [], 0
+    for name, value in values.items():
+        place, like = Place("rows", offset), inputs[0] if inputs else None
+        inputs.append(input_matrix(place, value.shape, symmetric=name != "H", like=like))
+        offset += value.size
+    p, h, r = inputs
+    gain = divide(p @ h.T, sym(h @ p @ h.T) + r)
+    stage = Stage({offset: gain, offset + n * m: joseph(p, gain, h, r), offset + n * (m + n): (p @ p) @ h.T}, {})
+    (work,) = works_of(stage)
+    repeats = work.program[0].works[0].graph.repeats
+    assert len(repeats) >= 5 and any(len(repeat.rows) % ROWS for repeat in repeats)
+    rows = np.concatenate([*map(np.ravel, values.values()), np.zeros(n * (2 * m + n))])
+
+    def call(rows):
+        work(rows, rows, rows)
+
+    Loops(call)(rows)
+    P, H, R = values.values()
+    K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
+    A = np.eye(n) - K @ H
+    results = np.split(rows[offset:], [n * m, n * (m + n)])
+    for found, expected in zip(results, (K, A @ P @ A.T + K @ R @ K.T, P @ P @ H.T), strict=True):
+        np.testing.assert_allclose(found.reshape(expected.shape), expected, rtol=1e-10, atol=1e-12)

@@ -421,7 +421,7 @@ class Expressions(Arrays):
         else:
             writer = Writer(translator.call_by_name, builder, data, width)
             writer.stride = target.args[-1]
-            writer.write(program)
+            writer.write_repeated(program, lambda kind: new_function(builder.module, kind, "repeated"))
         translator.arrange_memory([[]])
         translator.free_all_but([])
         builder.ret_void()

@@ -24,8 +24,9 @@ from __future__ import annotations
 import gc
 import math
 import operator
-from collections.abc import Callable, Container, Hashable, Iterable, Iterator
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 
@@ -60,6 +61,8 @@ COMPARISONS: dict[str, Callable] = {
 CONDITIONS = (*COMPARISONS, "and", "or")  # operations whose results are no floats
 JUMPS = (*COMPARISONS, "floor", "ceil", "rint", "fmod")  # operations whose results rounding may change by much
 REDUCTIONS = ("sum", "largest")  # operations that make one number of those of all members
+ROWS = 4  # of a repeated function that machine code evaluates side by side
+FEWEST_REPEATED = 200  # operations of a function's rows: with fewer, memory costs more than the code that it saves
 
 
 class TooLarge(TypeError):
@@ -91,6 +94,7 @@ class Graph:
         self.whole: set[int] = set()  # places of numbers that are not taken apart, as along them slopes are taken
         self.may_raise = True  # whether a branch that raises an exception is NaN, or is refused
         self.exact = False  # whether a model's function is being traced: see `as_written`
+        self.repeats: list[Repeat] = []
         self._made: dict[tuple, Number] = {}
         self._most = most
 
@@ -368,12 +372,51 @@ def called(name: str, count: int, *numbers: Number) -> list[Number]:
     return [graph.make("entry", call, k) for k in range(count)]
 
 
-def needed_by(numbers: Iterable[Number], known: Container[int] = ()) -> list[Number]:
+class Repeat(NamedTuple):
+    """A function that was traced for several rows of numbers, whose body machine code may have once.
+
+    Attributes:
+        formal: numbers in the place of a row.
+        body: the results for them.
+        rows: the rows.
+        results: the results for each of them, of which no row depends on another.
+    """
+
+    formal: Sequence[Number]
+    body: Sequence[Number]
+    rows: Sequence[Sequence[Number]]
+    results: Sequence[Sequence[Number]]
+
+
+def are_unknown(numbers: np.ndarray) -> bool:
+    """Whether all numbers of an array are Numbers, none of them known now or of a member."""
+    return all(isinstance(a, Number) and a.value is None and not a.member for a in numbers.flat)
+
+
+def repeated(function: Callable, rows: np.ndarray) -> np.ndarray:
+    """The results `function(row)` of each row of a matrix, (rows, results); many make a `Repeat` of the graph."""
+    if len(rows) < 2 or not are_unknown(rows):
+        return np.array([function(row) for row in rows], dtype=object)
+    graph = rows[0, 0].graph
+    formal = [graph.given(("own", k)) for k in range(rows.shape[1])]
+    body = function(np.array(formal, dtype=object)).tolist()
+    first = len(graph.numbers)
+    results = np.array([function(row) for row in rows], dtype=object)
+    is_new = all(isinstance(a, Number) and a.place >= first for a in results.flat)
+    if is_new and len(graph.numbers) - first >= FEWEST_REPEATED:
+        graph.repeats.append(Repeat(formal, body, rows.tolist(), results.tolist()))
+    return results
+
+
+def needed_by(
+    numbers: Iterable[Number], known: Container[int] = (), of: Callable = operator.attrgetter("of")
+) -> list[Number]:
     """Numbers and all their arguments, in the order of evaluation.
 
     Args:
         numbers: the wanted ones.
         known: places in the graph of known numbers, whose arguments are not needed.
+        of: the arguments of a number.
     """
     visited: set[int] = set()
     ordered = []
@@ -381,7 +424,7 @@ def needed_by(numbers: Iterable[Number], known: Container[int] = ()) -> list[Num
         waiting = [last]
         while waiting:
             number = waiting[-1]
-            missing = [] if number.place in known else [a for a in number.of if a.place not in visited]
+            missing = [] if number.place in known else [a for a in of(number) if a.place not in visited]
             if number.place in visited or not missing:
                 waiting.pop()
                 if number.place not in visited:

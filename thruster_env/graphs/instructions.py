@@ -17,7 +17,7 @@ from llvmlite import ir  # type: ignore[import-untyped]
 
 from thruster_env.core.compiled import FASTMATH
 from thruster_env.core.streams import ROUNDER, ROUNDER_BITS, SQRT_HALF_BITS
-from thruster_env.graphs.graphs import COMPARISONS, Number
+from thruster_env.graphs.graphs import COMPARISONS, ROWS, Number, Repeat, needed_by
 from thruster_env.graphs.programs import (
     BY_MEMBERS,
     SIDE_BY_SIDE,
@@ -56,6 +56,7 @@ class Writer:
         self.stride: ir.Value | None = None
         self.values: dict[int, ir.Value] = {}
         self.values_of: dict[str, ir.Value] = {}
+        self._memory_of: dict[int, tuple[ir.Value, int]] = {}  # of the numbers of repeated functions
         self.pointer_of: Callable[[Place], ir.Value] = self._pointer
 
     def write(self, program: Program) -> None:
@@ -63,6 +64,75 @@ class Writer:
         self.read(program.reads)
         self.work(program.works)
         self.store(program.stores)
+
+    def write_repeated(self, program: Program, new_function: Callable) -> None:
+        """The same, but functions that were traced for many rows are functions of LLVM, for `ROWS` rows a call.
+
+        Side by side, the matrices of many runs would not fit into the fastest memory, so these have no functions.
+
+        Args:
+            program: the program.
+            new_function: makes a function of a type.
+        """
+        bodies = _bodies_of(program) if self._width == 1 else []
+        if not bodies:
+            return self.write(program)
+        reads = {number.place: source for source, number in program.reads}
+        by_result = {number.place: body for body in bodies for number in body.results}
+
+        def arguments_of(node: Number | _RepeatedBody) -> Sequence:
+            body = None if isinstance(node, _RepeatedBody) else by_result.get(node.place)
+            return node.of if body is None else (body,)
+
+        for node in needed_by([number for _, number in program.stores], reads, arguments_of):
+            if isinstance(node, _RepeatedBody):
+                self._call_body(node, new_function)
+            elif node.place in reads:
+                self.values[node.place] = self._read(reads[node.place])
+            elif node.place in by_result:
+                pointer = self._vector_at(*self._memory_of[node.place])
+                self.values[node.place] = self._builder.load(pointer, align=8, typ=self._vector)
+            else:
+                self.work([node])
+        self.store(program.stores)
+
+    def _call_body(self, body: _RepeatedBody, new_function: Callable) -> None:
+        rows, common = self._in_memory(body.entries), self._in_memory(body.common)
+        results = self._on_stack(body.results)
+        function = new_function(ir.FunctionType(ir.VoidType(), [rows.type] * 3))
+        function.attributes.add("noinline")
+        for argument in function.args:
+            argument.add_attribute("noalias")
+        arrays = dict(zip(("own", "common", "results"), function.args, strict=True))
+        writer = Writer(self._call, ir.IRBuilder(function.append_basic_block()), arrays, ROWS)
+        writer.write(body.program)
+        writer._builder.ret_void()
+        of_group = ROWS * body.length, ROWS * len(body.program.stores)
+        for k in range(len(body.entries) // of_group[0]):
+            row, result = (self._behind(*part) for part in ((rows, k * of_group[0]), (results, k * of_group[1])))
+            self._builder.call(function, [row, common, result])
+
+    def _in_memory(self, numbers: Sequence[Number]) -> ir.Value:
+        """Where numbers lie one after the other, as the results of another function do, or a copy of them."""
+        memory, first = self._memory_of.get(numbers[0].place, (None, 0)) if numbers else (None, 0)
+        located = [self._memory_of.get(number.place) for number in numbers]
+        if memory is None or located != [(memory, first + k) for k in range(len(numbers))]:
+            memory, first = self._on_stack(numbers), 0
+            for k, number in enumerate(numbers):
+                self._builder.store(self.values[number.place], self._vector_at(memory, k), align=8)
+        return self._behind(memory, first)
+
+    def _on_stack(self, numbers: Sequence[Number]) -> ir.Value:
+        memory = self._builder.alloca(DOUBLE, size=ir.Constant(LONG, max(len(numbers), 1)))
+        memory.align = 64
+        self._memory_of |= {number.place: (memory, k) for k, number in enumerate(numbers)}
+        return memory
+
+    def _vector_at(self, memory: ir.Value, at: int) -> ir.Value:
+        return self._builder.bitcast(self._behind(memory, at), self._vector.as_pointer())
+
+    def _behind(self, memory: ir.Value, at: int) -> ir.Value:
+        return self._builder.gep(memory, [ir.Constant(LONG, at)], source_etype=DOUBLE)
 
     def read(self, reads: Sequence[tuple[Place, Number]]) -> None:
         """Read numbers."""
@@ -238,6 +308,65 @@ class Writer:
 
 def _declared(module: ir.Module, name: str, kind: ir.Type, count: int) -> ir.Function:
     return module.globals.get(name) or ir.Function(module, ir.FunctionType(kind, [kind] * count), name)
+
+
+class _RepeatedBody:
+    """A `Repeat` of a program: among its numbers it stands for its results, as one operation on all rows.
+
+    Attributes:
+        place: a number that no other one has.
+        program: of a row ("own"), and of numbers that are the same for all rows ("common").
+        length: of a row.
+        entries: the numbers of the rows, as `_in_groups` has them; the last row fills the last group.
+        common: numbers that are the same for all rows.
+        of: all of them.
+        results: of the rows, in the same order.
+    """
+
+    def __init__(self, place: int, repeat: Repeat):
+        """Find the numbers that are the same for all rows."""
+        self.place, self.length = place, len(repeat.formal)
+        self.entries, self.results = _in_groups(repeat.rows), _in_groups(repeat.results)
+        formal = {number.place: Place("own", k) for k, number in enumerate(repeat.formal)}
+        of_row, ordered = set(formal), needed_by(repeat.body)
+        for number in ordered:
+            if any(a.place in of_row for a in number.of):
+                of_row.add(number.place)
+        reads, works, self.common = [], [], list[Number]()
+        for number in needed_by(repeat.body, {number.place for number in ordered} - of_row):
+            if number.place in formal:
+                reads.append((formal[number.place], number))
+            elif number.place in of_row or number.operation == "constant":
+                works.append(number)
+            else:
+                reads.append((Place("common", len(self.common)), number))
+                self.common.append(number)
+        self.program = Program(
+            reads, works, [(Place("results", k), number) for k, number in enumerate(repeat.body)]
+        )
+        self.of = [*self.entries, *self.common]
+
+
+def _in_groups(rows: Sequence[Sequence[Number]]) -> list[Number]:
+    rows = [*rows, *[rows[-1]] * (-len(rows) % ROWS)]
+    return [
+        rows[k + row][j] for k in range(0, len(rows), ROWS) for j in range(len(rows[0])) for row in range(ROWS)
+    ]
+
+
+def _bodies_of(program: Program) -> list[_RepeatedBody]:
+    """The repeated functions of which a program needs most results, and computes the inputs."""
+    if not program.works:
+        return []
+    works, bodies = {number.place: number for number in program.works}, []
+    known = {number.place for _, number in program.reads} | works.keys()
+    for k, repeat in enumerate(program.works[0].graph.repeats):
+        needed = [works[a.place] for row in repeat.results for a in row if a.place in works]
+        if 2 * len(needed) > len(repeat.results) * len(repeat.body) and not any(a.exact for a in needed):
+            body = _RepeatedBody(-1 - k, repeat)
+            if all(a.place in known and not a.is_condition for a in body.of):
+                bodies.append(body)
+    return bodies
 
 
 INT = ir.IntType(32)

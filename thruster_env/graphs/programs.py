@@ -52,7 +52,8 @@ OF_STEPS = ("rows", "given", "numbers")  # arguments of programs that run a filt
 OF_MEMBERS = ("rows", "given", "numbers", "table", "draws", "size")  # those of programs with loops over members
 OF_COPIES = ("memory", "numbers")  # those of programs of copies of a plant; memory (rows, copies) has a stride
 BY_MEMBERS = ("table", "draws")  # of these, those with a row for each number and a column for each member
-SIDE_BY_SIDE = ("rows", "change", "given", "memory")  # of all, those with a number for each run at each place
+SIDE_BY_SIDE = ("rows", "change", "given", "memory", "own", "results")
+"""Of all, those with a number for each run at each place, or for each row of a repeated function."""
 SPECIAL = {
     "negative": "-{}",
     "pow": "{} ** {}",
