@@ -4,13 +4,15 @@ import json
 from dataclasses import dataclass
 from typing import Annotated
 
+import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
 
+import tuning
 from thruster_env.core.text_tables import Table
 from tuning.api.markers import INPUT, RUNS, Option
-from tuning.api.result import Result
+from tuning.api.result import Result, plain_data
 from tuning.cli.verbs import command_of
 
 
@@ -44,6 +46,19 @@ def command(monkeypatch, tmp_path):
     app = typer.Typer()
     app.command()(command_of(tank))
     return lambda *arguments: CliRunner().invoke(app, arguments)
+
+
+def test_a_result_and_the_json_of_its_command_are_the_same_data(tmp_path):
+    file, written = tmp_path / "acc.csv", tmp_path / "fit.json"
+    file.write_text("\n".join(["acc", *(f"{(7 * k) % 11}" for k in range(60))]))
+    app = typer.Typer()
+    app.command()(command_of(tuning.fit))
+    CliRunner().invoke(app, [str(file), "--json", str(written)])
+    stored = json.loads(written.read_text())
+    del stored["text_tables"]
+    assert json.loads(json.dumps(tuning.fit(file).as_dict(), allow_nan=False)) == stored
+    mixed = {1: (np.nan, np.inf), "x": np.array([[0.5, np.nan]])}
+    assert plain_data(mixed) == {"1": [None, None], "x": [[0.5, None]]}
 
 
 def test_a_table_is_shown_by_terminal_notebook_page_and_markdown(tmp_path):

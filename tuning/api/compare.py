@@ -37,7 +37,7 @@ from tuning.api.markers import (
 )
 from tuning.api.problems import given_for, is_filter, problems_of
 from tuning.api.progress import console_for, row_bar
-from tuning.api.result import Result, drawn, frame, number
+from tuning.api.result import Result, drawn, frame, number, plain_data
 from tuning.api.study import DEFAULT_FILTER, Study, is_own, user_choice
 from tuning.api.tune import MOST_TRIALS
 from tuning.evaluation.baselines import OWN
@@ -163,7 +163,7 @@ class FilterComparison(Result):
     def as_dict(self) -> dict[str, Any]:
         """All results as plain data, as in `thruster compare --json`."""
         data = {"seed": self.seed, "knows": self.knows, "interrupted": self.interrupted, "left_out": self.left_out}
-        return {**data, **as_json(list(self.boards))}
+        return plain_data({**data, **as_json(list(self.boards))})
 
     def figures(self) -> dict[str, Figure]:
         """Scores of all filters."""

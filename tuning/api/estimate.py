@@ -49,7 +49,7 @@ from tuning.api.markers import (
     TunedArgument,
 )
 from tuning.api.read_logs import read_logs, recorded_runs
-from tuning.api.result import Result, drawn, frame, number
+from tuning.api.result import Result, drawn, frame, number, plain_data
 from tuning.logs.read import as_tuned
 
 if TYPE_CHECKING:
@@ -258,7 +258,7 @@ class LogEstimates(Result):
             "findings": [asdict(finding) for finding in log.findings],
             "sentences": self.sentences(),
         }
-        return {**data, **self._alarms_as_dict(), "files": list(self.files)}
+        return plain_data({**data, **self._alarms_as_dict(), "files": list(self.files)})
 
     def _alarms_as_dict(self) -> dict[str, Any]:
         watched, names = self.watched, [channel.symbol for channel in self.log.measured]

@@ -14,7 +14,7 @@ from filters.estimators.foreign import label_of
 from filters.filter import Filter
 from thruster_env.core.checks import at_least
 from thruster_env.core.text_tables import Table
-from tuning.api.result import Result, about, drawn, frame, number
+from tuning.api.result import Result, about, drawn, frame, number, plain_data
 from tuning.evaluation.baselines import ORACLE, RULE, TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency, restart_sentences
 from tuning.evaluation.held_out import Comparison
@@ -125,7 +125,7 @@ class HeldOut(Result):
         warned = warnings_of(self.evaluation, self.problem, self.forget)
         checked = {} if self.covariance is None else {"consistency": self.covariance.as_dict()}
         what = {"filter": self.choice._asdict(), "scenario": self.problem.name}
-        return {**what, **data, "warnings": warned, **checked}
+        return plain_data({**what, **data, "warnings": warned, **checked})
 
     def to_frame(self) -> pandas.DataFrame:
         """A row per filter: RMSE of each state with its 95 % interval, score, NEES, NIS, log-likelihood, restarts.

@@ -34,7 +34,7 @@ from tuning.api.markers import (
 )
 from tuning.api.progress import console_for
 from tuning.api.read_logs import recorded_runs
-from tuning.api.result import Result, drawn, frame
+from tuning.api.result import Result, drawn, frame, plain_data
 from tuning.likelihood.identify import STARTS, Profile, Validation, profile_figure, profiles, validate
 from tuning.likelihood.identify import identify as identify_runs
 from tuning.likelihood.objective import Objective
@@ -211,7 +211,7 @@ class Identified(Result):
     def as_dict(self) -> dict[str, Any]:
         """All results as plain data, as in `thruster identify --json`."""
         result = self.found
-        return {
+        data = {
             "logs": [log.name for log in self.runs],
             "held_out": [log.name for log in self.held_out],
             "values": result.values,
@@ -236,6 +236,7 @@ class Identified(Result):
             "sentences": self.sentences(),
             "files": list(self.files),
         }
+        return plain_data(data)
 
     @property
     def exit_code(self) -> int:

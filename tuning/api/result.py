@@ -50,7 +50,7 @@ class Result:
         return {}
 
     def as_dict(self) -> dict[str, Any]:
-        """All results as plain data."""
+        """All results as `plain_data`, which `json.dumps` takes."""
         raise NotImplementedError
 
     def document(self) -> dict[str, Any]:
@@ -116,6 +116,21 @@ class Printed(Result):
     def as_dict(self) -> dict[str, Any]:
         """The data."""
         return self.data
+
+
+def plain_data(value: Any) -> Any:
+    """The same as `json` takes it: arrays as lists, numbers that are not finite as None, keys as texts.
+
+    Args:
+        value: mappings, sequences, NamedTuples, arrays and numbers, nested.
+    """
+    if isinstance(value, dict):
+        return {str(key): plain_data(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_data(part) for part in value]
+    if hasattr(value, "tolist"):  # an array, or a number of NumPy's
+        return plain_data(value.tolist())
+    return None if isinstance(value, float) and not isfinite(value) else value
 
 
 def check_page(page: str | Path) -> Path:

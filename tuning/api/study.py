@@ -16,7 +16,7 @@ from filters.registry import filter_type
 from thruster_env.core.text_tables import Table
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.held_out import HeldOut
-from tuning.api.result import Result, about, drawn, frame
+from tuning.api.result import Result, about, drawn, frame, plain_data
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import check_keepable, write_tuned
 from tuning.evaluation.worth import all_warnings, tuning_effect
@@ -247,7 +247,7 @@ class Study(Result):
 
     def as_dict(self) -> dict[str, Any]:
         """All results as plain data, as in `thruster tune --json`."""
-        return as_json(self)
+        return plain_data(as_json(self))
 
     @property
     def exit_code(self) -> int:

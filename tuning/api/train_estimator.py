@@ -36,7 +36,7 @@ from tuning.api.markers import (
 )
 from tuning.api.problems import problem_of
 from tuning.api.progress import console_for
-from tuning.api.result import Result, about, drawn, frame, number
+from tuning.api.result import Result, about, drawn, frame, number, plain_data
 from tuning.api.tune import file_name
 from tuning.evaluation.baselines import ORACLE, oracle
 from tuning.evaluation.tuned import read_choice
@@ -163,7 +163,7 @@ class EstimatorTraining(Result):
             for name, evaluation in standing.evaluations.items():
                 row[name] = {"score": evaluation.score.value, "ratio": standing.ratio(first, name)._asdict()}
             rows.append(row)
-        return {
+        data = {
             "kind": self.kind,
             "problem": self.problem.name,
             "file": str(self.file),
@@ -172,6 +172,7 @@ class EstimatorTraining(Result):
             "seconds": self.seconds,
             "interrupted": self.interrupted,
         }
+        return plain_data(data)
 
     def to_frame(self) -> pandas.DataFrame:
         """A row for each filter: scores on held-out, longer and noisier runs, with their ratios to the first."""

@@ -16,7 +16,7 @@ from thruster_env.core.text_tables import Table
 from tuning.api.markers import CodeProblem, ExecutorOption, ModelOption, PresetOption, Progress, TunedFile
 from tuning.api.problems import given_for
 from tuning.api.progress import console_for, working
-from tuning.api.result import Result
+from tuning.api.result import Result, plain_data
 from tuning.evaluation.held_out import evaluate_held_out, versions
 from tuning.evaluation.tuned import metrics, problem_in, read_tuned
 
@@ -94,13 +94,14 @@ class Verification(Result):
 
     def as_dict(self) -> dict[str, Any]:
         """All results as plain data, as in `thruster verify --json`."""
-        return {
+        data = {
             "file": self.file,
             "holds": self.holds,
             "checked": self.checked,
             "differences": [{**d._asdict(), "relative": d.relative} for d in self.differences],
             "packages": {name: {"stored": then, "here": now} for name, (then, now) in self.packages.items()},
         }
+        return plain_data(data)
 
 
 def verify(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,6 +13,7 @@ from rich.console import Console, RenderableType
 
 from thruster_env.core.files import check_target, write_whole
 from thruster_env.core.text_tables import Unfolded, console
+from tuning.api.result import plain_data
 from tuning.cli.interrupts import PrintedWhole
 
 progress_console = Console(stderr=True, markup=False, highlight=False)
@@ -113,16 +113,4 @@ def progress_of(title: str, out: Path | None = None) -> Iterator[Callable[[str, 
 
 def as_text(data) -> str:
     """JSON of plain data, arrays and NamedTuples; numbers that are not finite become null."""
-    return json.dumps(_plain(data), indent=2, allow_nan=False) + "\n"
-
-
-def _plain(value):
-    if isinstance(value, dict):
-        return {str(key): _plain(part) for key, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(part) for part in value]
-    if hasattr(value, "tolist"):  # an array, or a number of NumPy's
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return json.dumps(plain_data(data), indent=2, allow_nan=False) + "\n"

@@ -23,7 +23,7 @@ from thruster_env.core.streams import filter_keys
 from thruster_env.core.text_tables import Table, Unfolded
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.continuous import ContinuousModel
-from tuning.api.result import Result, frame
+from tuning.api.result import Result, frame, plain_data
 from tuning.likelihood.ascent import climb
 from tuning.series.column import Column, seconds_text
 from tuning.series.fit import CANDIDATES, Candidate, Choice, Number, behind, choose, filtered
@@ -346,7 +346,7 @@ class SeriesFit(Result):
     def as_dict(self) -> dict[str, Any]:
         """All of it as plain data, for JSON."""
         f, _, _, h, offset = self.model.matrices()
-        return {
+        data = {
             "model": self.name,
             "rows": len(self.column.values),
             "measured": int(self.column.measured.any(axis=1).sum()),
@@ -368,6 +368,7 @@ class SeriesFit(Result):
             ],
             "sentences": self.sentences(),
         }
+        return plain_data(data)
 
     def tables(self) -> list[Table | str]:
         """Half a page for the terminal: the model, its numbers with intervals, and what they mean."""
