@@ -38,7 +38,6 @@ from thruster_env.model.simulate import noise_step, simulate, truth_steps
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.traced import called_function
 from thruster_env.model.turns import (
-    refuse_measured,
     slopes_of_stored,
     slopes_of_tangent,
     tangent_of,
@@ -133,13 +132,12 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
     Args:
         model: the model that draws the truth.
         inputs: (B, K, p), one sequence a row.
-        missing: whether each measurement is missing, (B, K + 1, m); none if None.
+        missing: whether each measurement is missing, (B, K + 1, channels); none if None.
 
     Returns:
         P_k for every sequence and step, (B, K + 1, n, n), of rotations (B, K + 1, t, t) in their tangent; index 0
         is after the first measurement. NaN for a sequence along which it is too large for float64.
     """
-    refuse_measured(model, "a bound")
     inputs = np.ascontiguousarray(as_floats(inputs))
     keys, nothing = np.zeros((len(inputs), 2)), np.zeros((model.t, model.t))
     rounding = 1e-30 * model.measurement_noise_cov  # none at all is no covariance of a measurement
@@ -325,7 +323,6 @@ def _truth_keys(count: int, truths: int, seed: int) -> np.ndarray:
 
 def _posterior_bound(model: StateSpaceModel, inputs: np.ndarray, keys: np.ndarray) -> np.ndarray:
     """The bound of `posterior_bound` from the truths of these keys, by square roots S S' = P."""
-    refuse_measured(model, "a bound")
     if not has_bound(model.process_noise_cov):
         raise ValueError(f"the bound needs a positive definite Q, but got {model.process_noise_cov.tolist()}")
     (count, steps, _), n = inputs.shape, model.t
@@ -388,7 +385,7 @@ def _square(root: np.ndarray) -> np.ndarray:
 def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
     n, t, m, transition = shape.n, shape.t, shape.m, functions.transition
     transition_matrix = transition_slopes(functions, shape)
-    observation_matrix = for_any_input(observation_slopes(functions, shape), shape, "x, scales")
+    observation_matrix = _of_innovations(functions, shape)
     (begin, _, _), disturb = truth_steps(functions, shape), noise_step(shape)
     state, store_state = vector_reader(n), vector_writer(n)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
@@ -445,6 +442,25 @@ def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
     matrices, weights = [(None, None, t, t)] * 3, ((t * t,), (m * m,))
     shapes = (None, None, 2), None, (None, None, None), (None,), *weights, *matrices, None, None
     return Loops(gather, shapes)
+
+
+def _of_innovations(functions: Functions, shape: Shape):
+    """The function of x, scales, u and c: H (m, n), of measured rotations on their tangent at h(x)."""
+    slopes, turns = for_any_input(observation_slopes(functions, shape), shape, "x, scales"), shape.measured_turns
+    if not turns:
+        return slopes
+
+    def back(y, c):
+        return tuple(map(tuple, slopes_of_tangent(y, turns)))
+
+    m, channels, observe = shape.m, shape.channels, for_any_input(functions.observe, shape)
+    by_tangent = called_function(back, "y, c", (channels, 0), 0, (m, channels))
+    on_tangent = multiplier(m, channels, shape.n)
+
+    def of_innovations(x, scales, u, c):
+        return on_tangent(by_tangent(observe(x, u, c), ()), slopes(x, scales, u, c))
+
+    return of_innovations
 
 
 def _same(x):

@@ -43,7 +43,7 @@ from thruster_env.model import rotations
 from thruster_env.model.euler import EulerAngle, euler_outputs
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.simulate import inputs_until
-from thruster_env.model.turns import readings, refuse_measured
+from thruster_env.model.turns import of_channels, readings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -349,15 +349,13 @@ def alarms_of(estimate: LogEstimate, monitor: Monitor, first: int = 0, *, isolat
         isolate: whether to run the filter without each channel, too, and count the alarms of the others.
 
     Raises:
-        ValueError: for a filter without a covariance, measured rotations, and to isolate the only channel.
+        ValueError: for a filter without a covariance, and to isolate the only channel.
     """
     if not estimate.filter.has_covariance:
         raise ValueError(f"a monitor needs a filter with a covariance, but {estimate.filter.name!r} has none")
-    refuse_measured(estimate.model, "a log with a monitor")
-    measurements = estimate.log.measurements
     without = None
     if isolate:
-        channels = measurements.shape[1]
+        channels = estimate.model.m
         if channels < 2:
             raise ValueError("a faulty channel can be isolated among two or more, but the filter has one")
         without = tuple(
@@ -367,7 +365,8 @@ def alarms_of(estimate: LogEstimate, monitor: Monitor, first: int = 0, *, isolat
 
 
 def _alarms(estimate: LogEstimate, monitor: Monitor, first: int) -> list[Alarm]:
-    tested = estimate.innovations[first:], estimate.innovation_covs[first:], estimate.log.measurements[first:]
+    measurements = readings(estimate.log.measurements[first:], estimate.model.measured_turns)
+    tested = estimate.innovations[first:], estimate.innovation_covs[first:], measurements
     return [
         alarm._replace(step=alarm.step + first, since=alarm.since + first) for alarm in monitor.alarms(*tested)
     ]
@@ -375,10 +374,12 @@ def _alarms(estimate: LogEstimate, monitor: Monitor, first: int) -> list[Alarm]:
 
 def _alarms_without(estimate: LogEstimate, monitor: Monitor, first: int, channel: int) -> list[Alarm]:
     """Alarms of the other channels if the filter runs without one."""
-    measurements = estimate.log.measurements.copy()
-    measurements[:, channel] = np.nan
+    turns = estimate.model.measured_turns
+    left_out = np.array(of_channels(np.arange(estimate.model.m) == channel, turns))
+    measurements = np.where(left_out, np.nan, estimate.log.measurements)
     again = estimate_with(estimate.filter, replace(estimate.log, measurements=measurements), noise=estimate.noise)
-    return [alarm for alarm in _alarms(again, monitor, first) if alarm.channel != channel]
+    gone = np.delete(left_out, [turn.stored for turn in turns])
+    return [alarm for alarm in _alarms(again, monitor, first) if not gone[alarm.channel]]
 
 
 def _statistical(alarms: Sequence[Alarm]) -> list[Alarm]:

@@ -36,6 +36,7 @@ from thruster_env.model.quantities import Quantity
 
 SIDES = "body", "world"
 STORED, AXES = "wxyz", "xyz"
+MEAN_STEPS = 8  # towards a mean rotation
 Quantities = list[Quantity]
 
 
@@ -209,14 +210,6 @@ def refuse_rotations(model: Any) -> None:
         )
 
 
-def refuse_measured(model: Any, where: str) -> None:
-    """Raise ValueError for a model that measures rotations, directions or poses; `where` takes none."""
-    if model.measured_turns:
-        names = " and ".join(repr(turn.name) for turn in model.measured_turns)
-        rule = f"measurements of {where} must be numbers and angles, but {names} turns"
-        raise ValueError(f"{rule}: filters.run, sessions, EstimateState and C take such models")
-
-
 def readings(z: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
     """Measurements (..., m) by innovation: of a part all numbers but the first, NaN where one is missing."""
     z = np.array(z, dtype=np.float64)
@@ -296,6 +289,40 @@ def tangent_of(model: Any, known: int | None = None) -> tuple[Quantity, ...]:
     """The quantities of an error of a model's state, or of its first `known` stored numbers."""
     states = model.states[:known]
     return tuple(error_quantities(states, leading(model.turns, len(states))))
+
+
+def innovations_of(model: Any) -> tuple[Quantity, ...]:
+    """The m quantities of an innovation of a model, of R and of an error of a measurement."""
+    return tuple(error_quantities(model.measurements, model.measured_turns))
+
+
+def differences_of(model: Any, measured: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Differences (..., m) of measurements z from y (..., channels): z - y, angles wrapped, e of rotations.
+
+    z = move(y, e), NaN where a number of the part is missing
+    """
+    turns, flags = model.measured_turns, model.any_shape.measurement_angles
+    if not turns:
+        return angles.difference(measured, expected, flags)
+    z, y = (np.moveaxis(values, -1, 0) for values in np.broadcast_arrays(measured, expected))
+    e = np.stack([np.asarray(part) for part in innovation(z, y, turns)], axis=-1)
+    return angles.wrapped_where(e, tangent_flags(flags, turns))
+
+
+def about_mean(rows: np.ndarray, turns: Sequence[Turn], flags: Sequence[bool]) -> np.ndarray:
+    """States or measurements, one a row, angles on the branch of their circular mean; NaN where one is missing.
+
+    With rotations among them these are differences (N, t) from the mean row.
+    """
+    if not turns:
+        return angles.on_one_branch(rows, flags)
+    complete = ~np.isnan(rows).any(axis=1)
+    mean = rows[complete.argmax()]
+    for _ in range(MEAN_STEPS):
+        apart = np.stack([np.asarray(d) for d in innovation(rows.T, mean[:, None], turns)], axis=-1)
+        apart = angles.wrapped_where(apart, tangent_flags(flags, turns))
+        mean = np.array(move(mean, np.nanmean(apart, axis=0), turns))
+    return apart
 
 
 def errors_of(model: Any, means: np.ndarray, states: np.ndarray) -> np.ndarray:

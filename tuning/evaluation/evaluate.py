@@ -28,7 +28,7 @@ from filters.ensembles.square_root import record_members
 from filters.filter import Filter
 from filters.starts import Restarts, restarts_of
 from thruster_env.model.quantities import Quantity
-from thruster_env.model.turns import errors_of, tangent_of
+from thruster_env.model.turns import errors_of, innovations_of, readings, tangent_of
 from tuning.evaluation.runs import RunMetrics, metrics_of_all, outputs_of
 from tuning.problems.data import Data, estimates_in_parts
 
@@ -189,7 +189,7 @@ def compute_metrics(
         **_errors(filter_, runs, data, scale, intervals),
         nis=mean_interval(runs.nis, intervals),
         expected_nis=float(counts.mean()) if counts.size else np.nan,
-        channels=data.measurements.shape[-1],
+        channels=filter_.model.m,
         log_likelihood=float(runs.log_likelihoods.mean()),
         log_likelihoods=runs.log_likelihoods,
         weights=runs.weights,
@@ -288,7 +288,8 @@ def check_consistency(filter_: Filter, data: Data, dt: float | None = None) -> C
             means = estimates.means[..., :t] if truth is None else errors_of(model, estimates.means, truth)
             of_plant = estimates._replace(means=means, covs=estimates.covs[..., :t, :t])
             truth = None if truth is None else np.zeros(means.shape)
-        parts.append(findings(of_plant, truth, runs.measurements, first, angles, runs.counted))
+        measured = readings(runs.measurements, model.measured_turns)
+        parts.append(findings(of_plant, truth, measured, first, angles, runs.counted))
     report = report_of(
         joined(parts),
         states,
@@ -296,7 +297,7 @@ def check_consistency(filter_: Filter, data: Data, dt: float | None = None) -> C
         first_step=first,
         names=[quantity.short_label for quantity in quantities],
         angles=angles,
-        channels=[channel.label for channel in model.measurements],
+        channels=[channel.label for channel in innovations_of(model)],
     )
     return report._replace(constants=tuple(getattr(model.constants, "_fields", ())), blown=blown)
 
@@ -379,6 +380,8 @@ def blow_up(filter_: Filter, estimates: Estimates, data: Data, dt: float | None)
         data: inputs and measurements.
         dt: sample time [s], if there is one.
     """
-    names = [channel.name for channel in filter_.model.measurements]
-    innovations, measurements = (data.late_scored(values) for values in (estimates.innovations, data.measurements))
+    model = filter_.model
+    names = [channel.name for channel in innovations_of(model)]
+    measured = readings(data.measurements, model.measured_turns)
+    innovations, measurements = (data.late_scored(values) for values in (estimates.innovations, measured))
     return blow_up_sentence(innovations, measurements, names, dt)

@@ -442,8 +442,11 @@ def gain_over_regression(model: StateSpaceModel, tuned: Evaluation, training: Da
         data: runs on which both are compared.
 
     Returns:
-        The mean over all scored measurements; NaN for a filter without a covariance, or if there are too few rows.
+        The mean over all scored measurements; NaN for a filter without a covariance, for measured
+        rotations, or if there are too few rows.
     """
+    if model.measured_turns:
+        return NOTHING
     angles = [is_angle(i, model.any_shape.measurement_angles) for i in range(model.m)]
     densities = log_densities(training, data, np.array(angles))
     scored = np.where(data.scored[..., None], densities, np.nan)

@@ -14,13 +14,12 @@ import numpy as np
 
 from filters.consistency.nees import normalized_squares
 from filters.filter import Filter
-from thruster_env.core.angles import difference
 from thruster_env.core.checks import correlation_flaws
 from thruster_env.core.compiled import is_interpreting
 from thruster_env.core.sources import vector_reader, vector_writer
 from thruster_env.model.shape import Functions, Shape, constants_reader, for_any_input
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import errors_of, tangent_of
+from thruster_env.model.turns import differences_of, errors_of, innovations_of, readings, tangent_of
 from tuning.problems.assumed import within
 from tuning.problems.check import data_of
 from tuning.problems.data import Data, estimates_in_parts
@@ -106,7 +105,7 @@ def heavy_innovations(filter_: Filter, problems_data: Sequence[Data]) -> dict[st
     """`heavy_tails` of a filter's innovations over their deviations in S, of scored steps."""
     if not filter_.has_covariance:
         return {}
-    names = [channel.symbol for channel in filter_.model.measurements]
+    names = [channel.symbol for channel in innovations_of(filter_.model)]
     ratios = [ratio.reshape(-1, len(names)) for data in problems_data for ratio, _ in _innovations(filter_, data)]
     return heavy_tails(np.concatenate(ratios), names)
 
@@ -116,7 +115,7 @@ def _innovations(filter_: Filter, data: Data):
     for part, estimates in estimates_in_parts(filter_, data):
         late = part.late
         variances = np.einsum("bkii->bki", estimates.innovation_covs[:, late])
-        present = ~np.isnan(part.late_scored(part.measurements))
+        present = ~np.isnan(readings(part.late_scored(part.measurements), filter_.model.measured_turns))
         with np.errstate(all="ignore"):
             ratios = estimates.innovations[:, late] / np.sqrt(variances)
             nis = normalized_squares(estimates.innovations[:, late], estimates.innovation_covs[:, late])
@@ -237,7 +236,7 @@ def residuals(model: StateSpaceModel, data: Data) -> Residuals:
     expected, outputs = predicted(model, states, inputs)
     measured = data.late_scored(data.measurements)
     process = -errors_of(model, expected, states[:, 1:])
-    measurement = difference(measured, outputs, model.any_shape.measurement_angles)
+    measurement = differences_of(model, measured, outputs)
     complete = [np.isfinite(rows).all(axis=-1) for rows in (process, measurement)]
     both = [mask[:, :-1] & mask[:, 1:] for mask in complete]
     pairs = [
@@ -247,9 +246,9 @@ def residuals(model: StateSpaceModel, data: Data) -> Residuals:
 
 
 def predicted(model: StateSpaceModel, states: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """F along states (B, T, n) and inputs (B, T - 1, p), (B, T - 1, n), and h, (B, T, m)."""
+    """F along states (B, T, n) and inputs (B, T - 1, p), (B, T - 1, n), and h, (B, T, channels)."""
     states, inputs = (np.ascontiguousarray(rows, dtype=np.float64) for rows in (states, inputs))
-    expected, outputs = np.empty(states[:, 1:].shape), np.empty((*states.shape[:2], model.m))
+    expected, outputs = np.empty(states[:, 1:].shape), np.empty((*states.shape[:2], model.channels))
     steps = _steps(model.functions, model.any_shape, is_interpreting())
     steps(states, inputs, model.numbers, expected, outputs)
     return expected, outputs
@@ -286,7 +285,7 @@ def estimated_from(model: StateSpaceModel, data: Data) -> Estimated:
     mean_w, mean_v = (rows.mean(axis=0) for rows in model_residuals[:2])
     names = (
         [f"w of {state.symbol}" for state in tangent_of(model)],
-        [f"v of {channel.symbol}" for channel in model.measurements],
+        [f"v of {channel.symbol}" for channel in innovations_of(model)],
     )
     w, v = (heavy_tails(*pair) for pair in zip(model_residuals[:2], names, strict=True))
     of_w, of_v = (_correlation(rows) for rows in model_residuals[2:])
@@ -328,7 +327,7 @@ def model_error(problem: Problem, seed: int = 0) -> str:
     )
     variances = np.diag(model.measurement_noise_cov)
     errors |= _errors(
-        model.measurements, variances, model_residuals.measurement, model_residuals.measurement_pairs, 0.0
+        innovations_of(model), variances, model_residuals.measurement, model_residuals.measurement_pairs, 0.0
     )
     return errors[max(errors)] if errors else ""
 
@@ -370,7 +369,12 @@ def _is_regular(cov: np.ndarray) -> bool:
 @lru_cache(maxsize=64)
 def _steps(functions: Functions, shape: Shape, interpreting: bool):
     """The function steps(states, inputs, numbers, expected, outputs) that evaluates f and h along true states."""
-    n, m, transition, observe = shape.n, shape.m, functions.transition, for_any_input(functions.observe, shape)
+    n, m, transition, observe = (
+        shape.n,
+        shape.channels,
+        functions.transition,
+        for_any_input(functions.observe, shape),
+    )
     substeps = shape.offsets.substeps
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)

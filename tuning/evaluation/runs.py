@@ -15,7 +15,7 @@ from thruster_env.core.angles import difference
 from thruster_env.model.euler import EulerAngle
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import errors_of, leading, rotation_angles
+from thruster_env.model.turns import errors_of, leading, readings, rotation_angles
 from tuning.problems.data import FIRST_SCORED_STEP, Data, estimates_in_parts, where_true
 
 LEAST = -1e6  # log score of a step whose covariance is singular or not finite
@@ -90,7 +90,8 @@ def metrics_by_run(
     and omitted without a scale.
     """
     late, measurements = data.late, data.measurements
-    present = (~np.isnan(data.late_scored(measurements))).sum(axis=-1)
+    turns = filter_.model.measured_turns
+    present = (~np.isnan(readings(data.late_scored(measurements), turns))).sum(axis=-1)
     squares = normalized_squares(estimates.innovations[:, late], estimates.innovation_covs[:, late])
     likelihoods = np.full(len(measurements), np.nan)
     if filter_.has_covariance:

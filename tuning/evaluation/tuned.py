@@ -34,6 +34,7 @@ from thruster_env.core.checks import at_least, covariance, positive, short_repr
 from thruster_env.core.files import write_whole
 from thruster_env.core.modules import is_code
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import readings
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import ROLES, Comparison, numbers, sizes_as_data, summary, versions
 from tuning.problems.assumed import augmented, name_and_unknown, suited
@@ -147,9 +148,10 @@ def monitor_data(monitor: Monitor, channels: int) -> dict[str, Any]:
 
 def _monitor_of(choice: Choice, plan: Plan) -> dict | None:
     """The monitor of a filter with a covariance, whose counts follow from the training runs; else None."""
-    if not choice.filter(plan.scenarios[0]).has_covariance:
+    filter_ = choice.filter(plan.scenarios[0])
+    if not filter_.has_covariance:
         return None
-    measurements = plan.training_data()[0].seen.measurements
+    measurements = readings(plan.training_data()[0].seen.measurements, filter_.model.measured_turns)
     return monitor_data(monitor_for(measurements), measurements.shape[-1])
 
 

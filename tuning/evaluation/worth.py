@@ -70,7 +70,7 @@ def warnings_of(evaluation: Evaluation, problem: Problem, forget: float | None =
         problem: on which it was evaluated.
         forget: the longest time constant that was allowed [s]; None for a fifth of a run.
     """
-    channels = len(problem.quantities.measurements)
+    channels = len(problem.innovations)
     uneven = [] if evaluation.uneven is None else [uneven_sentence(evaluation.uneven, channels)]
     return [*_nees_warning(evaluation), *_memory_warning(evaluation, problem, forget), *uneven]
 

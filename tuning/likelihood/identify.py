@@ -18,7 +18,6 @@ import numpy as np
 from filters.adaptive import RobustExtendedKalmanFilter
 from filters.engine.batch import Estimates
 from filters.starts import Starts, as_the_prior_says
-from thruster_env.core.angles import difference, on_one_branch
 from thruster_env.core.checks import at_least, one_of, short_repr
 from thruster_env.core.files import BLUE, DARK, RUST, panels
 from thruster_env.core.parallel import IN_PROCESS, TaskMap
@@ -28,6 +27,7 @@ from thruster_env.core.text_tables import verbatim
 from thruster_env.logs.log import Log
 from thruster_env.model.simulate import inputs_until
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import about_mean, differences_of, innovations_of, of_channels, readings
 from tuning.likelihood.ascent import Ascent, climb
 from tuning.likelihood.identifiability import SIGNIFICANT, TWO_SIDED
 from tuning.likelihood.objective import Objective
@@ -514,12 +514,13 @@ def validation_of(
         unseen: (m,) which channels the filter only predicts: their errors are those of the estimate.
         starts: of the runs; None if all begin as the model's prior says.
     """
-    symbols = [channel.symbol for channel in model.measurements]
+    symbols = [channel.symbol for channel in innovations_of(model)]
     hidden = np.zeros(model.m, dtype=bool) if unseen is None else np.asarray(unseen)
     starts = as_the_prior_says(model, len(runs.measurements)) if starts is None else starts
     counted = np.arange(runs.measurements.shape[1]) >= starts.counted_from[:, None]
-    scored = ~np.isnan(runs.measurements) & counted[..., None]
-    visible = runs._replace(measurements=np.where(hidden, np.nan, runs.measurements))
+    turns = model.measured_turns
+    scored = ~np.isnan(readings(runs.measurements, turns)) & counted[..., None]
+    visible = runs._replace(measurements=np.where(of_channels(hidden, turns), np.nan, runs.measurements))
     estimates, nothing = estimates_of(model, visible, starts), np.zeros((model.t, model.t))
     known = starts._replace(covs=np.zeros_like(starts.covs))
     simulated = estimates_of(model.replace(process_noise_cov=nothing, prior_cov=nothing), visible, known)
@@ -529,8 +530,8 @@ def validation_of(
         return np.sqrt((np.where(scored, errors, 0.0) ** 2).sum(axis=(0, 1)) / scored.sum(axis=(0, 1)))
 
     one_step, simulation = rmse(estimates), rmse(simulated)
-    rows = np.where(scored, runs.measurements, np.nan).reshape(-1, model.m)
-    rows = on_one_branch(rows, model.any_shape.measurement_angles)
+    rows = np.where(counted[..., None], runs.measurements, np.nan).reshape(-1, model.channels)
+    rows = about_mean(rows, turns, model.any_shape.measurement_angles)
     spread = np.array([rows[~np.isnan(rows[:, i]), i].std() for i in range(model.m)])
     fit = 100 * (1 - simulation / np.where(spread > 0, spread, np.nan))
     weighted = np.linalg.solve(estimates.innovation_covs, estimates.innovations[..., None])[..., 0]
@@ -577,11 +578,11 @@ def validate(
 def _less_predicted(model: StateSpaceModel, runs: Data, estimates: Estimates, hidden: np.ndarray) -> np.ndarray:
     """Measurements minus their prediction from the estimates, if some channels are hidden; else zeros."""
     if not hidden.any():
-        return np.zeros_like(runs.measurements)
+        return np.zeros((*runs.measurements.shape[:2], model.m))
     observe, c, fed = model.functions.observe, model.given_constants, model.any_shape.fed
     inputs = inputs_until(runs.inputs)
     predicted = [
         [observe(as_value(x), *fed(as_value(u)), c) for x, u in zip(*run, strict=True)]
         for run in zip(estimates.means.tolist(), inputs.tolist(), strict=True)
     ]
-    return difference(runs.measurements, np.array(predicted), model.any_shape.measurement_angles)
+    return differences_of(model, runs.measurements, np.array(predicted))

@@ -22,7 +22,7 @@ from filters.starts import Starts, as_the_prior_says
 from thruster_env.core.checks import one_of
 from thruster_env.core.sources import is_array
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import Turn, leading, stored_of
+from thruster_env.model.turns import Turn, innovations_of, leading, stored_of
 from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.ascent import Evaluation
 from tuning.problems.data import Data
@@ -467,7 +467,7 @@ def symmetric_units(size: int) -> np.ndarray:
 
 def _checked_channels(predicted: Sequence[str], model: StateSpaceModel) -> list[bool]:
     """Which channels are only predicted; ValueError for an unknown one, or if all are."""
-    symbols = [channel.symbol for channel in model.measurements]
+    symbols = [channel.symbol for channel in innovations_of(model)]
     for symbol in predicted:
         one_of("a predicted channel", symbol, symbols)
     unseen = [symbol in predicted for symbol in symbols]

@@ -27,7 +27,7 @@ from thruster_env.graphs.tracing import traced
 from thruster_env.logs.log import AnyStepModel, in_any_steps
 from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.traced import traced_model
-from thruster_env.model.turns import error_quantities
+from thruster_env.model.turns import innovations_of, tangent_of
 from tuning.likelihood.objective import Part
 from tuning.problems.data import Data
 from tuning.problems.problem import STEP, Coordinates, Parameter, Problem, squared
@@ -301,8 +301,7 @@ class ModelFamily:
         """Every parameter that may be free, with its range about its start."""
         starts = dict(self._arguments) | {name: getattr(self.base.constants, name) for name in self._fields}
         parameters = {name: about(name, float(value)) for name, value in starts.items()}
-        errors = error_quantities(self.base.states, self.base.turns)
-        units = [quantity.unit for quantity in (*errors, *self.base.measurements)]
+        units = [quantity.unit for quantity in (*tangent_of(self.base), *innovations_of(self.base))]
         for name, (_, index, variance) in self._noise.items():
             unit = units[index + (0 if name.startswith("Q") else self.base.t)]
             parameters.setdefault(name, variance_about(name, variance, unit))

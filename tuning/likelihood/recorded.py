@@ -28,6 +28,7 @@ from thruster_env.core.streams import filter_keys
 from thruster_env.logs.grid import NEIGHBOURS
 from thruster_env.logs.log import Log, at_offset, in_steps, seen_by
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import innovations_of, of_channels
 from tuning.likelihood.objective import Innovations, Objective, Part
 from tuning.likelihood.parametric import ParametricModel
 from tuning.problems.data import Data, mask_of, padded
@@ -158,7 +159,7 @@ class RecordedRuns(Part):
         if of_data is None:
             return None
         factors = of_data(**self._data_values(point))
-        return np.array([factors.get(channel.symbol, 1.0) for channel in self.first_model.measurements])
+        return np.array([factors.get(channel.symbol, 1.0) for channel in innovations_of(self.first_model)])
 
 
 def _arguments_among(function: Callable, names: Sequence[str]) -> tuple[str, ...]:
@@ -174,9 +175,9 @@ def _arguments_among(function: Callable, names: Sequence[str]) -> tuple[str, ...
 def _check_runs(run: Data, model: StateSpaceModel) -> None:
     """Raise ValueError unless runs have the model's inputs and measurements, and samples in each channel."""
     sizes = run.inputs.shape[-1], run.measurements.shape[-1]
-    if sizes != (model.inputs, model.m):
+    if sizes != (model.inputs, model.channels):
         raise ValueError(
-            f"data must have the model's {model.inputs} inputs and {model.m} measurements, "
+            f"data must have the model's {model.inputs} inputs and {model.channels} measurements, "
             f"but got {short_repr(sizes)}"
         )
     empty = np.isnan(run.measurements).all(axis=(0, 1))
@@ -308,7 +309,9 @@ def starts_of(model: StateSpaceModel, runs: Data, unseen: Sequence[bool] | None 
     """
     count = len(runs.measurements)
     starts = as_the_prior_says(model, count)
-    measured = np.where(np.zeros(model.m, dtype=bool) if unseen is None else unseen, np.nan, runs.measurements)
+    measured = np.where(
+        False if unseen is None else of_channels(unseen, model.measured_turns), np.nan, runs.measurements
+    )
     starts.leads[:] = [_lead(run_measurements) for run_measurements in measured]
     if model.turns:
         first = first_measured(measured)
@@ -356,7 +359,7 @@ def _wide_and_guess(model: StateSpaceModel, runs: Data) -> tuple[np.ndarray, lis
     nothing = np.zeros((model.n, model.n))
     simulated = ExtendedKalmanFilter(model=model.replace(process_noise_cov=nothing, prior_cov=nothing))
     first = np.repeat(runs.inputs[:, :1], LEAD, axis=1)
-    blind = np.full((len(first), LEAD + 1, model.m), np.nan)
+    blind = np.full((len(first), LEAD + 1, model.channels), np.nan)
     guesses = run(simulated, runs.filter_keys, first, blind).means[:, -1]
     silent = np.full_like(runs.measurements, np.nan)
     means = run(simulated, runs.filter_keys, runs.inputs, silent).means

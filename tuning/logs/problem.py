@@ -28,6 +28,7 @@ from thruster_env.logs.findings import has_outliers, remarks_on
 from thruster_env.logs.log import FEWEST_STEPS, Log, in_any_steps, piece_of
 from thruster_env.model.continuous import in_discrete_time
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import innovations_of
 from tuning.likelihood.identify import identify
 from tuning.likelihood.parametric import ModelFamily
 from tuning.likelihood.recorded import CLOCK, clock_offsets, shifted
@@ -543,7 +544,7 @@ def of_gyroscope(names: Sequence[str], model: StateSpaceModel, runs: Sequence[Lo
     sizes = np.abs(np.einsum("lii->li", white.correlations)).max(axis=0)
     if sizes.max() < max(CORRELATED, 5.0 / math.sqrt(run.steps)):
         return []
-    channel = model.measurements[int(sizes.argmax())].symbol
+    channel = innovations_of(model)[int(sizes.argmax())].symbol
     return [
         f"Beware of {' and '.join(free)}: innovations of {channel} are correlated, up to {sizes.max():.2f}, so "
         "the acceleration is not that of the model, for which noise of the gyroscope then pays: the likelihood "

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from thruster_env.model.state_space import StateSpaceModel
+from thruster_env.model.turns import readings
 from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.residuals import estimated_from
 from tuning.likelihood.ascent import Evaluation, climb, lbfgs
@@ -253,11 +254,12 @@ def _start(task: Task, goal: Objective) -> tuple[np.ndarray, np.ndarray]:
 
 def counts_of(task: Task) -> tuple[int, np.ndarray, int]:
     """Numbers of transitions, of measured values of each channel, (m,), and of times with a measurement."""
-    transitions, measured, times = 0, np.zeros(task.data[0].measurements.shape[-1]), 0
+    transitions, measured, times = 0, np.zeros(task.problems[0].model().m), 0
     for problem, data in zip(task.problems, task.data, strict=True):
         first = data.first_scored if problem.leads_in else 0
         transitions += int(np.maximum(data.rows - max(first, 1), 0).sum())
-        known = ~np.isnan(data.seen.measurements[:, first:])
+        turns = problem.model().measured_turns
+        known = ~np.isnan(readings(data.seen.measurements[:, first:], turns))
         measured, times = measured + known.sum(axis=(0, 1)), times + int(known.any(axis=-1).sum())
     return transitions, measured, times
 

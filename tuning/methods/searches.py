@@ -13,7 +13,7 @@ import numpy as np
 import optuna
 from optuna.distributions import BaseDistribution
 
-from thruster_env.core.angles import difference
+from thruster_env.model.turns import differences_of
 from tuning.evaluation.residuals import predicted
 from tuning.likelihood.ascent import DIVERGED
 from tuning.methods.task import (
@@ -219,7 +219,7 @@ def _squares(task: Task, choice: Choice, index: int, hidden: np.ndarray) -> np.n
         last = first + len(part.seeds)
         _, expected = predicted(model, estimates.means, part.seen.inputs)
         z = part.late_scored(data.measurements[first:last])
-        left = difference(z, expected[:, data.late], model.any_shape.measurement_angles)
+        left = differences_of(model, z, expected[:, data.late])
         left = np.where(hidden[first:last, data.late, None], left, np.nan)
         totals = totals + np.nansum(left**2, axis=(0, 1))
         counts = counts + (~np.isnan(left)).sum(axis=(0, 1))

@@ -24,11 +24,10 @@ from filters.augmented import Unknown, augmented_model
 from filters.consistency.report import estimable
 from filters.consistency.time_constants import Run
 from filters.tuned_file import AUGMENTED, NOISE, PRIOR
-from thruster_env.core.angles import on_one_branch
 from thruster_env.core.checks import at_least, one_of, positive, short_repr
 from thruster_env.core.modules import error_line
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import errors_of, leading, move, refuse_measured
+from thruster_env.model.turns import about_mean, leading
 from tuning.problems.check import DIGEST_RUNS, check_data, digest_of, numbers_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data, checked_first_scored_step
 from tuning.problems.problem import GIVEN, SPREAD, Parameter, Problem
@@ -36,7 +35,6 @@ from tuning.problems.problem import GIVEN, SPREAD, Parameter, Problem
 RANGE_SEEDS = range(8)  # seeds whose runs determine each state's range, unless the model has it
 RANGE_FRACTION = 0.01  # standard deviation of the rule of thumb's Q, as a fraction of each state's range
 MOST_STEPS = 1_000_000
-MEAN_STEPS = 8  # towards a mean rotation
 
 # Constants to estimate, in the name of a problem.
 NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -91,7 +89,6 @@ class AssumedProblem(Problem):
         self._dt = None if dt is None else positive("dt", dt)
         if self._parameters is not None and isinstance(assumed, StateSpaceModel):
             raise ValueError(f"a model with parameters must be a function of them, but got {short_repr(assumed)}")
-        refuse_measured(self.model(), "a problem")
 
     @abstractmethod
     def make(self, seeds: tuple[int, ...]) -> Data:
@@ -264,13 +261,7 @@ def rows_of(states: np.ndarray, model: StateSpaceModel) -> np.ndarray:
     """
     rows = states.reshape(-1, states.shape[-1])
     turns, angles = leading(model.turns, rows.shape[1]), model.any_shape.state_angles[: rows.shape[1]]
-    if not turns:
-        return on_one_branch(rows, angles)
-    mean = rows[0]
-    for _ in range(MEAN_STEPS):
-        apart = -errors_of(model, mean, rows)
-        mean = np.array(move(mean, apart.mean(axis=0), turns))
-    return apart
+    return about_mean(rows, turns, angles)
 
 
 def as_argument(cov: np.ndarray):

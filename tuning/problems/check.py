@@ -99,7 +99,7 @@ def check_data(data: Data, model: StateSpaceModel, name: str) -> None:
     count, steps = len(data.seeds), np.shape(data.inputs)[1] if np.ndim(data.inputs) == 3 else 0
     wanted = {
         "inputs": (count, steps, model.inputs),
-        "measurements": (count, steps + 1, model.m),
+        "measurements": (count, steps + 1, model.channels),
         "filter_keys": (count, 2),
     }
     parts = {entry: getattr(data, entry) for entry in wanted}

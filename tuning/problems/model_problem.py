@@ -456,7 +456,7 @@ def log_of(run: Mapping | Sequence, model: StateSpaceModel, dt: float = 1.0, nam
     if unknown or run.get("measurements") is None:
         got = short_repr(unknown[0]) if unknown else "no measurements"
         raise ValueError(f"{name} must have measurements, and may have inputs and states, but got {got}")
-    measurements = _columns("measurements", run["measurements"], model.m, name)
+    measurements = _columns("measurements", run["measurements"], model.channels, name)
     user_inputs = run.get("inputs")
     inputs = (
         np.zeros((len(measurements) - 1, 0))

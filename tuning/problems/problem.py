@@ -19,7 +19,7 @@ from filters.consistency.time_constants import Run
 from thruster_env.core.checks import at_least, finite, short_repr
 from thruster_env.model.quantities import Quantities, Quantity
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import tangent_of
+from thruster_env.model.turns import innovations_of, tangent_of
 from tuning.problems import data as seeds
 from tuning.problems.data import Data, runs_of
 
@@ -369,6 +369,11 @@ class Problem(ABC):
     def errors(self) -> tuple[Quantity, ...]:
         """Those of errors of the state, of which Q, P and the scale are: of rotations the components in rad."""
         return tangent_of(self.model())
+
+    @property
+    def innovations(self) -> tuple[Quantity, ...]:
+        """Those of innovations, of which R is: of measured rotations the components in rad."""
+        return innovations_of(self.model())
 
     @property
     def parameters(self) -> tuple[Parameter, ...] | None:

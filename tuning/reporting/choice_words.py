@@ -102,7 +102,7 @@ def choice_sentences(validation: Mapping[str, Any] | None, plan: Any) -> list[st
             f"Your own parameters cannot express the Q and R of the {called(chosen)}; those of {the} are "
             f"{_own(met[candidate], plan)}."
         )
-    channels = len(plan.scenarios[0].quantities.measurements)
+    channels = len(plan.scenarios[0].innovations)
     if validation.get("failures"):
         sentences.append(_failures_sentence(validation, plan.scenarios[0].seed_word, channels))
     if validation["price"] is not None and validation["price"] > MOST_PRICE:
@@ -332,9 +332,8 @@ def residual_sentences(problem: Problem, seed: int = 0) -> list[str]:
     noise = noise_estimation(problem, seed)
     if noise.process_cov is None or noise.measurement_cov is None:
         return []
-    model = problem.quantities
     w = _told(problem.errors, noise.process_cov, noise.process_mean, noise.process_correlation)
-    v = _told(model.measurements, noise.measurement_cov, noise.measurement_mean, noise.measurement_correlation)
+    v = _told(problem.innovations, noise.measurement_cov, noise.measurement_mean, noise.measurement_correlation)
     parts = [f"{what} {', '.join(remarks)}" for what, remarks in (("w of", w), ("v of", v)) if remarks]
     wrong = {f"{what} {remark.partition(' (')[0]}" for what, each in (("w of", w), ("v of", v)) for remark in each}
     heavy, tails = {name: share for name, share in noise.tails.items() if name not in wrong}, []
@@ -402,12 +401,12 @@ def model_doubts(problem: Problem, comparison: Comparison, seed: int = 0) -> lis
 
 def _correlation_doubt(problem: Problem, seed: int) -> list[str]:
     """Residuals of the true states that strongly correlate with the next step, in a sentence in a list."""
-    noise, model = noise_estimation(problem, seed), problem.quantities
+    noise = noise_estimation(problem, seed)
     if noise.process_correlation is None or noise.measurement_correlation is None:
         return []
     parts = (
         ("w of", problem.errors, noise.process_correlation),
-        ("v of", model.measurements, noise.measurement_correlation),
+        ("v of", problem.innovations, noise.measurement_correlation),
     )
     strong = [
         f"{r:+.2g} ({what} {quantity.symbol})"

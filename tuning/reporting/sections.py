@@ -18,7 +18,7 @@ from filters.registry import filter_type
 from thruster_env.core.files import BLUE, GREY, RUST, grid_of, new_figure, panels, tidy
 from thruster_env.core.text_tables import verbatim
 from thruster_env.model.quantities import Quantity
-from thruster_env.model.turns import tangent_of
+from thruster_env.model.turns import innovations_of, tangent_of
 from tuning.evaluation.baselines import TUNED, baseline_size, baselines
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison, versions
@@ -308,12 +308,12 @@ def model_section(choice: Choice, scenario: Problem) -> Section:
     ][:6]
     paragraphs += [
         f"A reading of {channel.text_symbol} is off by {_amount(variance, channel)} (standard deviation)."
-        for channel, variance in zip(model.measurements, model.measurement_noise_cov.diagonal(), strict=True)
+        for channel, variance in zip(innovations_of(model), model.measurement_noise_cov.diagonal(), strict=True)
     ][:6]
     if "ensemble_size" in choice.numbers:
         paragraphs.append(f"It carries {choice.numbers['ensemble_size']} members.")
     rows = [*_rows("Q", model.process_noise_cov, errors), *_rows("P0 ", model.prior_cov, errors)]
-    rows += _rows("R", model.measurement_noise_cov, model.measurements)
+    rows += _rows("R", model.measurement_noise_cov, innovations_of(model))
     columns = ["", "of", "variance", "standard deviation"]
     table = Table("Diagonals of Q, of P_0, the prior's covariance, and of R", columns, rows[:MOST_ROWS])
     return Section("Model, Q and R", [Words(paragraphs), table])
@@ -381,7 +381,7 @@ def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
 
 
 def _nis_words(nis: Sequence[float], plan: Plan) -> str:
-    word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].quantities.measurements)
+    word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].innovations)
     low, high = NIS_BAND
     side = "inside" if all(low <= ratio <= high for ratio in nis) else "outside"
     means, low, high = " and ".join(f"{channels * ratio:.3g}" for ratio in nis), channels * low, channels * high

@@ -12,7 +12,7 @@ import numpy as np
 from filters.engine.batch import Estimates
 from filters.filter import Filter
 from filters.logs.findings import MEASURED, SPARSE, TRUTH, colour_of, is_sparse
-from thruster_env.core.angles import with_breaks, wrapped, wrapped_where
+from thruster_env.core.angles import with_breaks, wrapped_where
 from thruster_env.core.files import BLUE, GREY, RUST, new_figure, thinned, tidy
 from thruster_env.core.sources import as_value, is_array
 from thruster_env.core.text_tables import TITLE, verbatim
@@ -21,7 +21,17 @@ from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import observation_slopes
 from thruster_env.model.simulate import inputs_until
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import Turn, leading, slopes_of_stored, tangent_of
+from thruster_env.model.turns import (
+    Turn,
+    innovations_of,
+    leading,
+    move,
+    readings,
+    slopes_of_stored,
+    slopes_of_tangent,
+    tangent_flags,
+    tangent_of,
+)
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data, estimates_on
 from tuning.reporting.page import Section, Sketchbook, Words
@@ -181,7 +191,7 @@ def draw_estimates(
     states = model.states if data.states is None else model.states[: data.states.shape[-1]]
     states = tuple(displayed_quantities(states, leading(model.turns, len(states))))
     indices, left_out = plotted_states(states, scored)
-    rows = _rows(states, indices, model.measurements, data.states is not None)
+    rows = _rows(states, indices, innovations_of(model), data.states is not None)
     heights = [row.height for row in rows]
     unit = UNIT if len(indices) <= 2 else UNIT_OF_MANY
     figure = new_figure((WIDTH * len(filters), unit * sum(heights)))
@@ -245,7 +255,9 @@ def one_run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
         means, error_deviations = _displayed(means, turns), _in_degrees(error_deviations, turns)
     parts = means, deviations, error_deviations
     time = (1.0 if dt is None else dt) * np.arange(single.steps + 1)
-    innovations = np.where(np.isnan(single.measurements[0]), np.nan, estimates.innovations[0])
+    innovations = np.where(
+        np.isnan(readings(single.measurements[0], model.measured_turns)), np.nan, estimates.innovations[0]
+    )
     if single.states is None:
         return Run(time, None, None, estimates, innovations, *parts)
     errors, truth = state_errors(filter_, estimates, single)[0], single.known_states[0]
@@ -344,22 +356,22 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
         dt: sample time [s]; None for an axis of steps.
     """
     filtered, model, single = one_run(filter_, data, index, dt), filter_.model, data.one(index)
-    channels, left_out = plotted_states(model.measurements)
+    turns = model.measured_turns
+    quantities = displayed_quantities(model.measurements, turns)
+    channels, left_out = plotted_states(quantities)
     inputs, _ = plotted_states(model.input_quantities)
     figure, axes = _signal_rows(len(channels) + len(inputs), 2 * WIDTH, dt)
-    measured = wrapped_where(single.measurements[0], model.any_shape.measurement_angles)
+    measured, expected_rows = _measured_and_predicted(model, single.measurements[0], filtered.innovations)
     colour = colour_of(filter_.name)
     for axis, j in zip(axes, channels, strict=False):
-        angle = model.measurements[j].angle
+        angle = quantities[j].angle
         line, dots = line_of(angle, filtered.time, measured[:, j]), {}
         if is_sparse(~np.isnan(measured[:, j])):
             dots = SPARSE
         axis.plot(*line, label="measured", **(MEASURED | {"linewidth": 2.0, "markeredgewidth": 3.0} | dots))
-        expected = measured[:, j] - filtered.innovations[:, j]
-        expected = wrapped(expected) if angle else expected
-        line = line_of(angle, filtered.time, expected)
+        line = line_of(angle, filtered.time, expected_rows[:, j])
         axis.plot(*line, color=colour, label="predicted before the update", **({"linewidth": 0.8} | dots))
-        axis.set_ylabel(axis_label(model.measurements[j]))
+        axis.set_ylabel(axis_label(quantities[j]))
     for axis, i in zip(axes[len(channels) :], inputs, strict=True):
         time, values = thinned(filtered.time[:-1], single.inputs[0][:, i])
         axis.plot(time, values, color=GREY, drawstyle="steps-post", linewidth=1.2, label="input")
@@ -368,9 +380,21 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
     return figure
 
 
+def _measured_and_predicted(model: StateSpaceModel, z: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Measurements (K + 1, channels) and z moved by -v, as numbers for people; of directions no prediction."""
+    turns = model.measured_turns
+    flags = tangent_flags(model.any_shape.measurement_angles, turns)
+    expected = np.stack([np.asarray(part) for part in move(z.T, -v.T, turns)], axis=-1)
+    for turn in turns:
+        if turn.kind == "direction":  # whose tangents at z and at the prediction have other axes
+            expected[:, turn.quaternion] = np.nan
+    measured, expected = (np.stack(displayed(rows.T, turns), axis=-1) for rows in (z, expected))
+    return wrapped_where(measured, flags), wrapped_where(expected, flags)
+
+
 def draw_innovations(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> Figure:
     """Innovations of every channel in the band that each filter expects; one column per filter."""
-    channels = next(iter(filters.values())).model.measurements
+    channels = innovations_of(next(iter(filters.values())).model)
     indices, left_out = plotted_states(channels)
     figure = new_figure((WIDTH * len(filters), HEIGHT * 1.2 * len(indices) + 0.8))
     axes = figure.subplots(len(indices), len(filters), squeeze=False, sharex=True)
@@ -405,7 +429,8 @@ def gains(filter_: Filter, data: Data, index: int) -> np.ndarray:
     slopes = np.stack([_slopes(model, mean, u) for mean, u in zip(means, acting, strict=True)])  # (K + 1, m, n)
     products = slopes @ covs.transpose(0, 2, 1)  # H P', (K + 1, m, n)
     found_gains = np.linalg.solve(model.measurement_noise_cov, products).transpose(0, 2, 1)
-    found_gains[np.isnan(data.one(index).measurements[0]).all(axis=1)] = np.nan
+    measured = readings(data.one(index).measurements[0], model.measured_turns)
+    found_gains[np.isnan(measured).all(axis=1)] = np.nan
     return found_gains
 
 
@@ -414,7 +439,8 @@ def draw_gains(filters: Mapping[str, Filter], data: Data, index: int, dt: float 
     model = next(iter(filters.values())).model
     states = tangent_of(model)
     indices, left_out = plotted_states(states, scored)
-    channels, _ = plotted_states(model.measurements)
+    quantities = innovations_of(model)
+    channels, _ = plotted_states(quantities)
     figure = new_figure((WIDTH * len(filters), HEIGHT * len(indices) + 0.8))
     axes = figure.subplots(len(indices), len(filters), squeeze=False, sharex=True)
     tidy(axes.flat)
@@ -424,13 +450,11 @@ def draw_gains(filters: Mapping[str, Filter], data: Data, index: int, dt: float 
         for axis, i in zip(column, indices, strict=True):
             for row, j in enumerate(channels):
                 look = {"color": colour_of(filter_.name), "linestyle": DASHES[row % len(DASHES)], "linewidth": 1.0}
-                axis.plot(
-                    *thinned(time, matrices[:, i, j]), label=f"by {model.measurements[j].text_symbol}", **look
-                )
+                axis.plot(*thinned(time, matrices[:, i, j]), label=f"by {quantities[j].text_symbol}", **look)
         column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
         column[-1].set_xlabel(_time(dt))
     for axis, i in zip(axes[:, 0], indices, strict=True):
-        units = {_over(states[i], model.measurements[j]) for j in channels}
+        units = {_over(states[i], quantities[j]) for j in channels}
         unit = units.pop() if len(units) == 1 else "state/channel"
         axis.set_ylabel(axis_label(states[i]._replace(name="gain on", unit=unit)))
     figure.align_ylabels(axes[:, 0])
@@ -444,7 +468,10 @@ def _slopes(model: StateSpaceModel, mean: np.ndarray, u: np.ndarray) -> np.ndarr
         return np.full((model.m, model.t), np.nan)
     slopes, fed = observation_slopes(model.functions, model.any_shape), model.any_shape.fed(as_value(u.tolist()))
     h = slopes(as_value(mean.tolist()), as_value(model.scales), *fed, model.given_constants)
-    h = np.array(h, dtype=float).reshape(model.m, model.n)
+    h = np.array(h, dtype=float).reshape(model.channels, model.n)
+    if model.measured_turns:
+        y = model.functions.observe(as_value(mean.tolist()), *fed, model.given_constants)
+        h = np.array(slopes_of_tangent(y, model.measured_turns)) @ h
     return h @ np.array(slopes_of_stored(mean, model.turns)) if model.turns else h
 
 
@@ -488,7 +515,7 @@ def of_estimates(filters: Mapping[str, Filter], data: Data, index: int, dt: floa
     for name, filter_ in filters.items():
         run, parts = one_run(filter_, data, index, dt), []
         values, deviations, what = _against(run)
-        quantities = filter_.model.measurements
+        quantities = innovations_of(filter_.model)
         if run.errors is not None:
             quantities = displayed_quantities(filter_.model.states, filter_.model.turns)
         for i in range(values.shape[-1]):
@@ -555,8 +582,10 @@ def sections_over_time(
     picture = book.picture(draw_estimates(filters, data, 0, dt, scored), caption, alt)
     sections = [Section("One run over time", [picture, *remark])]
     model = tuned.model
-    named = [channel.name for channel in model.measurements], [channel.unit for channel in model.measurements]
-    alt = f"Measured: {of_series(named[0], data.one(0).measurements[0], named[1])}"
+    turns = model.measured_turns
+    channels = displayed_quantities(model.measurements, turns)
+    named = [channel.name for channel in channels], [channel.unit for channel in channels]
+    alt = f"Measured: {of_series(named[0], _displayed(data.one(0).measurements[0], turns), named[1])}"
     caption = f"Measurements on {where}, their prediction by the tuned filter before each update, and the inputs."
     sections.append(Section("Measured signal", [book.picture(draw_signal(tuned, data, 0, dt), caption, alt)]))
     if not tuned.has_covariance:
@@ -585,7 +614,7 @@ def _gain_section(book: Sketchbook, pair, data, dt, scored, where: str) -> Secti
             values = ", ".join(
                 f"{state.text_symbol} by {channel.text_symbol} {last[-1][i, j]:.3g}"
                 for i, state in enumerate(tangent_of(model))
-                for j, channel in enumerate(model.measurements)
+                for j, channel in enumerate(innovations_of(model))
             )
             described.append(f"{title}: {values} at the end")
     caption = (

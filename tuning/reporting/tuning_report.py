@@ -227,7 +227,7 @@ def _band_sentence(objective: str, free: float, best: float, word: str) -> list[
 
 
 def _none_consistent(result: StudyResult, plan: Plan) -> str:
-    word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].quantities.measurements)
+    word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].innovations)
     means = [f"{channels * ratio:.3g}" if isfinite(ratio) else "infinite" for ratio in result.nis]
     low, high = (channels * end for end in NIS_BAND)
     end = "largest" if plan.objectives[0] in PROPER else "smallest"

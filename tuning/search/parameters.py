@@ -309,7 +309,7 @@ def index_pairs(text: str) -> str:
 def _all_parameters(problem: Problem, *, hold_r: bool, full_q: bool, full_r: bool, prior: bool) -> list[Parameter]:
     if problem.parameters is not None:
         return list(problem.parameters)
-    untuned, quantities, parameters = problem.untuned, problem.quantities, []
+    untuned, parameters = problem.untuned, []
     variances, errors = _diagonal(untuned[Q]), problem.errors
     user_values = untuned if problem.given is None else problem.given
     given_q, given_r = _diagonal(user_values[Q]), _diagonal(user_values[R])
@@ -323,7 +323,7 @@ def _all_parameters(problem: Problem, *, hold_r: bool, full_q: bool, full_r: boo
     if full_q:
         parameters += _correlations(Q, len(errors))
     if not hold_r:
-        channels = quantities.measurements
+        channels = problem.innovations
         for i, (variance, channel) in enumerate(zip(_diagonal(untuned[R]), channels, strict=True)):
             ends = _range(variance, given_r[i], variance)
             name, location = r_name(i, len(channels)), MeasurementVariance(i)

@@ -376,7 +376,7 @@ class Plan(NamedTuple):
                 )
             checked_problem(problem)
             parameters = [parameter.name for parameter in problem.parameters or ()]
-            sizes = () if parameters else (len(problem.errors), len(problem.quantities.measurements))
+            sizes = () if parameters else (len(problem.errors), len(problem.innovations))
             shapes.append((sizes, parameters))
             if shapes[-1] != shapes[0]:
                 raise ValueError(
