@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from thruster_env.core.angles import wrapped_where
 from thruster_env.model import rotations
 from thruster_env.model.quantities import Output, Quantity
-from thruster_env.model.turns import Turn, move, parts_of
+from thruster_env.model.turns import Turn, move, parts_of, tangent_flags
 
 EULER = "roll", "pitch", "yaw"
 SMALL_STEP = 1e-6  # of a tangent, for slopes
@@ -78,3 +79,15 @@ def displayed_deviations(means: np.ndarray, covs: np.ndarray, turns: Sequence[Tu
         rows -= 360.0 * np.round(rows / 360.0)
     slopes /= 2.0 * SMALL_STEP
     return np.sqrt(np.maximum(np.einsum("...ij,...jk,...ik->...i", slopes, covs, slopes), 0.0))
+
+
+def measured_and_predicted(model: Any, z: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Measurements (K + 1, channels) and z moved by -v, as numbers for people; of directions no prediction."""
+    turns = model.measured_turns
+    flags = tangent_flags(model.any_shape.measurement_angles, turns)
+    expected = np.stack([np.asarray(part) for part in move(z.T, -v.T, turns)], axis=-1)
+    for turn in turns:
+        if turn.kind == "direction":  # whose tangents at z and at the prediction have other axes
+            expected[:, turn.quaternion] = np.nan
+    measured, expected = (np.stack(displayed(rows.T, turns), axis=-1) for rows in (z, expected))
+    return wrapped_where(measured, flags), wrapped_where(expected, flags)

@@ -16,7 +16,7 @@ from thruster_env.core.angles import with_breaks, wrapped_where
 from thruster_env.core.files import BLUE, GREY, RUST, new_figure, thinned, tidy
 from thruster_env.core.sources import as_value, is_array
 from thruster_env.core.text_tables import TITLE, verbatim
-from thruster_env.model.euler import displayed, displayed_deviations, displayed_quantities
+from thruster_env.model.euler import displayed, displayed_deviations, displayed_quantities, measured_and_predicted
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.shape import observation_slopes
 from thruster_env.model.simulate import inputs_until
@@ -25,16 +25,15 @@ from thruster_env.model.turns import (
     Turn,
     innovations_of,
     leading,
-    move,
     readings,
     slopes_of_stored,
     slopes_of_tangent,
-    tangent_flags,
     tangent_of,
 )
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data, estimates_on
 from tuning.reporting.page import Section, Sketchbook, Words
+from tuning.reporting.style import of_series
 
 FAR = 20.0  # where one panel of a row reaches so many times as far as another each has its own limits
 WIDEST = 4.0  # times the largest error: how much of a band is shown
@@ -356,12 +355,11 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
         dt: sample time [s]; None for an axis of steps.
     """
     filtered, model, single = one_run(filter_, data, index, dt), filter_.model, data.one(index)
-    turns = model.measured_turns
-    quantities = displayed_quantities(model.measurements, turns)
+    quantities = displayed_quantities(model.measurements, model.measured_turns)
     channels, left_out = plotted_states(quantities)
     inputs, _ = plotted_states(model.input_quantities)
     figure, axes = _signal_rows(len(channels) + len(inputs), 2 * WIDTH, dt)
-    measured, expected_rows = _measured_and_predicted(model, single.measurements[0], filtered.innovations)
+    measured, expected_rows = measured_and_predicted(model, single.measurements[0], filtered.innovations)
     colour = colour_of(filter_.name)
     for axis, j in zip(axes, channels, strict=False):
         angle = quantities[j].angle
@@ -378,18 +376,6 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
         axis.set_ylabel(axis_label(model.input_quantities[i]))
     _legend(figure, axes, left_out.replace("states", "channels"))
     return figure
-
-
-def _measured_and_predicted(model: StateSpaceModel, z: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Measurements (K + 1, channels) and z moved by -v, as numbers for people; of directions no prediction."""
-    turns = model.measured_turns
-    flags = tangent_flags(model.any_shape.measurement_angles, turns)
-    expected = np.stack([np.asarray(part) for part in move(z.T, -v.T, turns)], axis=-1)
-    for turn in turns:
-        if turn.kind == "direction":  # whose tangents at z and at the prediction have other axes
-            expected[:, turn.quaternion] = np.nan
-    measured, expected = (np.stack(displayed(rows.T, turns), axis=-1) for rows in (z, expected))
-    return wrapped_where(measured, flags), wrapped_where(expected, flags)
 
 
 def draw_innovations(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> Figure:
@@ -545,20 +531,6 @@ AXES = (
     "are over these steps."
 )
 READ = "Point at a figure to read values; drag sideways to zoom in, double-click to zoom out."
-
-
-def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) -> str:
-    """Range and mean of every column of values (K, m), and how many are missing."""
-    sentences = []
-    for name, unit, column in zip(names, units, values.T, strict=True):
-        finite = column[np.isfinite(column)]
-        if not finite.size:
-            sentences.append(f"{name}: nothing")
-            continue
-        missing = f", {len(column) - len(finite)} of {len(column)} missing" if len(finite) < len(column) else ""
-        ends = f"from {finite.min():.3g} to {finite.max():.3g} {unit}".rstrip()
-        sentences.append(f"{name} {ends}, mean {finite.mean():.3g}{missing}")
-    return f"{'; '.join(sentences)}."
 
 
 def sections_over_time(
