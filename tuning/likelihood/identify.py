@@ -520,7 +520,7 @@ def validation_of(
     counted = np.arange(runs.measurements.shape[1]) >= starts.counted_from[:, None]
     turns = model.measured_turns
     scored = ~np.isnan(readings(runs.measurements, turns)) & counted[..., None]
-    visible = runs._replace(measurements=np.where(of_channels(hidden, turns), np.nan, runs.measurements))
+    visible = runs._replace(measurements=np.where(of_channels(hidden.tolist(), turns), np.nan, runs.measurements))
     estimates, nothing = estimates_of(model, visible, starts), np.zeros((model.t, model.t))
     known = starts._replace(covs=np.zeros_like(starts.covs))
     simulated = estimates_of(model.replace(process_noise_cov=nothing, prior_cov=nothing), visible, known)

@@ -501,7 +501,7 @@ def of_estimates(filters: Mapping[str, Filter], data: Data, index: int, dt: floa
     for name, filter_ in filters.items():
         run, parts = one_run(filter_, data, index, dt), []
         values, deviations, what = _against(run)
-        quantities = innovations_of(filter_.model)
+        quantities: Sequence[Quantity] = innovations_of(filter_.model)
         if run.errors is not None:
             quantities = displayed_quantities(filter_.model.states, filter_.model.turns)
         for i in range(values.shape[-1]):
