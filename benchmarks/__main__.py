@@ -32,7 +32,11 @@ PARTS = {  # with the modules and functions that measure their rows
     **{"steps": "steps.rows", "vectors": "steps.vector_rows", "vector_filters": "steps.vector_filter_rows"},
     **{"batches": "batches.rows", "c_code": "c_code.rows", "horizon": "steps.horizon_rows"},
     **{"vehicles": "steps.vehicle_rows", "trajectories": "batches.trajectory_rows", "studies": "studies.rows"},
-    **{"assimilation": "studies.assimilation_rows", "policies": "studies.policy_rows"},
+    **{
+        "attitude": "batches.attitude_rows",
+        "assimilation": "studies.assimilation_rows",
+        "policies": "studies.policy_rows",
+    },
     **{"processes": "first_use.rows", "peers": "peers.rows"},
 }
 

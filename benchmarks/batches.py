@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 from importlib.util import find_spec
-from math import gcd
+from math import cos, gcd, sin, tan
 from time import perf_counter
 from typing import NamedTuple
 
@@ -13,13 +13,16 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from benchmarks.timing import Measure, Row, alone, side_by_side
-from filters import run
+from filters import StateSpaceModel, affine_model, make_filter, run
 from filters.filter import Filter
 from thruster_env.core.checks import covariance_root
 from thruster_env.core.parallel import cores, spread
 from thruster_env.core.sources import column_reader, column_writer, vector_reader
-from thruster_env.core.streams import FILTER_PROCESS, fill_normals
+from thruster_env.core.streams import FILTER_PROCESS, episode_keys, fill_normals
 from thruster_env.graphs.loops import Loops
+from thruster_env.model import rotations
+from thruster_env.model.simulate import simulate
+from thruster_env.model.turns import Rotation
 from thruster_env.thruster.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.thruster.plant import Plant
 from tuning.evaluation.evaluate import evaluate
@@ -29,6 +32,7 @@ from tuning.search.space import oracle_choice
 
 SEEDS, ENSEMBLE_SIZE = 64, 50
 EVALUATE_GOAL, RUN_GOAL = 2.1, 1.8  # of the floor's time
+TURNING_GOAL = 1.5  # of the time of six plain states
 NORMALS = 3  # a member and step: one for each state, one for the measurement
 WIDTH = 64  # members in one block of the floor: whole vector registers, and all in the fastest cache
 BLOCKS = SEEDS * ENSEMBLE_SIZE // WIDTH
@@ -145,6 +149,61 @@ def trajectory_rows(seed: int, quick: bool) -> Iterator[Row]:
         check_agreement(estimates(filter_, data), estimate()[0], data.states)
         peer = shared(estimate, steps * TRAJECTORY_SIZE)
         yield Row(what, name, side_by_side(ours, peer, rounds, warm_up=False), ratio_goal=goal)
+
+
+def attitude_rows(seed: int, quick: bool) -> Iterator[Row]:
+    """An EKF of a rotation, seven stored numbers and six in the tangent, beside those of six numbers."""
+    count, steps, rounds = (32, 100, 5) if quick else (256, 400, 40)
+    inputs = 0.1 * np.random.default_rng(seed).normal(size=(count, steps, 3))
+    measures = {}
+    for name, model in attitude_models().items():
+        drawn, filter_ = simulate(model, episode_keys(range(count)), inputs), make_filter("ekf", model)
+        filtered = partial(run, filter_, inputs=inputs, measurements=drawn.measurements)
+        measures[name] = shared(filtered, count * steps)
+    ours = measures.pop("rotation")
+    for name, peer in measures.items():
+        timing = side_by_side(ours, peer, rounds)
+        yield Row("EKF batch of a rotation and a bias, a step", name, timing, ratio_goal=TURNING_GOAL)
+
+
+def attitude_models(dt: float = 0.01) -> dict[str, StateSpaceModel]:
+    """A gyroscope with a bias as input; gravity and the magnetic field, or three angles twice, are measured."""
+    fields = (0.0, 0.0, 9.81), (20.0, 0.0, 40.0)
+
+    def turn(x, u, c):
+        d = tuple(dt * (rate - bias) for rate, bias in zip(u, x[4:], strict=True))
+        return (*rotations.product(x[:4], rotations.exponential(d)), *x[4:])
+
+    def see(x, c):
+        return tuple(z for field in fields for z in rotations.to_body(x[:4], field))
+
+    def turn_angles(x, u, c):
+        p, q, r = (rate - bias for rate, bias in zip(u, x[3:], strict=True))
+        across = q * sin(x[0]) + r * cos(x[0])
+        rates = p + across * tan(x[1]), q * cos(x[0]) - r * sin(x[0]), across / cos(x[1])
+        return (*(angle + dt * rate for angle, rate in zip(x[:3], rates, strict=True)), *x[3:])
+
+    def see_angles(x, c):
+        half = [0.5 * angle for angle in x[:3]]
+        roll, pitch, yaw = ((cos(h), *(sin(h) * (i == axis) for i in range(3))) for axis, h in enumerate(half))
+        q = rotations.product(yaw, rotations.product(pitch, roll))
+        return tuple(z for field in fields for z in rotations.to_body(q, field))
+
+    noise = {"process_noise_cov": [1e-5] * 6, "measurement_noise_cov": [0.01] * 6, "prior_cov": [0.1] * 6}
+    turning = {"transition": turn, "observe": see, "states": (Rotation("attitude"), "b_x", "b_y", "b_z")}
+    angles = {"transition": turn_angles, "observe": see_angles, "prior_mean": [0.0] * 6}
+    one, zero = np.eye(3), np.zeros((3, 3))
+    return {
+        "rotation": StateSpaceModel(inputs=3, prior_mean=[1.0] + [0.0] * 6, **turning, **noise),
+        "six numbers": affine_model(
+            a=np.block([[one, -dt * one], [zero, one]]),
+            b=np.vstack([dt * one, zero]),
+            c=np.block([[one, zero], [one, zero]]),
+            prior_mean=[0.0] * 6,
+            **noise,
+        ),
+        "roll, pitch and yaw": StateSpaceModel(inputs=3, **angles, **noise),
+    }
 
 
 def estimates(filter_: Filter, data: Data) -> np.ndarray:
