@@ -16,7 +16,7 @@ from filters.algebra.matrices import Operation, never, operation, same
 from filters.algebra.operations import sym, wrap
 from filters.algebra.points import ones, outer
 from filters.algebra.roots import zeros
-from thruster_env.graphs.graphs import Number
+from thruster_env.graphs.graphs import Graph, Number
 from thruster_env.graphs.tracing import traced
 from thruster_env.model import turns as steps
 from thruster_env.model.traced import slopes_along
@@ -218,15 +218,26 @@ def reset_slopes(x, d, turns):
     return _computed(steps.reset_slopes, turns, x, d)
 
 
-for _operation, _function in (
-    (moved, steps.move),
-    (apart, steps.difference),
-    (innovation, steps.innovation),
-    (completed, steps.completed),
-    (normalised, steps.unit),
-    (slopes_of_stored, steps.slopes_of_stored),
-    (slopes_of_tangent, steps.slopes_of_tangent),
-    (reset_slopes, steps.reset_slopes),
-    (inverse_reset_slopes, steps.inverse_reset_slopes),
-):
+OF_COMPONENTS: dict[Operation, Callable] = {
+    moved: steps.move,
+    apart: steps.difference,
+    innovation: steps.innovation,
+    completed: steps.completed,
+    normalised: steps.unit,
+    slopes_of_stored: steps.slopes_of_stored,
+    slopes_of_tangent: steps.slopes_of_tangent,
+    reset_slopes: steps.reset_slopes,
+    inverse_reset_slopes: steps.inverse_reset_slopes,
+}
+"""The functions of sequences of components, and of the rotations, that compute the operations."""
+for _operation, _function in OF_COMPONENTS.items():
     _differentiable(_operation, _function)
+
+
+@cache
+def numbers_of(of: Operation, sizes: tuple[int, ...], turns: Any) -> np.ndarray:
+    """The result of an operation as Numbers of a graph, whose given ones are (argument, component)."""
+    graph = Graph()
+    vectors = [[graph.given((part, k)) for k in range(size)] for part, size in enumerate(sizes)]
+    result = np.array(_traced(OF_COMPONENTS[of])(*vectors, turns), dtype=object)
+    return np.array([graph.number(entry) for entry in result.ravel()], dtype=object).reshape(result.shape)

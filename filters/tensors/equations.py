@@ -3,15 +3,11 @@
 A component of a state is a tensor (...,), so that an operation of the graph is one of torch for a whole batch, and
 the points of a sigma-point filter are one more dimension. The Jacobian of an equation that is called, such as a
 network, is found forwards, by `torch.func.jvp` along each component, unless the user gives it.
-
-autograd multiplies slopes, also those of the side that a choice discards: 0 times the infinite slope of a root at
-zero is NaN. So an operation without a finite slope has a constant as its result (`slopes` has the same rule).
 """
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +17,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
+from filters.tensors.graphs import stacked, values_of, with_finite_slope
 from filters.tensors.stages import (
     FULL_TURN,
     LOW,
@@ -34,94 +31,15 @@ from filters.tensors.stages import (
 )
 from thruster_env.core.compiled import needs_floats
 from thruster_env.core.sources import is_array
-from thruster_env.graphs.folding import POSITIVE, as_single
-from thruster_env.graphs.graphs import COMPARISONS, Graph, Number, needed_by
+from thruster_env.graphs.graphs import Graph, Number, needed_by
 from thruster_env.graphs.programs import Place
 from thruster_env.model.shape import LANES, Shape, constants_are_array, padded
 from thruster_env.model.traced import MOST, Traced
 
-WORK: dict[str, Callable] = {
-    "+": operator.add,
-    "-": operator.sub,
-    "*": operator.mul,
-    "/": operator.truediv,
-    "pow": operator.pow,
-    "negative": operator.neg,
-    **COMPARISONS,
-    "and": operator.and_,
-    "or": operator.or_,
-    "cbrt": lambda x: torch.sign(x) * abs(x) ** (1.0 / 3.0),
-}
-"""Operations of tensors and floats; other ones are torch's functions of tensors, by their names."""
-NAMES = {"rint": "round"}
-
-HAS_SLOPE: dict[str, Callable] = {
-    "sqrt": lambda x: x > 0.0,
-    "log": lambda x: x > 0.0,
-    "/": lambda a, b: b != 0.0,
-    "pow": lambda x, e: torch.isfinite(x**e) & ((x != 0.0) | (e >= 1.0)),
-    **dict.fromkeys(("arctan2", "hypot"), lambda a, b: (a != 0.0) | (b != 0.0)),
-    "cbrt": lambda x: x != 0.0,
-    "log1p": lambda x: x > -1.0,
-    **dict.fromkeys(("log2", "log10"), lambda x: x > 0.0),
-    "arccosh": lambda x: x > 1.0,
-    **dict.fromkeys(("arcsin", "arccos"), lambda x: abs(x) != 1.0),
-    "arctanh": lambda x: abs(x) < 1.0,
-    **dict.fromkeys(("exp", "expm1", "exp2"), lambda x: torch.isfinite(torch.exp(x))),
-    **dict.fromkeys(("sinh", "cosh"), lambda x: torch.isfinite(torch.cosh(x))),
-}
-"""Where an operation has a finite slope, of those that do not have one everywhere."""
-
-
-OF_ZERO = frozenset(HAS_SLOPE) - {"arccosh", "arctanh"}  # of these, operations that have one of a positive number
 POINTS = 64  # at which functions of tensors are compared with those of floats
 ASKING = frozenset("__bool__ __float__ __int__ __index__ __complex__ item".split())
 # Of torch: a function of tensors may do so and give derivatives.
 LEAVING = frozenset("tolist numpy __array__".split())
-
-
-def with_finite_slope(operation: str, function: Callable, arguments: Sequence[Tensor | float]) -> Tensor:
-    """The result of an operation; a constant where it has no finite slope."""
-    known = [a.detach() if isinstance(a, Tensor) else a for a in arguments]
-    has_slope = HAS_SLOPE[operation](*known)
-    moving = function(*(torch.where(has_slope, a, 1.0) if isinstance(a, Tensor) else a for a in arguments))
-    return torch.where(has_slope, moving, function(*known))
-
-
-def values_of(
-    wanted: Sequence[Number], order: Sequence[Number], known: Mapping[Any, Tensor], like: Tensor
-) -> list[Tensor | float]:
-    """Values of numbers: tensors, and floats for constants.
-
-    Args:
-        wanted: numbers of one graph.
-        order: `graphs.needed_by(wanted)`.
-        known: tensors of the given numbers by their names; their shapes broadcast.
-        like: a tensor of the dtype and on the device of all.
-    """
-    values: dict[int, Tensor | float] = {}
-
-    def tensor(value: Tensor | float) -> Tensor:
-        return value if isinstance(value, Tensor) else number_like(value, like)
-
-    for number in order:
-        arguments = [values[a.place] for a in number.of]
-        if number.operation == "given":
-            values[number.place] = known[number.arguments[0]]
-        elif number.value is not None:
-            values[number.place] = number.value if like.dtype == torch.float64 else as_single(number.value)
-        elif number.operation in HAS_SLOPE and not (
-            number.operation in OF_ZERO and number.of[-1 if number.operation == "/" else 0].sign == POSITIVE
-        ):
-            function = WORK.get(number.operation) or getattr(torch, number.operation)
-            values[number.place] = with_finite_slope(number.operation, function, [*map(tensor, arguments)])
-        elif number.operation in WORK:
-            values[number.place] = WORK[number.operation](*arguments)
-        else:
-            values[number.place] = getattr(torch, NAMES.get(number.operation, number.operation))(
-                *map(tensor, arguments)
-            )
-    return [values[number.place] for number in wanted]
 
 
 def sizes_of(which: str, shape: Shape) -> tuple[int, ...]:
@@ -301,20 +219,6 @@ def _components(*arguments: Tensor) -> list[tuple[Tensor, ...]]:
 
 def _components_of_points(x: Tensor, *arguments: Tensor) -> list[tuple[Tensor, ...]]:
     return [x.unbind(-2), *(tensor[..., None].unbind(-2) for tensor in arguments)]
-
-
-def number_like(value: Any, like: Tensor) -> Tensor:
-    """A number as a tensor (); it is filled in on the device, without a copy from the host."""
-    return like.new_full((), value) if isinstance(value, (int, float)) else like.new_tensor(value)
-
-
-def stacked(values: Sequence[Tensor | float], parts: list[tuple[Tensor, ...]]) -> Tensor:
-    """Components of a result as one tensor (..., rows), for the batch of all arguments."""
-    like, known = parts[0][0], [tensor for part in parts for tensor in part]
-    shapes = (tensor.shape for tensor in (*known, *values) if isinstance(tensor, Tensor))
-    batch = torch.broadcast_shapes(*shapes)
-    rows = (value if isinstance(value, Tensor) else number_like(value, like) for value in values)
-    return torch.stack([row.expand(batch) for row in rows], -1)
 
 
 def equation_of(

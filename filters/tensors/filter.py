@@ -227,7 +227,7 @@ class TensorFilter:
     def _make(self) -> None:
         paged = with_page(self.filter, "a filter on tensors")
         self._model, self._own = paged.kernel_model, paged.parameters
-        shape, (f, by_f, h, by_h) = self._model.shape, self._model.functions
+        shape, (f, by_f, h, by_h) = self._model.any_shape, self._model.functions
         transition, by_transition, observe, by_observe = self._user_functions
         f_equation = equation_of("transition", (f, by_f), (transition, by_transition), shape)
         h_equation = equation_of("observe", (h, by_h), (observe, by_observe), shape)
@@ -281,7 +281,7 @@ class TensorFilter:
 
     def _recursion(self, key: np.ndarray, *, compiled: bool = False) -> Recursion:
         """The steps with the numbers that the filter has now."""
-        mean = wrapped_where(self.prior_mean, self._model.shape.state_angles)
+        mean = wrapped_where(self.prior_mean, self._model.any_shape.state_angles)
         words = round_keys(key, mean.device)
         numbers = Numbers(self._known(), mean, self.prior_cov, self.measurement_noise_cov, words)
         arguments = self._stages, numbers, self.filter.size, self._model.substeps
@@ -306,7 +306,7 @@ class TensorFilter:
 
         A belief that is not finite, or has a negative variance, becomes the prior, and this is counted.
         """
-        z = self._finite("z", z, (self._model.m,), missing_allowed=True)
+        z = self._finite("z", z, (self._model.channels,), missing_allowed=True)
         recursion, estimate = self._recursion(belief.key), Estimate(belief.mean, belief.cov, belief.extras)
         updated = recursion.update(estimate, z, belief.step)
         if updated.lost.any():
@@ -326,7 +326,7 @@ class TensorFilter:
         Raises:
             ValueError: if shapes do not fit, an input is not finite, or a measurement is infinite.
         """
-        z = self._finite("measurements", measurements, (self._model.m,), missing_allowed=True)
+        z = self._finite("measurements", measurements, (self._model.channels,), missing_allowed=True)
         if inputs is None:
             inputs = z.new_zeros(*z.shape[:-2], z.shape[-2] - 1, 0)
         u = self._finite("inputs", inputs, (self._model.inputs,))

@@ -25,9 +25,11 @@ from filters.algebra import operations as geometric
 from filters.algebra import operations as scalars
 from filters.algebra import points as densities
 from filters.algebra.matrices import Matrix, Operation, in_order, never
+from filters.algebra.tangents import OF_COMPONENTS, columns_in_tangent, rows_in_tangent, unit
 from filters.pages.kernels import MembersMemory, Stage, stages_of
 from filters.pages.kernels import member_stages_of as members_stages
 from filters.pages.page import NumbersMemory, Page, PagedModel, RowMemory
+from filters.tensors.graphs import on_components
 from thruster_env.core.angles import TURN
 from thruster_env.core.matrices import RESOLUTION
 from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS
@@ -58,6 +60,10 @@ def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tens
             )
             if matrix.operation in CONSTANT:
                 values[matrix] = _constant(matrix.operation, matrix.arguments[0].shape, like.dtype, like.device)
+            elif matrix.operation in OF_COMPONENTS:
+                values[matrix] = on_components(matrix, [*arguments])
+            elif matrix.operation is matrices.multiply and matrix.arguments[0].member:
+                values[matrix] = _product_of_each(matrix, *arguments)
             elif matrix.operation in OF_SHAPE:
                 values[matrix] = OF_SHAPE[matrix.operation](len(matrix.shape) + matrix.member, *arguments)
             else:
@@ -87,6 +93,13 @@ SMALL, INNER = 3, 4
 
 def _product(dimensions: int, a: Tensor, b: Tensor) -> Tensor:
     return _matrix_product(a, b) if dimensions == 2 else _matrix_product(a, b[..., None])[..., 0]
+
+
+def _product_of_each(matrix: Matrix, a: Tensor, b: Tensor) -> Tensor:
+    """A matrix of each member, (..., rows, columns, members), by a matrix or a vector, or those of each."""
+    members = "n" * matrix.arguments[1].member
+    columns = "j" * (len(matrix.arguments[1].shape) > 1)
+    return torch.einsum(f"...ikn,...k{columns}{members}->...i{columns}n", a, b)
 
 
 def _matrix_product(a: Tensor, b: Tensor) -> Tensor:
@@ -346,24 +359,26 @@ class TensorModel(PagedModel):
 
     def __init__(self, f: Equation, h: Equation, memory: NumbersMemory):
         super().__init__(memory)
-        n, m = memory.shape.n, memory.shape.m
-        self._f, self._h = _Operations(f, n, n), _Operations(h, m, n)
+        n, channels = memory.shape.n, memory.shape.channels
+        self._f, self._h = _Operations(f, n, n), _Operations(h, channels, n)
 
     def f(self, x: Matrix, u: Matrix) -> Matrix:
         """The state, a substep after x; of points (n, points) that of each."""
-        return self._f.value_at(x, u, self._constants)
+        return unit(self._f.value_at(x, u, self._constants), self.turns)
 
     def F(self, x: Matrix, u: Matrix) -> Matrix:  # noqa: N802
-        """df/dx."""
-        return self._f.matrix(self._f.both(x, u, self._constants))
+        """df/dx, of a state with rotations in the tangents at x and f(x, u), (t, t)."""
+        both = self._f.both(x, u, self._constants)
+        columns = columns_in_tangent(self._f.matrix(both), x, self.turns)
+        return rows_in_tangent(columns, self._f.value(both), self.turns)
 
     def h(self, x: Matrix) -> Matrix:
         """What is measured at x; of points (n, points) at each."""
         return self._h.value_at(x, *self._seen())
 
     def H(self, x: Matrix) -> Matrix:  # noqa: N802
-        """dh/dx."""
-        return self._h.matrix(self._h.both(x, *self._seen()))
+        """dh/dx, of a state with rotations in the tangent at x, (channels, t)."""
+        return columns_in_tangent(self._h.matrix(self._h.both(x, *self._seen())), x, self.turns)
 
 
 class _Operations:
@@ -466,7 +481,7 @@ class EnsembleStages(Stages):
 
     def start(self, numbers: Mapping[Place, Tensor], prior: tuple[Tensor, Tensor], draw: Draw) -> tuple:
         """The members at the prior, their mean and covariance."""
-        tensors = {**numbers, NORMALS: draw(FILTER_PRIOR, self.memory.shape.n)}
+        tensors = {**numbers, NORMALS: draw(FILTER_PRIOR, self.memory.shape.t)}
         mean, cov, extras = self._after(tensors, ("start", "summarise"), prior[0])
         batch = prior[0].shape[:-1]
         extras = {
@@ -480,7 +495,7 @@ class EnsembleStages(Stages):
     ) -> tuple:
         """The belief a step later."""
         tensors = self._tensors(numbers, belief, u)
-        tensors[NORMALS] = draw(FILTER_PROCESS, self.memory.shape.n)
+        tensors[NORMALS] = draw(FILTER_PROCESS, self.memory.shape.t)
         return self._after(tensors, (*["propagate"] * substeps, "add_process_noise", "summarise"), belief[0])
 
     def update(self, numbers: Mapping[Place, Tensor], belief: tuple, z: Tensor, draw: Draw) -> tuple[tuple, list]:

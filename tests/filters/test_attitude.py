@@ -556,7 +556,7 @@ def test_attitude_by_name_is_smoothed(name):
 
 
 def test_every_other_path_refuses_them():
-    """Smoothers, tensors, C, gradients and models made of a model."""
+    """Smoothers, C, gradients and models made of a model."""
     model, filter_ = attitude_model(), filters.ExtendedKalmanFilter(model=attitude_model())
     data = {"inputs": np.zeros((2, 3)), "measurements": np.zeros((3, 6))}
     batch = {name: np.tile(part, (2, 1, 1)) for name, part in data.items()}
@@ -566,7 +566,6 @@ def test_every_other_path_refuses_them():
         lambda: c_filter(filters.EnsembleKalmanFilter(model=model), "a"),
         lambda: consistency_report(filters.run(filter_, **batch), None),
         lambda: ForeignFilter(model=model, estimator=Estimator()),
-        lambda: filters.torch(filter_),
         lambda: write_project(filter_, "a folder"),
         lambda: filters.linearize(model, model.prior_mean, np.zeros(3)),
         lambda: filters.augmented_model(model, {0: filters.Unknown(0.1)}),

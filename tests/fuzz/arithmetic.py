@@ -19,7 +19,7 @@ import numpy as np
 
 from filters import make_filter, run
 from filters.c.programs import _Single
-from filters.tensors.equations import values_of as tensors_of
+from filters.tensors.graphs import values_of as tensors_of
 from tests.fuzz.python_interface import _line, _until
 from tests.models import state_space
 from thruster_env.core.streams import filter_keys

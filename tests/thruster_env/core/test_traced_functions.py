@@ -67,7 +67,7 @@ def test_values_and_slopes_are_those_of_python():
 
 def test_tensors_have_the_same_values_and_slopes():
     torch = pytest.importorskip("torch")
-    from filters.tensors.equations import values_of as tensors_of
+    from filters.tensors.graphs import values_of as tensors_of
     from thruster_env.graphs.graphs import needed_by
 
     values, slopes = graph_of()
