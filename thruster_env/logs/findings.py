@@ -232,9 +232,9 @@ def outliers(log: Log, channel: str) -> np.ndarray:
 def unmeasured(values: np.ndarray) -> tuple[np.ndarray, list[tuple[str, str]]]:
     """Which samples of a channel are no measurements, (N,), and kinds and texts of these findings.
 
-    A placeholder of missing numbers, such as -999, comes more than once and is farther from all other values than
-    their range. A sample is repeated if its sensor is slower than the log: either the channel changes in every
-    p-th sample alone, or hardly a value comes again later, as it would in a quantised channel.
+    A placeholder of missing numbers, such as -999, comes three times or more and is farther from all other values
+    than their range. A sample is repeated if its sensor is slower than the log: either the channel changes in
+    every p-th sample alone, or hardly a value comes again later, as it would in a quantised channel.
 
     Args:
         values: samples of the channel, (N,).
@@ -242,7 +242,7 @@ def unmeasured(values: np.ndarray) -> tuple[np.ndarray, list[tuple[str, str]]]:
     left_out, texts = np.zeros(len(values), dtype=bool), []
     levels, counts = np.unique(values, return_counts=True)
     for end, inner in ((0, levels[1:]), (-1, levels[:-1])) if len(levels) > SHORTEST else ():
-        if 1 < counts[end] < SELDOM * len(values) and abs(levels[end] - inner[end]) > np.ptp(inner):
+        if 2 < counts[end] < SELDOM * len(values) and abs(levels[end] - inner[end]) > np.ptp(inner):
             left_out |= values == levels[end]
             text = f"is {levels[end]:.6g} in {counts[end]} samples, far from all others: they are left out"
             texts.append((PLACEHOLDER, text))
