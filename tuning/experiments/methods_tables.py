@@ -195,7 +195,8 @@ def tables(results: Sequence[Result], protocol: Protocol) -> dict[str, Callable[
     return {
         "what to use": lambda: what_to_use(results, protocol),
         "groups A to D": lambda: group_table(results, protocol, "ABCD"),
-        "groups E, F and H": lambda: group_table(results, protocol, "EFH"),
+        "groups E and H": lambda: group_table(results, protocol, "EH"),
+        "group F": lambda: group_table(results, protocol, "F"),
         "group G": lambda: group_table(results, protocol, "G"),
     }
 
