@@ -192,13 +192,13 @@ def attitude_models(dt: float = 0.01) -> dict[str, StateSpaceModel]:
     noise = {"process_noise_cov": [1e-5] * 6, "measurement_noise_cov": [0.01] * 6, "prior_cov": [0.1] * 6}
     turning = {"transition": turn, "observe": see, "states": (Rotation("attitude"), "b_x", "b_y", "b_z")}
     angles = {"transition": turn_angles, "observe": see_angles, "prior_mean": [0.0] * 6}
-    one, zero = np.eye(3), np.zeros((3, 3))
+    eye, zero = np.eye(3), np.zeros((3, 3))
     return {
         "rotation": StateSpaceModel(inputs=3, prior_mean=[1.0] + [0.0] * 6, **turning, **noise),
         "six numbers": affine_model(
-            a=np.block([[one, -dt * one], [zero, one]]),
-            b=np.vstack([dt * one, zero]),
-            c=np.block([[one, zero], [one, zero]]),
+            a=np.block([[eye, -dt * eye], [zero, eye]]),
+            b=np.vstack([dt * eye, zero]),
+            c=np.block([[eye, zero], [eye, zero]]),
             prior_mean=[0.0] * 6,
             **noise,
         ),
