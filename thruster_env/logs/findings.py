@@ -186,13 +186,13 @@ def _of_channel(log: Log, column: int, channel: str) -> list[Finding]:
     if len(rows) < SHORTEST:
         return []
     values, quantity = values[rows], log.measured[column]
-    turned: list[Finding] = []
+    wraps: list[Finding] = []
     if (turn := dict(log.recording.turns).get(channel, 0.0)) > 0.0:
         text = f"{_name(channel)} wraps: whole turns ({turn:.6g}) are added, and a filter needs the same"
-        turned.append(Finding(WRAPPED, channel, 0, log.steps, len(rows), text))
+        wraps.append(Finding(WRAPPED, channel, 0, log.steps, len(rows), text))
     elif not quantity.angle and turn_of(values, quantity.unit):
         text = f"{_name(channel)} wraps like an angle, and the model does not have it as one (angle=True)"
-        turned.append(Finding(WRAPPED, channel, 0, log.steps, len(rows), text))
+        wraps.append(Finding(WRAPPED, channel, 0, log.steps, len(rows), text))
     runs = _runs_of_equals(values)
     findings, ends = _saturated(log, channel, rows, values, runs)
     for first, count in _stuck(log, rows, values, runs, quantity.angle):
@@ -201,7 +201,7 @@ def _of_channel(log: Log, column: int, channel: str) -> list[Finding]:
         low, high = int(rows[first]), int(rows[first + count - 1])
         text = f"{_name(channel)} is stuck at {values[first]:.6g} for {count} samples{_where(log, low, high)}"
         findings.append(Finding(STUCK, channel, low, high, count, text))
-    findings = turned + findings
+    findings = wraps + findings
     bursts = _bursts(log, rows, values, quantity.angle)
     for begin, end in bursts:
         first, last = int(rows[begin]), int(rows[end])

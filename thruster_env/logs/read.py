@@ -236,19 +236,19 @@ def read_log(
     common = {offsets.get(channel.key, 0.0) for channel in wanted if channel.key in column_of}
     if len(common) == 1 and any(common) and not model.input_quantities:
         start, offsets = start - common.pop(), {}  # one clock for all: times move, and no sample is interpolated
-    source, parts, turned, unwrapped = {}, {}, list[Remark](), dict[str, float]()
+    source, parts, channel_remarks, unwrapped = {}, {}, list[Remark](), dict[str, float]()
     rows, dropped = np.zeros(len(of_file.times), bool), []
     in_file = [channel for channel in wanted if channel.key in column_of]
     read = {channel.key: _series(table, column_of[channel.key], channel, of_file) for channel in in_file}
     samples = {key: series for key, (series, _) in read.items()}
     if model.turns or model.measured_turns:
-        samples, turned = quaternions.repaired(model, samples)
-        turned += quaternions.remark_on_numbers(model, table.names, column_of)
+        samples, channel_remarks = quaternions.repaired(model, samples)
+        channel_remarks += quaternions.remark_on_numbers(model, table.names, column_of)
     for channel in in_file:
         series, present = samples[channel.key], read[channel.key][1]
         if channel.kind == MEASUREMENT and not model.measured_turns:
             series, left_out = _measured(series, channel)
-            turned += left_out
+            channel_remarks += left_out
             turn = turn_of(series.values, channel.quantity.unit) if unwrap else 0.0
             if turn:
                 unwrapped[channel.key] = turn
@@ -289,7 +289,7 @@ def read_log(
     remarks = (
         *([Remark(CLOCK, "", assumption)] if assumption else []),
         *table.remarks,
-        *turned,
+        *channel_remarks,
         *stale_inputs(driven, end, dt, start),
     )
     referring = [channel for channel in wanted if channel.kind not in (INPUT, MEASUREMENT)]

@@ -16,6 +16,8 @@ from html import escape
 from itertools import count, groupby
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from thruster_env.core.text_tables import Table, markdown_text, typeset, typeset_html
 from tuning.evaluation.sizes import SizeRow
 from tuning.reporting.style import SCRIPT, STYLE
@@ -288,3 +290,17 @@ class Sketchbook:
         """A figure as a part of a page."""
         svg, readings = figure_svg(figure, next(self._names))
         return Picture(svg, caption, alt, readings)
+
+
+def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) -> str:
+    """Range and mean of every column of values (K, m), and how many are missing."""
+    sentences = []
+    for name, unit, column in zip(names, units, values.T, strict=True):
+        finite = column[np.isfinite(column)]
+        if not finite.size:
+            sentences.append(f"{name}: nothing")
+            continue
+        missing = f", {len(column) - len(finite)} of {len(column)} missing" if len(finite) < len(column) else ""
+        ends = f"from {finite.min():.3g} to {finite.max():.3g} {unit}".rstrip()
+        sentences.append(f"{name} {ends}, mean {finite.mean():.3g}{missing}")
+    return f"{'; '.join(sentences)}."

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
-
 DARK = """color-scheme: dark; --paper: #15191d; --ink: #e4e7ea; --soft: #aab3ba; --line: #3a424a; 
   --strong: #5a646e; --card: #1e2930; --mark: #5fb3dc; --link: #7cc4ea;"""
 # A shadow at each edge behind which there is more: two covers scroll with what they cover, the shadows stay.
@@ -239,17 +235,3 @@ document.querySelectorAll('.code').forEach(block => {
 addEventListener('beforeprint', () => document.querySelectorAll('details').forEach(one => one.open = true));
 })();
 """
-
-
-def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) -> str:
-    """Range and mean of every column of values (K, m), and how many are missing."""
-    sentences = []
-    for name, unit, column in zip(names, units, values.T, strict=True):
-        finite = column[np.isfinite(column)]
-        if not finite.size:
-            sentences.append(f"{name}: nothing")
-            continue
-        missing = f", {len(column) - len(finite)} of {len(column)} missing" if len(finite) < len(column) else ""
-        ends = f"from {finite.min():.3g} to {finite.max():.3g} {unit}".rstrip()
-        sentences.append(f"{name} {ends}, mean {finite.mean():.3g}{missing}")
-    return f"{'; '.join(sentences)}."

@@ -32,8 +32,7 @@ from thruster_env.model.turns import (
 )
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data, estimates_on
-from tuning.reporting.page import Section, Sketchbook, Words
-from tuning.reporting.style import of_series
+from tuning.reporting.page import Section, Sketchbook, Words, of_series
 
 FAR = 20.0  # where one panel of a row reaches so many times as far as another each has its own limits
 WIDEST = 4.0  # times the largest error: how much of a band is shown

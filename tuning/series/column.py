@@ -195,15 +195,7 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
     of_turns = dict(log.recording.turns)
     turns = tuple(of_turns.get(channel, 0.0) for channel in channels)
     if any(remark.kind == REPEATED for remark in log.recording.remarks):
-        rows = (~np.isnan(log.measurements)).any(axis=1)
-        units = [f"[{quantity.unit}]" if quantity.unit else "" for quantity in log.measured]
-        headers = [f"{quantity.name}{unit}" for quantity, unit in zip(log.measured, units, strict=True)]
-        columns = dict(zip(headers, log.measurements[rows].T, strict=True))
-        slower = column_of({TIME_HEADER: log.times[rows], **columns}, column=headers)
-        remarks = sentences(
-            [finding for finding in log.findings if finding.kind in (PLACEHOLDER, REPEATED, WRAPPED)]
-        )
-        return replace(slower, remarks=(*remarks, *slower.remarks), turns=turns)
+        return replace(_slower(log), turns=turns)
     table, findings = log.measurements.copy(), []
     for finding in log.findings:
         if finding.kind == STUCK:
@@ -216,6 +208,18 @@ def column_of(z: Any, dt: Any = None, *, times: Any = None, column: str | Sequen
     values = table[:, 0] if len(log.measured) == 1 else table
     missing = [] if stamps is not None else _missing(log.measurements, log.dt)
     return Column(values, log.dt, log.measured, (*sentences(findings), *missing), stamps, turns)
+
+
+def _slower(log: Log) -> Column:
+    """The column of a sensor that is slower than its log, at its own rate: of the rows with a measurement."""
+    rows = (~np.isnan(log.measurements)).any(axis=1)
+    units = [f"[{quantity.unit}]" if quantity.unit else "" for quantity in log.measured]
+    headers = [f"{quantity.name}{unit}" for quantity, unit in zip(log.measured, units, strict=True)]
+    columns = dict(zip(headers, log.measurements[rows].T, strict=True))
+    column = column_of({TIME_HEADER: log.times[rows], **columns}, column=headers)
+    kinds = PLACEHOLDER, REPEATED, WRAPPED
+    remarks = sentences([finding for finding in log.findings if finding.kind in kinds])
+    return replace(column, remarks=(*remarks, *column.remarks))
 
 
 def _missing(values: np.ndarray, dt: float) -> list[str]:
