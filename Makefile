@@ -13,6 +13,8 @@ TEST_EXTRAS := rl,render,peers,db,samplers,nuts,parquet,recorders,units,frames,e
 BENCH_EXTRAS := rl,peers,bench
 DOCS_EXTRAS := docs,rl,frames
 ARGS :=
+# Images of Docker often forbid Python to keep what it compiles: each of the tests' processes would compile all it imports.
+unexport PYTHONDONTWRITEBYTECODE
 
 # Stamps: present only after a complete install, so a second run needs no network and an interrupted one starts over.
 MADE := $(VENV)/.made
