@@ -207,6 +207,7 @@ HEAVY = {
 TERMINAL = {"rich", "tuning"}
 COMMAND = {*TERMINAL, "pydantic"}  # Typer's
 FITTING = {"numpy", "filters", "llvmlite", "scipy.linalg", "scipy.optimize", "scipy.special"}
+TUNING = HEAVY - {"matplotlib", "numba", "pandas", "sqlalchemy", "stable_baselines3", "torch"}
 MAY_LOAD = {  # what imports, and commands of the command line, may load
     "import thruster_env": set(),
     "import filters": {"filters"},
@@ -217,6 +218,8 @@ MAY_LOAD = {  # what imports, and commands of the command line, may load
     "thruster new problem mine": COMMAND,
     "thruster inspect": {*COMMAND, "numpy", "scipy.linalg"},
     "thruster fit acc.csv": COMMAND | FITTING,
+    "thruster tune --help": TUNING,
+    "thruster train --help": TUNING,
 }
 
 

@@ -1,4 +1,4 @@
-"""Classical controllers as policies, PI, LQR, LQG and predictive ones, and policies that correct them.
+"""Classical controllers as policies: PI, LQR, LQG and predictive ones.
 
 They use the observation sets of `tuning.policies.algorithms`, so they can be compared with learnt policies.
 """
@@ -11,12 +11,11 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from thruster_env.core.checks import one_of
 from thruster_env.thruster.controllers import HORIZONS, LQRController, PIController, PredictiveController
 from thruster_env.thruster.dynamics import Constants
-from tuning.policies.algorithms import TrainingReturns, size_of
+from tuning.policies.algorithms import TrainingReturns
 
 # Factors on the gains of `gains.lambda_gains`, tried for each observation set.
 GAINS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0)
@@ -50,48 +49,6 @@ class ClassicalPolicy:
         """Replace the last actions in a state by those that were applied, (n, p)."""
         if self.keeps_input:
             state[:, 0] = self.middle + self.half * actions[:, 0]
-
-
-class CorrectController(VecEnvWrapper):
-    """Let a policy correct a controller: a = clip(a_c + share a_p) of the two actions, each in [-1, 1].
-
-    The controller's action is appended to the observation. With a policy of zero action the result is the
-    controller.
-    Source: T. Johannink et al. (2019), "Residual reinforcement learning for robot control", ICRA, 6023-6029.
-
-    Args:
-        venv: envs whose observations the controller takes, with actions in [-1, 1].
-        controller: the controller that is corrected.
-        share: the largest correction, as a fraction of half of each input's range.
-    """
-
-    def __init__(self, venv: VecEnv, controller: ClassicalPolicy, share: float):
-        """Wrap the envs; see the class."""
-        self._controller, self._share = controller, share
-        size = size_of(venv.observation_space) + size_of(venv.action_space)
-        super().__init__(venv, gym.spaces.Box(-np.inf, np.inf, (size,), np.float32))
-
-    def reset(self) -> np.ndarray:
-        """Reset the envs."""
-        observations = self.venv.reset()
-        self._actions, self._state = self._controller.predict(observations)
-        return np.concatenate([observations, self._actions], axis=1)
-
-    def step_async(self, actions: np.ndarray) -> None:
-        """Correct the controller's actions."""
-        applied = np.clip(self._actions + self._share * np.clip(actions, -1.0, 1.0), -1.0, 1.0)
-        self._controller.replace_last_actions(self._state, applied)
-        self.venv.step_async(applied.astype(np.float32))
-
-    def step_wait(self):
-        """Step the envs."""
-        observations, rewards, dones, infos = self.venv.step_wait()
-        for i in np.flatnonzero(dones):
-            last = infos[i]["terminal_observation"]
-            action, _ = self._controller.predict(last, self._state[i])
-            infos[i]["terminal_observation"] = np.concatenate([last, action])
-        self._actions, self._state = self._controller.predict(observations, self._state, dones)
-        return np.concatenate([observations, self._actions], axis=1), rewards, dones, infos
 
 
 def predictive(name: str, env: gym.Env) -> ClassicalPolicy:

@@ -1,7 +1,8 @@
 """The envs of a training configuration for Stable-Baselines3: native vectorised ones, or single ones.
 
 `NativeVecEnv` gives a Gymnasium vector env the interface of Stable-Baselines3's VecEnv. `ShowOutput` and
-`ShowHistory` change what a policy observes: an output of the state, or the last measurements and actions.
+`ShowHistory` change what a policy observes: an output of the state, or the last measurements and actions. With
+`CorrectController` a policy corrects a classical controller.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from thruster_env.core.checks import short_repr
 from thruster_env.env.env import ObserveState, ObserveStateVector
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.policies.algorithms import box_of, find_observation_set, size_of
-from tuning.policies.controllers import CorrectController
+from tuning.policies.controllers import ClassicalPolicy
 from tuning.policies.setup import TrainingConfiguration, plant_of
 
 RULE = "env must be a vector env, of gym.make_vec(..., autoreset_mode='SameStep')"
@@ -193,6 +194,48 @@ class ShowHistory(VecEnvWrapper):
     def _visible(self, observations: np.ndarray) -> np.ndarray:
         appended = observations[:, self._measured :]
         return np.concatenate([self._past.reshape(self.num_envs, -1), appended], axis=1)
+
+
+class CorrectController(VecEnvWrapper):
+    """Let a policy correct a controller: a = clip(a_c + share a_p) of the two actions, each in [-1, 1].
+
+    The controller's action is appended to the observation. With a policy of zero action the result is the
+    controller.
+    Source: T. Johannink et al. (2019), "Residual reinforcement learning for robot control", ICRA, 6023-6029.
+
+    Args:
+        venv: envs whose observations the controller takes, with actions in [-1, 1].
+        controller: the controller that is corrected.
+        share: the largest correction, as a fraction of half of each input's range.
+    """
+
+    def __init__(self, venv: VecEnv, controller: ClassicalPolicy, share: float):
+        """Wrap the envs; see the class."""
+        self._controller, self._share = controller, share
+        size = size_of(venv.observation_space) + size_of(venv.action_space)
+        super().__init__(venv, gym.spaces.Box(-np.inf, np.inf, (size,), np.float32))
+
+    def reset(self) -> np.ndarray:
+        """Reset the envs."""
+        observations = self.venv.reset()
+        self._actions, self._state = self._controller.predict(observations)
+        return np.concatenate([observations, self._actions], axis=1)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Correct the controller's actions."""
+        applied = np.clip(self._actions + self._share * np.clip(actions, -1.0, 1.0), -1.0, 1.0)
+        self._controller.replace_last_actions(self._state, applied)
+        self.venv.step_async(applied.astype(np.float32))
+
+    def step_wait(self):
+        """Step the envs."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for i in np.flatnonzero(dones):
+            last = infos[i]["terminal_observation"]
+            action, _ = self._controller.predict(last, self._state[i])
+            infos[i]["terminal_observation"] = np.concatenate([last, action])
+        self._actions, self._state = self._controller.predict(observations, self._state, dones)
+        return np.concatenate([observations, self._actions], axis=1), rewards, dones, infos
 
 
 def _space(size: int) -> gym.spaces.Box:

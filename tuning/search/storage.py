@@ -31,7 +31,6 @@ from optuna.storages._cached_storage import _CachedStorage
 from optuna.storages._heartbeat import BaseHeartbeat
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState, create_trial
-from sqlalchemy.exc import DBAPIError, OperationalError
 
 from thruster_env.core.checks import short_repr
 
@@ -139,6 +138,8 @@ def open_database(url: str, on_lost: OnLost) -> BaseStorage:
 
 def _database(url: str, on_lost: OnLost) -> RDBStorage:
     """A database, with its tables; tried again when another host makes them at the same time."""
+    from sqlalchemy.exc import DBAPIError, OperationalError  # takes 0.2 s, which journal files need not wait for
+
     for _ in range(TABLE_TRIES - 1):
         try:
             return _connected(url, on_lost)
