@@ -284,7 +284,7 @@ class CovarianceCheck:
             },
             "coverage_95": report.coverage,
             "crps": report.crps,
-            "crps_if_honest": report.crps_expected,
+            "crps_expected": report.crps_expected,
             "members": members,
             "channels": report.channels,
             "innovation_coverage_95": report.innovation_coverage,
