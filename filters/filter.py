@@ -181,6 +181,11 @@ class Filter:
         """The fields, without memory that is kept for the next call."""
         return {name: value for name, value in vars(self).items() if name not in (SPARE, SPARE_IN_PYTHON)}
 
+    @classmethod
+    def of_recursion(cls) -> type[Filter]:
+        """The class whose recursion it has: its own, or that of which it only has another start."""
+        return cls
+
     def from_first_input(self, inputs: Any, rows: int, update_first: bool) -> tuple[Filter, Any]:
         """The filter and the inputs of a run of so many rows, of those that the user gave."""
         return self, inputs

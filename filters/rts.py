@@ -290,7 +290,7 @@ RELATIONS: dict[type[Filter], Relation] = {
 
 def relation_of(filter_: Filter, what: str, alternatives: str = "") -> Relation:
     """The relation of a filter for `smooth_backwards`; ValueError if it has no such smoother."""
-    kind = type(filter_)
+    kind = filter_.of_recursion()
     if kind not in RELATIONS:
         refuse_rotations(filter_.model)
     if filter_.model.bounds:

@@ -53,6 +53,7 @@ STEP = 1e-6  # of parameters, which are scaled to sensible changes of 1
 
 def has_derivatives(kind: type[Filter]) -> bool:
     """Whether a class of filters has derivatives: one of `KINDS`, or a user's that has a page."""
+    kind = kind.of_recursion()
     return kind in KINDS or (not kind.__module__.startswith("filters.") and issubclass(kind, PageFilter))
 
 

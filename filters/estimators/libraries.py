@@ -42,6 +42,11 @@ class PredictedKalmanFilter(KalmanFilter):
 
     has_first_input: ClassVar[bool] = False
 
+    @classmethod
+    def of_recursion(cls) -> type[Filter]:
+        """That of the Kalman filter, of which only the start differs."""
+        return KalmanFilter
+
     def from_first_input(self, inputs: Any, rows: int, update_first: bool) -> tuple[Filter, Any]:
         """Of as many inputs as rows the first one belongs to the first prediction: mean += B u_0."""
         if not update_first:

@@ -180,3 +180,15 @@ def test_what_does_not_fit_is_refused():
         filters.from_control(resting, [1.0], [1.0], dt=0.1, noise_input=[1.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="must be 'kf' of an affine model"):
         filters.to_filterpy(3)
+
+
+def test_filterpy_is_smoothed_as_by_its_own_smoother():
+    kf = filterpy_filter()
+    means, covs, _, _ = kf.batch_filter(Z)
+    smoothed, smoothed_covs, _, _ = kf.rts_smoother(means, covs)
+    kf = filterpy_filter()
+    ours = filters.smooth(filters.from_filterpy(kf), Z)
+    close(ours.means, smoothed[..., 0])
+    close(ours.covs, smoothed_covs)
+    started = filters.from_filterpy(filterpy_filter(np.array([[0.3], [0.5]])), first_input=[1.0])
+    assert filters.smooth(started, inputs=np.ones(59), measurements=Z, lag=2).means.shape == (60, 2)
