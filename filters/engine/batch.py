@@ -151,11 +151,19 @@ def trajectories(
         without = ", because the model has no inputs" if not model.inputs else ""
         rule = f"inputs and measurements must have shapes {shapes}{without}"
         raise ValueError(f"{rule}, but got {inputs.shape} and {z.shape}")
-    if not np.isfinite(inputs).all() or np.isinf(z).any():
-        raise ValueError("inputs must be finite, and measurements finite or NaN, but some are not")
+    _check_finite(inputs, z)
     if not ((keys >= 0) & (keys < 2**32) & (keys == np.floor(keys))).all():
         raise ValueError("keys must be whole numbers from 0 to 2^32 - 1, but some are not")
     return keys, inputs, z
+
+
+def _check_finite(inputs: np.ndarray, z: np.ndarray) -> None:
+    """Raise ValueError that names the first input (B, K, p) or measurement (B, K + 1, m) that is not."""
+    rule = "inputs must be finite, and measurements finite or NaN"
+    for name, values, wrong in (("inputs", inputs, ~np.isfinite(inputs)), ("measurements", z, np.isinf(z))):
+        for run, row, channel in np.argwhere(wrong)[:1].tolist():
+            where = f"row {row} of {name}" + f", run {run}" * (len(values) > 1)
+            raise ValueError(f"{rule}, but {where} has {values[run, row, channel]:g}")
 
 
 def is_single(keys: Any, inputs: Any, measurements: Any) -> bool:
@@ -298,7 +306,12 @@ def prepared(
     q = process_noise_covs
     q = _covs_of_rows("process_noise_covs", q, of_rows - update_first, filter_.kernel_model.t)
     if not update_first:  # a row without a measurement before the first one
-        measurements = np.insert(measurements, 0, np.nan, axis=1 if measurements.ndim == 3 else 0)
+        if inputs is not None and inputs.shape[-2:] != (of_rows, filter_.kernel_model.inputs):
+            rule = f"inputs must have shape {(of_rows, filter_.kernel_model.inputs)}, a row for each measurement"
+            raise ValueError(f"{rule} where update_first=False, but got {inputs.shape[-2:]}")
+        is_batch = measurements.ndim == 3
+        _check_finite(np.zeros(0), measurements if is_batch else measurements.reshape(1, of_rows, -1))
+        measurements = np.insert(measurements, 0, np.nan, axis=int(is_batch))
         r = None if r is None else np.concatenate([r[:1], r])
     single = is_single(None, inputs, measurements)
     keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
@@ -386,6 +399,9 @@ def _in_rows(model: StateSpaceModel, keys: Any, inputs: Any, measurements: Any) 
         way = f": z[..., None] for {len(z)} trajectories" if m == 1 and z.shape[0] < z.shape[1] else ""
         way = ": z.T" if len(z) == m else way
         raise ValueError(f"{rule}, but got {z.shape}{way}")
+    if u is not None and not u.ndim:
+        shape = (*z.shape[:-2], z.shape[-2 if z.ndim == 3 else 0] - 1, model.inputs)
+        raise ValueError(f"inputs must have shape {shape}, but got a number: np.full({shape}, {u:g}) is constant")
     if z.ndim < 3 and u is not None:
         if u.ndim == 3 and u.shape[1:] == (model.inputs, 1):
             u = u[:, :, 0]

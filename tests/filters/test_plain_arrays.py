@@ -91,6 +91,26 @@ def test_an_ensemble_draws_as_the_batch_of_one_does():
             {"inputs": np.zeros(39), "measurements": np.stack([Z, Z], axis=1)},
             r"measurements of one trajectory must have shape \(K \+ 1, 1\), but got \(40, 2\)$",
         ),
+        ({"inputs": 0.5, "measurements": Z}, r"shape \(39, 1\), but got a number: np.full\(\(39, 1\), 0.5\)"),
+        (
+            {"inputs": np.zeros(39), "measurements": Z, "update_first": False},
+            r"inputs must have shape \(40, 1\), a row for each .* update_first=False, but got \(39, 1\)",
+        ),
+        *(
+            (
+                {
+                    "inputs": np.zeros(39 + before),
+                    "measurements": np.where(np.arange(40) == 7, np.inf, Z),
+                    "update_first": not before,
+                },
+                "measurements finite or NaN, but row 7 of measurements has inf",
+            )
+            for before in (0, 1)
+        ),
+        (
+            {"inputs": np.append(np.zeros(38), np.nan), "measurements": Z},
+            "inputs must be finite, .* but row 38 of inputs has nan",
+        ),
         ({"inputs": np.zeros(39), "measurements": ["a"] * 40}, "measurements must be an array of numbers"),
         ({}, "measurements must be an array"),
         (
