@@ -14,13 +14,13 @@ import unicodedata
 from collections.abc import Sequence
 from html import escape
 from itertools import count, groupby
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from thruster_env.core.text_tables import Table, markdown_text, typeset, typeset_html
 from tuning.evaluation.sizes import SizeRow
-from tuning.reporting.style import SCRIPT, STYLE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,6 +40,7 @@ FONTS = re.compile(r"'DejaVu Sans',[^;\"]*sans-serif")
 COLOUR = re.compile(r"#([0-9a-fA-F]{6})\b")
 
 # Of tables and pictures on a page.
+STYLE, SCRIPT = (Path(__file__).with_name(f"report.{kind}").read_text(encoding="utf-8") for kind in ("css", "js"))
 WIDE = 480.0  # [pt] pictures beyond this are scrolled on a phone
 
 
