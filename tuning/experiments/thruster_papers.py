@@ -11,13 +11,15 @@ with this prior the Kalman filter's posterior covariance is the steady state's a
 error has the Riccati optimum as expectation. Were P_inf the posterior covariance, the update with z_0 would make
 the first steps better than the steady state. A second start, N(0, I), shows how little this matters.
 
-Source: `KIKI2020` and `NURHADI2022`, cited in full there; the model goes back to A. J. Healey et al. (1995),
-"Toward an improved understanding of thruster dynamics for underwater vehicles", IEEE J. Oceanic Engineering 20(4).
+Source: Kiki (2020) and Nurhadi et al. (2022), cited in full in `thruster_papers.toml`; the model goes back to
+A. J. Healey et al. (1995), "Toward an improved understanding of thruster dynamics for underwater vehicles", IEEE
+J. Oceanic Engineering 20(4).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -27,6 +29,7 @@ from filters.bounds import riccati_covariances
 from filters.engine.batch import run
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from thruster_env.core.checks import at_least, covariance_root, one_of, positive
+from thruster_env.core.files import read_toml
 from thruster_env.core.matrices import zero_order_hold
 from thruster_env.core.streams import COMPARISON_STUDY, derived_generator
 from thruster_env.core.text_tables import Table
@@ -61,12 +64,13 @@ class PublishedRMSE(NamedTuple):
     omega_m: float  # [rad/s]
     U_a: float  # [m/s]
     note: str = ""  # misprint, if there is one
-    in_text: tuple[float, float] | None = None  # the pair in the paper's text, if it differs
+    in_text: Sequence[float] | None = None  # the pair in the paper's text, if it differs
 
     @property
     def meant(self) -> tuple[float, float]:
         """The most probable pair: that of the text, where it differs from the table."""
-        return self.in_text or (self.omega_m, self.U_a)
+        omega_m, flow = self.in_text or (self.omega_m, self.U_a)
+        return omega_m, flow
 
 
 class PublishedTable(NamedTuple):
@@ -76,93 +80,18 @@ class PublishedTable(NamedTuple):
     source: str
     kf: dict[tuple[str, float], PublishedRMSE]  # by (case, q)
     enkf: dict[tuple[str, float], PublishedRMSE]
-    remarks: tuple[str, ...]  # what a reader of the paper should know
+    remarks: Sequence[str]  # what a reader of the paper should know
 
 
-# RMSE of KF and EnKF on the linear bow thruster, as printed by M. Kiki (2020), final project KM184801, Department
-# of Mathematics, Institut Teknologi Sepuluh Nopember, Surabaya (in Indonesian). One run of 100 steps of 0.01 s, it
-# seems; x_0, P_0, V_s, U_0 and the ensemble size are not printed.
-KIKI2020 = PublishedTable(
-    name="kiki2020",
-    source="M. Kiki (2020), final project KM184801, Institut Teknologi Sepuluh Nopember, Surabaya",
-    kf={
-        ("tunnel", 0.5): PublishedRMSE(0.8740, 0.9239, "the text has 0.9232 for U_a", (0.8740, 0.9232)),
-        ("tunnel", 0.6): PublishedRMSE(1.0138, 1.0093),
-        ("tunnel", 0.8): PublishedRMSE(1.1386, 1.1429),
-        ("tunnel", 1.0): PublishedRMSE(1.3290, 1.3297),
-        ("open-bladed", 0.5): PublishedRMSE(2.7060, 1.9870, "the text has 2.7061 for omega_m", (2.7061, 1.9870)),
-        ("open-bladed", 0.6): PublishedRMSE(2.0609, 2.0609, "one value twice; the text has 2.0690"),
-        ("open-bladed", 0.8): PublishedRMSE(1.9957, 2.6939, "the text has 2.6821 for omega_m", (2.6821, 2.6939)),
-        ("open-bladed", 1.0): PublishedRMSE(2.7525, 2.7646),
-    },
-    enkf={
-        ("tunnel", 0.5): PublishedRMSE(0.7920, 0.1352),
-        ("tunnel", 0.6): PublishedRMSE(0.8941, 0.1492),
-        ("tunnel", 0.8): PublishedRMSE(1.0355, 0.1724),
-        ("tunnel", 1.0): PublishedRMSE(1.2331, 0.2055),
-        ("open-bladed", 0.5): PublishedRMSE(3.6437, 0.6529),
-        ("open-bladed", 0.6): PublishedRMSE(4.4253, 0.6759),
-        ("open-bladed", 0.8): PublishedRMSE(5.2090, 0.8666),
-        ("open-bladed", 1.0): PublishedRMSE(5.7886, 0.9631),
-    },
-    remarks=(
-        "Equation 4.50 as printed starts every member again from the mean: the ensemble forgets its spread.",
-        "Section 4.6 prints R where R^-1 belongs.",
-        "The KF's 1.9957 stands in one cell only (open-bladed, q = 0.8) and is most likely a slip: the text to "
-        "its figure has 2.6821, so that the pair would be 2.6821 and 2.6939.",
-        "The abstract quotes this 1.9957 together with 2.0609, from two different rows (q = 0.8 and q = 0.6), as "
-        "that of Nurhadi et al. (2022) does: they are no run.",
-        "Observability is tested with the measurement matrix [0 1], but the observability matrix printed is that "
-        "of [1 0]. The runs have neither: H = [-2.03 -12.2].",
-        "The eigenvalue 3.1872 of the open-bladed system is printed 31872, and its characteristic polynomial has "
-        "528.83 where the trace gives 523.83.",
-        "The derivative of dU_a/dt by U_0 is printed as -2 (K4/K3) U_0; the equation gives 2 (K4/K3) |U_a - U_0|.",
-    ),
-)
+def _cells(cells: Sequence[dict]) -> dict[tuple[str, float], PublishedRMSE]:
+    return {(cell.pop("case"), cell.pop("q")): PublishedRMSE(**cell) for cell in cells}
 
 
-# The same, and as little about the run, as printed by H. Nurhadi, M. Kiki, D. Adzkiya, T. Herlambang (2022),
-# "Estimation of water momentum and propeller velocity in bow thruster model of autonomous surface vehicle using
-# modified Kalman filter", International Journal of Electrical and Computer Engineering (IJECE) 12(6), 5988-5997,
-# doi:10.11591/ijece.v12i6.pp5988-5997.
-NURHADI2022 = PublishedTable(
-    name="nurhadi2022",
-    source="H. Nurhadi, M. Kiki, D. Adzkiya, T. Herlambang (2022), IJECE 12(6), 5988-5997",
-    kf={
-        ("tunnel", 0.5): PublishedRMSE(0.8678, 0.8717),
-        ("tunnel", 0.6): PublishedRMSE(1.0751, 1.0804),
-        ("tunnel", 0.8): PublishedRMSE(1.1638, 1.1598),
-        ("tunnel", 1.0): PublishedRMSE(1.1969, 1.8830),
-        ("open-bladed", 0.5): PublishedRMSE(1.6749, 1.6820),
-        ("open-bladed", 0.6): PublishedRMSE(1.7762, 1.7748),
-        ("open-bladed", 0.8): PublishedRMSE(1.8369, 1.8449),
-        ("open-bladed", 1.0): PublishedRMSE(2.2645, 2.2752),
-    },
-    enkf={
-        ("tunnel", 0.5): PublishedRMSE(0.8051, 0.1344),
-        ("tunnel", 0.6): PublishedRMSE(0.8051, 0.1344, "a copy of the row q = 0.5"),
-        ("tunnel", 0.8): PublishedRMSE(0.9951, 0.1659),
-        ("tunnel", 1.0): PublishedRMSE(1.2049, 0.2017),
-        ("open-bladed", 0.5): PublishedRMSE(4.0858, 0.6795),
-        ("open-bladed", 0.6): PublishedRMSE(4.1879, 0.6980),
-        ("open-bladed", 0.8): PublishedRMSE(5.0252, 0.8365),
-        ("open-bladed", 1.0): PublishedRMSE(5.8559, 0.9749),
-    },
-    remarks=(
-        "P_xz and P_z as printed use the perturbed measurements in place of the predicted ones.",
-        "The gain K as printed lacks H': it is P H' (H P H' + R)^-1.",
-        "The abstract's EnKF values 0.7920 and 0.1352 stand in the table of Kiki (2020), not in this "
-        "paper's. Its KF values 1.9957 and 2.0609 come from there too, from two different rows (q = 0.8 and "
-        "q = 0.6): they are no run. And 1.9957 is most likely a slip for 2.6821, which the text there has.",
-        "The eigenvalue 3.1872 of the open-bladed system is printed 31872, and its characteristic polynomial has "
-        "528.83 where the trace gives 523.83.",
-        "B of the open-bladed system is printed with 0.065 for 0.65: the printed B_d follows from 0.65 only.",
-        "The conclusion contradicts the paper's own Table 2. By the printed numbers the EnKF's error of omega_m "
-        "in the open-bladed case is 2.4 to 2.7 times the KF's.",
-    ),
-)
-
-STUDIES = {table.name: table for table in (NURHADI2022, KIKI2020)}
+STUDIES = {
+    name: PublishedTable(name, paper["source"], _cells(paper["kf"]), _cells(paper["enkf"]), paper["remarks"])
+    for name, paper in read_toml(Path(__file__).with_suffix(".toml"), "printed values").items()
+}
+"""The papers' tables by name, the latest first."""
 
 
 def unupdated_ensemble_means(

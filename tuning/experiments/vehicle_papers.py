@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ from thruster_env.auv.parameters import SEGOROGENI
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import one_of
 from thruster_env.core.compiled import is_interpreting
+from thruster_env.core.files import read_toml
 from thruster_env.core.streams import cosine_and_sine
 from thruster_env.graphs.loops import Loops
 from thruster_env.model.shape import Functions, Shape, constants_reader, number_offsets
@@ -71,7 +73,7 @@ class Paper(NamedTuple):
 
     name: str
     source: str
-    remarks: tuple[str, ...]
+    remarks: Sequence[str]
 
 
 def papers_model(states: str, world: str = "vehicle", **arguments) -> StateSpaceModel:
@@ -101,125 +103,14 @@ def papers_model(states: str, world: str = "vehicle", **arguments) -> StateSpace
     return auv_model(states=states, **settings | arguments)
 
 
-# Ngatini, E. Apriliani, H. Nurhadi (2017), "Ensemble and Fuzzy Kalman Filter for position estimation of an
-# autonomous underwater vehicle based on dynamical system of AUV motion", Expert Systems with Applications 68,
-# 29-35. The numbers are those of Ngatini's slides on the same comparison; the article itself was not at hand.
-
-
 PRINTED_MEMBERS = 50  # beside the 64 rules of the fuzzy filter
-
+PRINTED = read_toml(Path(__file__).with_suffix(".toml"), "printed values")
+NGATINI2017, NGATINI2019 = (Paper(name, paper["source"], paper["remarks"]) for name, paper in PRINTED.items())
 PRINTED_PATHS = {
-    "dynamic": PrintedPath(
-        PrintedRow(
-            {"x": 0.00152, "y": 0.00138, "psi": 0.001123},
-            1.68838,
-            {"x": 0.00152, "y": 0.00138, "psi": 0.001123},
-        ),
-        PrintedRow(
-            {"x": 0.01981, "y": 0.01778, "psi": 0.002287},
-            3.3382,
-            {"x": 0.01981, "y": 0.01778, "psi": 0.002287},
-        ),
-        "the percents are the digits of the RMSE: a copy",
-    ),
-    "I": PrintedPath(
-        PrintedRow({"x": 0.03953, "y": 0.00814, "psi": 0.002008}, 2.91739, {"x": 0.43, "y": 0.85}),
-        PrintedRow({"x": 0.044275, "y": 0.001251, "psi": 1.99e-5}, 3.496043, {"x": 0.98, "y": 3.31}),
-    ),
-    "II": PrintedPath(
-        PrintedRow({"x": 0.0553, "z": 0.0077, "psi": 0.0427}, 2.983, {"x": 0.087, "z": 2.41}),
-        PrintedRow({"x": 0.0334, "z": 0.0031, "psi": 0.00204}, 3.231, {"x": 0.171, "z": 1.49}),
-    ),
-    "III": PrintedPath(
-        PrintedRow({"x": 0.009, "y": 0.0044, "psi": 0.005}, 2.642, {"x": 0.977, "y": 4.86}),
-        PrintedRow({"x": 0.00045, "y": 0.00046, "psi": 1e-5}, 3.5532, {"x": 0.928, "y": 0.83}),
-    ),
-    "IV": PrintedPath(
-        PrintedRow(
-            {"x": 0.47017, "y": 0.467, "z": 0.082, "psi": 0.10039},
-            2.8194,
-            {"x": 0.454, "y": 4.834, "z": 3.525},
-        ),
-        PrintedRow(
-            {"x": 0.3747, "y": 0.3662, "z": 0.0188, "psi": 0.100388},
-            3.80326,
-            {"x": 0.661, "y": 4.089, "z": 0.886},
-        ),
-        "the EnKF's row is that of ngatini2019 for 50 members",
-    ),
+    name: PrintedPath(PrintedRow(**path["enkf"]), PrintedRow(**path["fkf"]), path.get("remark", ""))
+    for name, path in PRINTED[NGATINI2017.name]["paths"].items()
 }
-"""By the name of the path. That the angle is yaw is inferred, and so is what paths I to III are."""
-
-NGATINI2017 = Paper(
-    name="ngatini2017",
-    source="Ngatini, E. Apriliani, H. Nurhadi (2017), Expert Systems with Applications 68, 29-35, by their slides",
-    remarks=(
-        "Not fully specified: what the matrices of a rule are, whether a tangent has its offset, how a rule's "
-        "weight follows from six memberships, and whether a rule continues from its own estimate or the common "
-        "one. Here each rule is the tangent at its corner at cruise, its weight the product of memberships within "
-        "0 and 1, and all continue from the common estimate.",
-        "Memberships of minimum and maximum are exchanged in name, and both are called mu_u1.",
-        "B_3 keeps the term m dw/dt within the bracket, though dw/dt stands on the left.",
-        "The matrix E is printed with 8 columns, on one slide with 7. It is 6 x 6.",
-        "The gain is printed as P H' (H P + R)^-1. It is P H' (H P H' + R)^-1.",
-        "The input vector lists both planes twice.",
-        "The RMSE of the dynamic path are printed again as percents, and conclusion 4 has other percents.",
-        "M_uu_dr in the equation of yaw stands for N_uu_dr.",
-        "Row 5 of the mass matrix has -(M_wd + x_G) for -(M_wd + m x_G).",
-    ),
-)
-
-
-# Ngatini, H. Nurhadi (2019), "Estimasi Lintasan AUV 3 Dimensi (3D) Dengan Ensemble Kalman Filter", Jurnal Inovtek
-# Polbeng Seri Informatika 4(1), 12-21, ISSN 2527-9866.
-
-
-TABLE_III = {
-    50: PrintedRow({"x": 0.4702, "y": 0.4674, "z": 0.0823, "psi": 0.1003}, 2.819),
-    100: PrintedRow({"x": 0.4636, "y": 0.4666, "z": 0.0819, "psi": 0.1003}, 5.692),
-    200: PrintedRow({"x": 0.4648, "y": 0.4657, "z": 0.0814, "psi": 0.1003}, 11.56),
-    300: PrintedRow({"x": 0.4632, "y": 0.4644, "z": 0.0820, "psi": 0.1003}, 18.15),
-}
-"""By the number of members. That the angle is yaw is inferred."""
-
-PRINTED_INVERSE = np.array(
-    [
-        [0.162, -0.0024, 0.8989, 0.0011, 0.098, 0.0001],
-        [-0.0012, -0.8175, -0.0206, -0.0431, -0.0024, 0.0969],
-        [1.8855, -0.0418, -1.023, -0.0036, -0.2205, 0.0024],
-        [-0.0518, 0.8865, 0.0511, 1.0468, 0.0088, -0.105],
-        [15.9131, -0.3634, -17.0743, -0.0425, -1.8611, 0.0213],
-        [-0.0128, 15.7327, 0.1966, 0.8288, 0.024, -0.8641],
-    ]
-)
-"""A^-1 of equation (19), A the mass matrix with each row divided by its diagonal; "-08641" is read as -0.8641.
-
-Its inverse has a diagonal of ones to 8e-4 and the zeros of such a matrix, so the print holds what was meant. But
-its entries imply Xud = Yvd = Zwd, Ix - Kpd < 0 and Iy - Mqd = 0.09 kg m^2 for a body of 15 kg and almost a
-metre, and eigenvalues -0.24 and -0.49: an indefinite mass matrix, of which no vehicle has one.
-"""
-
-NGATINI2019 = Paper(
-    name="ngatini2019",
-    source="Ngatini, H. Nurhadi (2019), Jurnal Inovtek Polbeng Seri Informatika 4(1), 12-21",
-    remarks=(
-        "Equation (24) moves the mean, and no member: every forecast member is f(mean) plus noise, whose "
-        "covariance is Q whatever the measurements said. The slides of ngatini2017 move the members.",
-        "The text has an accuracy above 55 %, without a definition: it cannot be reproduced.",
-        "The seconds are linear in the number of members, 0.056 to 0.061 s each, so members were looped over. "
-        "At 0.001 s a step a path of 18 m takes some 20 000 steps, which would leave 3 us of Octave for the "
-        "dozen statements of a member's step: the run was probably shorter than the path.",
-        "The printed A^-1 is no vehicle's: its inverse has eigenvalues of both signs.",
-        "Table and text have 11.56 and 11.57 s for 200 members.",
-        "Abstract and conclusion give the error of an angle in metres, and initial angles come in rad/s.",
-        "Equations (1) to (4) have lost the dots of derivatives; Z_uu delta_s in (7) lacks u^2.",
-        "M_uu_dr in (10) and (17) stands for N_uu_dr, and the last bracket of (17) has the other sign.",
-        "Row 5 of (11) has -(M_wd + x_G) for -(M_wd + m x_G).",
-        "The gain is printed as P H' (H P + R)^-1. It is P H' (H P H' + R)^-1.",
-        "The body's origin is said to be in the earth's centre of gravity.",
-    ),
-)
-
+TABLE_III = {int(count): PrintedRow(**row) for count, row in PRINTED[NGATINI2019.name]["members"].items()}
 
 POSE_ANGLES = (False, False, False, True)  # of x, y, z and yaw
 KEPT = 5  # roll, pitch and the last p, q, r
