@@ -116,11 +116,6 @@ def subplots(size: tuple[float, float], *shape: int, **options):
     return figure, axes
 
 
-def legend_below(figure, axis, columns: int = 4) -> None:
-    """One legend for a whole figure, that of one of its axes."""
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=columns, frameon=False)
-
-
 def label_grid(axes, x: str, y: str) -> None:
     """Label a grid of axes along its lower and its left side."""
     for axis in axes[-1]:

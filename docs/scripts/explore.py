@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from docs.scripts import digits, subplots
-from thruster_env.core.files import BLUE, DARK, RUST, save_figure
+from thruster_env.core.files import BLUE, DARK, RUST, legend_below, save_figure
 from thruster_env.core.text_tables import markdown_table
 from tuning.exploring.bench import SCENES, Scene
 from tuning.exploring.view import View
@@ -40,19 +40,13 @@ def draw(scene: Scene, path: Path) -> Path:
     labels = (state.name, state.unit), ("its error", state.unit), ("innovation", channel.unit)
     for axis, (label, unit) in zip(axes[:, 0], labels, strict=True):
         axis.set_ylabel(f"{label} [{unit}]", fontsize=9)
-    figure.legend(*_handles(axes), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    legend_below(figure, axes[:2, 0], fontsize=9)
     return save_figure(figure, path)
 
 
 def _band(axis, time: np.ndarray, deviation: np.ndarray) -> None:
     reach = BAND * deviation
     axis.fill_between(time, -reach, reach, color=BLUE, alpha=0.25, linewidth=0, label="95 % band")
-
-
-def _handles(axes) -> tuple[list, list]:
-    """Lines of the first panel and the band of the second, with their labels."""
-    legends = [axis.get_legend_handles_labels() for axis in axes[:2, 0]]
-    return [*legends[0][0], *legends[1][0]], [*legends[0][1], *legends[1][1]]
 
 
 def _figures(view: View, symbol: str) -> str:

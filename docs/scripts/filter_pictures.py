@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from docs.scripts import about, digits, legend_below, log_ticks, subplots
+from docs.scripts import about, digits, log_ticks, subplots
 from filters import (
     Estimates,
     ExtendedKalmanFilter,
@@ -31,7 +31,7 @@ from filters.filter import Filter
 from filters.gaussian.mixtures import BLENDINGS
 from filters.logs.findings import TRUTH, plot_style
 from filters.registry import FILTERS
-from thruster_env.core.files import BLUE, DARK, MUSTARD, PALE, RUST, save_figure
+from thruster_env.core.files import BLUE, DARK, MUSTARD, PALE, RUST, legend_below, save_figure
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.thruster.analysis import steady_state
@@ -138,7 +138,7 @@ def kalman(path: Path) -> Path:
     right.set(xlabel="time [s]", ylabel=FLOW)
     right.set_title("levels within $\\pm$12 V, each for 0.25 s", fontsize=10)
     left.set_title("constant voltage", fontsize=10)
-    legend_below(figure, left)
+    legend_below(figure, [left])
     return save_figure(figure, path)
 
 
@@ -199,7 +199,7 @@ def sigma_points(path: Path) -> Path:
     log_ticks(right.xaxis, (0.02, 0.05, 0.1, 0.2, 0.5))
     log_ticks(right.yaxis, (1, 2, 5))
     right.set(xlabel="noise of the flow, std a step [m/s]", ylabel="RMSE of $U_a$ over its bound [-]")
-    legend_below(figure, right, 5)
+    legend_below(figure, [right])
     return save_figure(figure, path)
 
 

@@ -18,7 +18,7 @@ from docs.scripts import subplots
 from filters import EstimateState
 from filters.engine.batch import run
 from filters.filter import Filter
-from thruster_env.core.files import BLUE, DARK, RUST, save_figure, write_whole
+from thruster_env.core.files import BLUE, DARK, RUST, legend_below, save_figure, write_whole
 from tuning.api.study import Study
 from tuning.api.tune import run_tuning
 from tuning.cli.demo import FILTER, SCENARIO
@@ -80,8 +80,7 @@ def tuned(path: Path) -> Path:
         below.set_xlabel("time [s]")
     axes[0, 0].set_ylabel(axis_label(unit))
     axes[1, 0].set_ylabel(f"error\n[{unit.unit}]")
-    named = [pair for axis in axes[:, 0] for pair in zip(*axis.get_legend_handles_labels(), strict=True)]
-    figure.legend(*zip(*named, strict=True), loc="outside lower center", ncols=len(named), frameon=False)
+    legend_below(figure, axes[:, 0])
     return save_figure(figure, path)
 
 

@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from docs.scripts import by_name, digits, label_grid, legend_below, subplots
-from thruster_env.core.files import BLUE, DARK, RUST, SKY, save_figure, write_whole
+from docs.scripts import by_name, digits, label_grid, subplots
+from thruster_env.core.files import BLUE, DARK, RUST, SKY, legend_below, save_figure, write_whole
 from thruster_env.core.streams import episode_keys
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.env.env import ObserveStateVector
@@ -229,7 +229,7 @@ def responses(path: Path) -> Path:
     for axis in axes[-1]:
         axis.set_xlabel("time [ms]")
     figure.align_ylabels(axes[:, 0])
-    legend_below(figure, axes[0, 0])
+    legend_below(figure, axes[0, :1])
     return save_figure(figure, path)
 
 
@@ -258,7 +258,7 @@ def steady_states(path: Path) -> Path:
     axes[2].set_xticks(range(len(STYLES)), [name.replace("_", "\n") for name in STYLES], fontsize=8)
     axes[2].grid(axis="x", visible=False)
     axes[2].legend(fontsize=8, frameon=False, loc="upper left")
-    legend_below(figure, axes[0])
+    legend_below(figure, axes[:1])
     return save_figure(figure, path)
 
 
@@ -286,7 +286,7 @@ def sensor_effects(path: Path) -> Path:
         axis.plot(time[missing], readings[missing], "x", color=RUST, markersize=3.5, label="missing")
         axis.set_title(title, fontsize=9)
     label_grid(axes, "time [s]", "thrust [N]")
-    legend_below(figure, axes[0, 0])
+    legend_below(figure, axes[0, :1])
     return save_figure(figure, path)
 
 
@@ -382,7 +382,7 @@ def _signals(path: Path, plants: dict[str, Plant], plain: Plant, voltages, first
     axes[0, 0].set_ylabel(label)
     axes[1, 0].set_ylabel("thrust [N]")
     figure.align_ylabels(axes[:, 0])
-    legend_below(figure, axes[0, 0])
+    legend_below(figure, axes[0, :1])
     return save_figure(figure, path)
 
 

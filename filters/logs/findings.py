@@ -32,6 +32,7 @@ from thruster_env.core.files import (
     SKY,
     TRUE,
     WINE,
+    legend_below,
     new_figure,
     tidy,
 )
@@ -549,11 +550,7 @@ def draw_log(estimate: LogEstimate, title: str, *, states: bool = True, alarms: 
     axes[0].set_title(verbatim(title, most=TITLE), fontsize=11)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
-    named: dict[str, Any] = {}
-    for axis in axes:
-        handles, texts = axis.get_legend_handles_labels()
-        named |= dict(zip(texts, handles, strict=True))
-    figure.legend(named.values(), named, loc="outside lower center", ncols=len(named), frameon=False)
+    legend_below(figure, axes)
     return figure
 
 

@@ -220,6 +220,23 @@ def panels(count: int, columns: int, size: tuple[float, float], extra: float = 0
     return figure, axes[:count]
 
 
+def legend_below(figure, axes: Iterable, most: int | None = None, **options) -> None:
+    """One legend below a whole figure, of all that some of its axes name.
+
+    Args:
+        figure: of matplotlib.
+        axes: whose labels it has, each once.
+        most: entries side by side; all if None.
+        **options: of matplotlib's `legend`.
+    """
+    named: dict = {}
+    for axis in axes:
+        handles, labels = axis.get_legend_handles_labels()
+        named |= dict(zip(labels, handles, strict=True))
+    columns = len(named) if most is None else min(most, len(named))
+    figure.legend(named.values(), named, loc="outside lower center", ncols=columns, frameon=False, **options)
+
+
 def thinned(x: np.ndarray, y: np.ndarray, keep: np.ufunc | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Points of a line, (N,) each: of long ones the smallest and the largest value of each stretch.
 

@@ -18,6 +18,7 @@ from thruster_env.core.files import (
     PLUM,
     RUST,
     WINE,
+    legend_below,
     new_figure,
     thinned,
     tidy,
@@ -201,7 +202,6 @@ def draw_findings(log: Log) -> Figure:
     figure = new_figure((WIDTH, PANEL * len(panels) + ROOM))
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     tidy(axes)
-    named: dict[str, object] = {}
     for axis, (channel, quantity, values) in zip(axes, panels, strict=True):
         if channel:
             present = ~np.isnan(values)
@@ -227,10 +227,8 @@ def draw_findings(log: Log) -> Figure:
                 style = {"color": RUST, "fillstyle": "none", "markersize": 7, "markeredgewidth": 1.3}
                 axis.plot(times[rows], values[rows], "o", label="outlier", **style)
         axis.set_ylabel(quantity.plot_label.replace(" $", "\n$"))
-        handles, texts = axis.get_legend_handles_labels()
-        named |= dict(zip(texts, handles, strict=True))
     axes[0].set_title(verbatim(f"{log.name}: {log.steps + 1} rows, dt {log.dt:g} s", most=TITLE), fontsize=11)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
-    figure.legend(named.values(), named, loc="outside lower center", ncols=len(named), frameon=False)
+    legend_below(figure, axes)
     return figure

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.core.files import new_figure, save_figure, tidy
+from thruster_env.core.files import legend_below, new_figure, save_figure, tidy
 from thruster_env.core.text_tables import markdown_table
 from tuning.api.markers import OUTPUT, ExecutorOption, Option
 from tuning.api.markers import RUNS as RUNS_PANEL
@@ -244,9 +244,7 @@ def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> P
             label.set_fontweight("bold" if label.get_text() in (STUDY, START) else "normal")
         axis.set_title(f"{group}: {GROUPS[group]}", fontsize=10)
         axis.set_xlabel("regret [%]")
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    if handles:
-        drawn.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    legend_below(drawn, axes.flat[:1])
     drawn.suptitle(
         "Score over that of the best constant numbers, held out; left of 0.01 % is drawn there", fontsize=11
     )

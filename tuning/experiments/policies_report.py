@@ -15,7 +15,7 @@ import numpy as np
 
 from filters.consistency.nees import Interval
 from filters.logs.findings import colour_of
-from thruster_env.core.files import DARK, new_figure, save_figure, tidy
+from thruster_env.core.files import DARK, legend_below, new_figure, save_figure, tidy
 from thruster_env.core.text_tables import Table, markdown_table
 from tuning.api.markers import OUTPUT, RUNS, ExecutorOption, Option
 from tuning.api.result import Printed
@@ -287,8 +287,7 @@ def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
         _make_logarithmic(axis)
     axes[0].set_ylabel(COST)
     tidy(axes)
-    named = axes[0].get_legend_handles_labels()
-    figure.legend(*named, loc="outside lower center", ncols=2 * len(noises), frameon=False)
+    legend_below(figure, axes[:1], 2 * len(noises))
     return save_figure(figure, path)
 
 

@@ -27,7 +27,7 @@ from filters.logs.findings import TRUTH as TRUTH_LOOK
 from filters.logs.findings import plot_style
 from thruster_env.auv.paths import CRUISE_THRUST, MANOEUVRES, TORQUE_PER_THRUST
 from thruster_env.core.checks import at_least, one_of
-from thruster_env.core.files import BLUE, GREEN, PLUM, SKY, new_figure, save_figure
+from thruster_env.core.files import BLUE, GREEN, PLUM, SKY, legend_below, new_figure, save_figure
 from thruster_env.model.simulate import Truth, simulate
 from tuning.experiments.vehicle_papers import (
     DT,
@@ -370,13 +370,12 @@ def paths_figure(path: str | Path, runs: Sequence[PathRun]) -> Path:
         _arrange(axis, np.concatenate(list(drawn.positions.values())))
         meaning = PATHS[drawn.path]
         axis.set_title(drawn.path if drawn.path == meaning else f"{drawn.path}: {meaning}", fontsize=11, y=0.94)
-    handles, labels = axis.get_legend_handles_labels()
     if rows * columns > len(runs):
         corner = figure.add_subplot(rows, columns, rows * columns)
         corner.axis("off")
-        corner.legend(handles, labels, loc="center", frameon=False)
+        corner.legend(*axis.get_legend_handles_labels(), loc="center", frameon=False)
     else:
-        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+        legend_below(figure, [axis], 3)
     return save_figure(figure, path)
 
 

@@ -25,6 +25,7 @@ from thruster_env.core.files import (
     MUSTARD,
     PALE,
     RUST,
+    legend_below,
     panels,
 )
 from thruster_env.core.text_tables import TITLE, verbatim
@@ -133,8 +134,7 @@ def draw_comparison(comparison: Comparison, title: str, filter_name: str = "ekf"
         axis.set_ylabel(f"RMSE of {states[i].plot_label}")
         axis.margins(y=0.15)
         axis.grid(axis="x", visible=False)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", frameon=False, title=left_out or None)
+    legend_below(figure, axes[:1], title=left_out or None)
     figure.suptitle(verbatim(title, most=TITLE), fontsize=11)
     return figure
 

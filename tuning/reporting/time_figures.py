@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,7 +13,7 @@ from filters.engine.batch import Estimates
 from filters.filter import Filter
 from filters.logs.findings import MEASURED, SPARSE, TRUTH, colour_of, is_sparse
 from thruster_env.core.angles import with_breaks, wrapped_where
-from thruster_env.core.files import BLUE, GREY, RUST, new_figure, thinned, tidy
+from thruster_env.core.files import BLUE, GREY, RUST, legend_below, new_figure, thinned, tidy
 from thruster_env.core.sources import as_value, is_array
 from thruster_env.core.text_tables import TITLE, verbatim
 from thruster_env.model.euler import displayed, displayed_deviations, displayed_quantities, measured_and_predicted
@@ -168,7 +168,6 @@ def draw_estimates(
     run_index: int,
     dt: float | None,
     scored: Collection[int] | None = None,
-    **options,
 ) -> Figure:
     """Truth and estimate of every state over time, and the error in its 95 % band; one column per filter.
 
@@ -183,7 +182,6 @@ def draw_estimates(
         run_index: which of its runs.
         dt: sample time [s]; None for an axis of steps.
         scored: places of the states that count in the score, which come first where not all are shown.
-        **options: of matplotlib's `subplots`.
     """
     model = next(iter(filters.values())).model
     states = model.states if data.states is None else model.states[: data.states.shape[-1]]
@@ -192,27 +190,36 @@ def draw_estimates(
     rows = _rows(states, indices, innovations_of(model), data.states is not None)
     heights = [row.height for row in rows]
     unit = UNIT if len(indices) <= 2 else UNIT_OF_MANY
-    figure = new_figure((WIDTH * len(filters), unit * sum(heights)))
-    options = {"sharex": True, "height_ratios": heights, **options}
-    axes = figure.subplots(len(rows), len(filters), squeeze=False, **options)
+    figure, axes = _columns(filters, len(rows), unit * sum(heights), dt, height_ratios=heights)
+    _draw_rows(axes, rows, filters, data, run_index, dt)
+    legend_below(figure, axes[:, 0], title=left_out or None)
+    return figure
+
+
+def _columns(filters: Iterable[str], rows: int, height: float, dt: float | None, **options):
+    """A figure of a height [inch] with a column of panels over time per filter, below its title."""
+    titles = list(filters)
+    figure = new_figure((WIDTH * len(titles), height))
+    axes = figure.subplots(rows, len(titles), squeeze=False, sharex=True, **options)
     tidy(axes.flat)
-    runs = [one_run(filter_, data, run_index, dt) for filter_ in filters.values()]
-    for column, filtered, (title, filter_) in zip(axes.T, runs, filters.items(), strict=True):
+    for column, title in zip(axes.T, titles, strict=True):
+        column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
+        column[-1].set_xlabel(_time(dt))
+    return figure, axes
+
+
+def _draw_rows(
+    axes, rows: Sequence[Row], filters: Mapping[str, Filter], data: Data, index: int, dt: float | None
+) -> None:
+    """Draw a run of each filter into its column of panels, with one label and one pair of limits a row."""
+    runs = [one_run(filter_, data, index, dt) for filter_ in filters.values()]
+    for column, filtered, filter_ in zip(axes.T, runs, filters.values(), strict=True):
         for axis, row in zip(column, rows, strict=True):
             row.draw(axis, filtered, colour=colour_of(filter_.name))
-        column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
-        column[-1].set_xlabel("step" if dt is None else "time [s]")
     for line, row in zip(axes, rows, strict=True):
         line[0].set_ylabel(row.label)
         row.limit(line, runs, data.first_scored)
-    figure.align_ylabels(axes[:, 0])
-    named: dict[str, Any] = {}
-    for axis in axes[:, 0]:
-        handles, labels = axis.get_legend_handles_labels()
-        named |= dict(zip(labels, handles, strict=True))
-    options = {"ncols": len(named), "frameon": False, "title": left_out or None}
-    figure.legend(named.values(), named, loc="outside lower center", **options)
-    return figure
+    axes[0, 0].figure.align_ylabels(axes[:, 0])
 
 
 def _rows(
@@ -233,12 +240,15 @@ def _rows(
             label = axis_label(Quantity("error", "error", states[i].unit))
             rows.append(Row(LOW, label, partial(_error, i=i), partial(_limit_errors, i=i)))
     if not has_truth:
-        measured, _ = plotted_states(channels)
-        rows += [
-            Row(LOW, axis_label(channels[j]), partial(_innovation, j=j), partial(limit_innovations, j=j))
-            for j in measured
-        ]
+        rows += _innovation_rows(channels, plotted_states(channels)[0])
     return rows
+
+
+def _innovation_rows(channels: tuple[Quantity, ...], indices: list[int]) -> list[Row]:
+    return [
+        Row(LOW, axis_label(channels[j]), partial(_innovation, j=j), partial(limit_innovations, j=j))
+        for j in indices
+    ]
 
 
 def one_run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
@@ -373,7 +383,7 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
         time, values = thinned(filtered.time[:-1], single.inputs[0][:, i])
         axis.plot(time, values, color=GREY, drawstyle="steps-post", linewidth=1.2, label="input")
         axis.set_ylabel(axis_label(model.input_quantities[i]))
-    _legend(figure, axes, left_out.replace("states", "channels"))
+    legend_below(figure, axes, 4, title=left_out.replace("states", "channels") or None)
     return figure
 
 
@@ -381,22 +391,9 @@ def draw_innovations(filters: Mapping[str, Filter], data: Data, index: int, dt: 
     """Innovations of every channel in the band that each filter expects; one column per filter."""
     channels = innovations_of(next(iter(filters.values())).model)
     indices, left_out = plotted_states(channels)
-    figure = new_figure((WIDTH * len(filters), HEIGHT * 1.2 * len(indices) + 0.8))
-    axes = figure.subplots(len(indices), len(filters), squeeze=False, sharex=True)
-    tidy(axes.flat)
-    runs = [one_run(filter_, data, index, dt) for filter_ in filters.values()]
-    for column, filtered, (title, filter_) in zip(axes.T, runs, filters.items(), strict=True):
-        for axis, j in zip(column, indices, strict=True):
-            band = TWO_SIDED * np.sqrt(filtered.estimates.innovation_covs[0, :, j, j])
-            draw_in_band(
-                axis, filtered.time, filtered.innovations[:, j], band, "innovation", colour_of(filter_.name)
-            )
-        column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
-        column[-1].set_xlabel(_time(dt))
-    for line, j in zip(axes, indices, strict=True):
-        line[0].set_ylabel(axis_label(channels[j]))
-        limit_innovations(line, runs, data.first_scored, j)
-    _legend(figure, axes[:, 0], left_out.replace("states", "channels"))
+    figure, axes = _columns(filters, len(indices), HEIGHT * 1.2 * len(indices) + 0.8, dt)
+    _draw_rows(axes, _innovation_rows(channels, indices), filters, data, index, dt)
+    legend_below(figure, axes[:, 0], 4, title=left_out.replace("states", "channels") or None)
     return figure
 
 
@@ -426,24 +423,20 @@ def draw_gains(filters: Mapping[str, Filter], data: Data, index: int, dt: float 
     indices, left_out = plotted_states(states, scored)
     quantities = innovations_of(model)
     channels, _ = plotted_states(quantities)
-    figure = new_figure((WIDTH * len(filters), HEIGHT * len(indices) + 0.8))
-    axes = figure.subplots(len(indices), len(filters), squeeze=False, sharex=True)
-    tidy(axes.flat)
-    for column, (title, filter_) in zip(axes.T, filters.items(), strict=True):
+    figure, axes = _columns(filters, len(indices), HEIGHT * len(indices) + 0.8, dt)
+    for column, filter_ in zip(axes.T, filters.values(), strict=True):
         matrices = gains(filter_, data, index)
         time = (1.0 if dt is None else dt) * np.arange(len(matrices))
         for axis, i in zip(column, indices, strict=True):
             for row, j in enumerate(channels):
                 look = {"color": colour_of(filter_.name), "linestyle": DASHES[row % len(DASHES)], "linewidth": 1.0}
                 axis.plot(*thinned(time, matrices[:, i, j]), label=f"by {quantities[j].text_symbol}", **look)
-        column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
-        column[-1].set_xlabel(_time(dt))
     for axis, i in zip(axes[:, 0], indices, strict=True):
         units = {_over(states[i], quantities[j]) for j in channels}
         unit = units.pop() if len(units) == 1 else "state/channel"
         axis.set_ylabel(axis_label(states[i]._replace(name="gain on", unit=unit)))
     figure.align_ylabels(axes[:, 0])
-    _legend(figure, axes[:, 0], left_out)
+    legend_below(figure, axes[:, 0], 4, title=left_out or None)
     return figure
 
 
@@ -483,15 +476,6 @@ def _signal_rows(count: int, width: float, dt: float | None):
     axes[-1].set_xlabel(_time(dt))
     figure.align_ylabels(axes)
     return figure, axes
-
-
-def _legend(figure, axes, left_out: str) -> None:
-    named: dict[str, Any] = {}
-    for axis in axes:
-        handles, labels = axis.get_legend_handles_labels()
-        named |= dict(zip(labels, handles, strict=True))
-    options = {"ncols": min(len(named), 4), "frameon": False, "title": left_out or None}
-    figure.legend(named.values(), named, loc="outside lower center", **options)
 
 
 def of_estimates(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> str:
