@@ -1,25 +1,19 @@
-"""Inflation that adapts: the mode by a search, its place in a step, and a model whose Q is too small."""
+"""Inflation that adapts: modes by a search, widths by quadrature, and a model whose Q is too small."""
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
-from scipy.stats import multivariate_normal
+from scipy.stats import invgamma, multivariate_normal
 
 from filters import make_filter, run
+from filters.ensembles.ensemble import relative_move, width_of
+from tests.filters.checks import refused
 from tests.filters.test_localised import ring
 from tests.models import KEY, plane_model, random_affine, simulated, state_space
-from thruster_env.core.compiled import interpreted
 
 DEVIATION = 0.3
-
-
-def naive_factor(t, v, s, r):
-    """The next factor: slopes by differences, the mode by a search."""
-
-    def level(other):
-        return multivariate_normal.logpdf(v, cov=other / t * (s - r) + r)
-
-    return max(t + mode_of((level(t + 1e-5) - level(t - 1e-5)) / 2e-5), 1.0)
+OWN = {"ensemble_size": 8, "adaptive_inflation": DEVIATION}
 
 
 def mode_of(slope):
@@ -28,86 +22,62 @@ def mode_of(slope):
     def cost(u):
         return 0.5 * (u / DEVIATION) ** 2 - np.log(max(1.0 + slope * u, 1e-300))
 
-    found = minimize_scalar(cost, bounds=(-DEVIATION, DEVIATION), method="bounded", options={"xatol": 1e-12})
-    return found.x
+    return minimize_scalar(cost, bounds=(-DEVIATION, DEVIATION), method="bounded", options={"xatol": 1e-12}).x
 
 
-@pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", ["enkf", "etkf", "ensrf", "ienkf", "enkf-n", "rhf", "letkf 2"])
-def test_each_step_stretches_and_each_update_adapts(name):
-    kind, _, radius = name.partition(" ")
-    own = {"radius": float(radius)} if radius else {}
-    model = ring() if radius else plane_model()
-    plain = make_filter(kind, model, ensemble_size=8, **own)
-    adaptive = make_filter(kind, model, ensemble_size=8, adaptive_inflation=DEVIATION, **own)
-    _, z = simulated(model.replace(process_noise_cov=9.0 * model.process_noise_cov), 12)
-    u, belief, seen = np.zeros(model.inputs), adaptive.init(KEY), []
-    assert belief.extras == [1.0]
-    z[0, 4, 0] = np.nan
-    for k in range(12):
-        factor, here = belief.extras[0], ~np.isnan(z[0, k])
-        forecast = adaptive.predict(belief, u)
-        other = plain.predict(belief._replace(extras=np.empty(0)), u)
-        mean = other.members.mean(axis=1, keepdims=True)
-        np.testing.assert_allclose(forecast.members, mean + factor**0.5 * (other.members - mean), rtol=1e-12)
-        belief, innovation = adaptive.update(forecast, z[0, k])
-        same, _ = plain.update(forecast._replace(extras=np.empty(0)), z[0, k])
-        np.testing.assert_allclose(belief.members, same.members, rtol=1e-12)
-        v, both = innovation.value[here], np.ix_(here, here)
-        expected = naive_factor(factor, v, innovation.cov[both], model.measurement_noise_cov[both])
-        assert belief.extras[0] == pytest.approx(expected, rel=1e-5)
-        seen.append(belief.extras[0])
-    assert max(seen) > 1.2 and len(set(seen)) > 4
-    again, _ = adaptive.update(adaptive.predict(belief, u), np.full(model.m, np.nan))
-    assert again.extras[0] == belief.extras[0]
+def slopes_of(factors, forecast, innovation, model, here, taper=None):
+    """Slopes of the log-likelihood of the channels `here` by differences: of one factor, or of each state's.
 
-
-def naive_factors(t, members, y, v, s, r, taper):
-    """The next factor of each state: the likelihood of all channels, of which A is stretched where x_i shows."""
-    found = []
-    for i, factor in enumerate(t):
-        c = np.array([taper[i, k] * abs(np.corrcoef(members[i], y[k])[0, 1]) for k in range(len(v))])
+    A factor stretches A where x_i shows: by the correlation of x_i and y_k, and the taper.
+    """
+    members, both, found = forecast.members, np.ix_(here, here), []
+    y = np.array([model.functions.observe(tuple(x), model.constants) for x in members.T]).T[here]
+    v, s, r = innovation.value[here], innovation.cov[both], model.measurement_noise_cov[both]
+    for i, factor in enumerate(factors):
+        c = np.ones(len(v))
+        if len(factors) == model.n:
+            c = np.array([abs(np.corrcoef(members[i], row)[0, 1]) for row in y])
+            c = c if taper is None else c * np.array(taper)[i, here]
 
         def level(other, factor=factor, c=c):
             d = (1.0 + c * (other**0.5 - 1.0)) / (1.0 + c * (factor**0.5 - 1.0))
             return multivariate_normal.logpdf(v, cov=d[:, None] * (s - r) * d + r)
 
-        slope = (level(factor + 1e-5) - level(factor - 1e-5)) / 2e-5
-        found.append(max(factor + mode_of(slope), 1.0))
+        found.append((level(factor + 1e-5) - level(factor - 1e-5)) / 2e-5)
     return found
 
 
+OF_ALL = ["enkf", "etkf", "ensrf", "ienkf", "enkf-n", "rhf", "letkf 2"]
+OF_EACH = ["enkf", "etkf", "letkf 2", "denkf 2"]
+
+
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", ["enkf", "etkf", "letkf 2", "denkf 2"])
-def test_each_state_has_a_factor_of_its_own(name):
+@pytest.mark.parametrize(("name", "by_state"), [*((name, 0) for name in OF_ALL), *((name, 1) for name in OF_EACH)])
+def test_each_step_stretches_and_each_update_adapts(name, by_state):
     kind, _, radius = name.partition(" ")
     own = {"radius": float(radius)} if radius else {}
     model = ring() if radius else plane_model()
-    numbers = {"adaptive_inflation": DEVIATION, "inflation_by_state": 1}
-    plain, adaptive = (make_filter(kind, model, ensemble_size=8, **own, **given) for given in ({}, numbers))
-    _, z = simulated(model.replace(process_noise_cov=9.0 * model.process_noise_cov), 10)
+    plain = make_filter(kind, model, ensemble_size=8, **own)
+    adaptive = make_filter(kind, model, **OWN, **own, inflation_by_state=by_state)
+    _, z = simulated(model.replace(process_noise_cov=9.0 * model.process_noise_cov), 12)
     z[0, 4, 0] = np.nan
-    u, belief, n = np.zeros(model.inputs), adaptive.init(KEY), model.n
-    assert belief.extras.tolist() == [1.0] * n
-    taper = adaptive.tapers["taper"] if radius else np.ones((n, model.m))
-    for k in range(10):
+    u, belief, seen = np.zeros(model.inputs), adaptive.init(KEY), []
+    assert belief.extras.tolist() == [1.0] * (model.n if by_state else 1)
+    taper = adaptive.tapers["taper"] if radius else None
+    for k in range(12):
         factors, here = belief.extras.copy(), ~np.isnan(z[0, k])
         forecast = adaptive.predict(belief, u)
-        other = plain.predict(belief._replace(extras=np.empty(0)), u)
-        mean = other.members.mean(axis=1, keepdims=True)
-        stretched = mean + factors[:, None] ** 0.5 * (other.members - mean)
-        np.testing.assert_allclose(forecast.members, stretched, rtol=1e-12)
+        other = plain.predict(belief._replace(extras=np.empty(0)), u).members
+        mean = other.mean(axis=1, keepdims=True)
+        np.testing.assert_allclose(forecast.members, mean + factors[:, None] ** 0.5 * (other - mean), rtol=1e-12)
         belief, innovation = adaptive.update(forecast, z[0, k])
         same, _ = plain.update(forecast._replace(extras=np.empty(0)), z[0, k])
         np.testing.assert_allclose(belief.members, same.members, rtol=1e-12)
-        v, both = innovation.value[here], np.ix_(here, here)
-        y = np.array([model.functions.observe(tuple(x), model.constants) for x in forecast.members.T]).T[here]
-        r = model.measurement_noise_cov[both]
-        expected = naive_factors(
-            factors, forecast.members, y, v, innovation.cov[both], r, np.array(taper)[:, here]
-        )
+        slopes = slopes_of(factors, forecast, innovation, model, here, taper)
+        expected = [max(factor + mode_of(slope), 1.0) for factor, slope in zip(factors, slopes, strict=True)]
         np.testing.assert_allclose(belief.extras, expected, rtol=1e-5)
-    assert len(set(belief.extras)) > 1
+        seen.append(max(belief.extras))
+    assert max(seen) > 1.2 and len(set(seen)) > 4 and len(set(belief.extras)) > by_state
     again, _ = adaptive.update(adaptive.predict(belief, u), np.full(model.m, np.nan))
     np.testing.assert_array_equal(again.extras, belief.extras)
 
@@ -143,9 +113,8 @@ def test_it_makes_up_for_a_q_that_is_too_small_and_leaves_a_right_one():
 def test_of_one_state_it_is_the_factor_of_all_however_many_channels_see_it():
     model = random_affine(1, 3, 1, seed=2)
     inputs, z = simulated(model.replace(process_noise_cov=9.0 * model.process_noise_cov), 20)
-    own = {"ensemble_size": 8, "adaptive_inflation": DEVIATION}
     settings = {"inflation_by_state": 1}, {}, {"adaptive_inflation": 0.0}
-    each, one, none = (run(make_filter("etkf", model, **own | given), None, inputs, z).covs for given in settings)
+    each, one, none = (run(make_filter("etkf", model, **OWN | given), None, inputs, z).covs for given in settings)
     np.testing.assert_allclose(each, one, rtol=1e-10)
     assert abs(none / one - 1.0).max() > 0.1
 
@@ -178,22 +147,95 @@ def test_the_factor_grows_of_the_state_whose_q_is_too_small():
     assert spread < 0.9 * wide  # the first body's forecast stays narrow
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("by_state", (0, 1))
-def test_compiled_code_and_python_are_one(by_state):
-    parameters = {"adaptive_inflation": 0.2, "rotations": 1 - by_state, "inflation_by_state": by_state}
-    filter_ = make_filter("etkf", plane_model(), ensemble_size=9, **parameters)
-    inputs, z = simulated(plane_model(), 20, count=2, missing=0.2)
-    with interpreted():
-        expected = run(filter_, None, inputs, z)
-    for one, other in zip(run(filter_, None, inputs, z), expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+def prior(mode, width):
+    """Inverse gamma density of a factor."""
+    return invgamma(1.0 / width - 1.0, scale=mode / width)
+
+
+def posterior(mode, width, slope):
+    """The log of prior times linear likelihood, and the ends of where it is positive."""
+    ends = sorted([mode - 1.0 / slope, 0.0 if slope < 0.0 else 20.0])
+    return lambda t: prior(mode, width).logpdf(t) + np.log1p(slope * (t - mode)), max(ends[0], 1e-3), ends[1]
+
+
+def naive_update(mode, width, slope):
+    """Mode and width of the inverse gamma density with the posterior's mode and its curvature there."""
+    level, low, high = posterior(mode, width, slope)
+    inside = low + 1e-9, min(high - 1e-9, 4.0 * mode)
+    found = minimize_scalar(lambda t: -level(t), bounds=inside, method="bounded", options={"xatol": 1e-11}).x
+    step = 1e-4 * found
+    curvature = (level(found + step) - 2.0 * level(found) + level(found - step)) / step**2
+    return found, -1.0 / (curvature * found**2)
+
+
+@pytest.mark.parametrize("deviation", [1e-5, 0.02, 0.1, 0.6])
+def test_a_width_is_that_of_the_density_with_this_deviation_over_its_mode(deviation):
+    assert prior(3.0, width_of(deviation)).std() == pytest.approx(3.0 * deviation, rel=1e-6)
+
+
+@pytest.mark.parametrize("slope", [-3.0, -1.0, 0.5, 3.0, 10.0])
+def test_mode_and_deviation_are_those_of_the_posterior_by_quadrature(slope):
+    mode, width = 1.6, width_of(0.1)
+    level, low, high = posterior(mode, width, slope / mode)
+    e = relative_move(slope, width)
+    found, new_width = naive_update(mode, width, slope / mode)
+    assert mode * (1.0 + e) == pytest.approx(found, rel=1e-6)
+
+    def moment(power, about):
+        return quad(lambda t: np.exp(level(t)) * (t - about) ** power, low, min(high, 8.0), points=[mode])[0]
+
+    mean = moment(1, 0.0) / moment(0, 0.0)
+    deviation = (moment(2, mean) / moment(0, 0.0)) ** 0.5
+    assert prior(found, new_width).std() == pytest.approx(deviation, rel=0.05)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("by_state", [0, 1])
+def test_each_update_takes_factors_and_widths_to_the_posterior(by_state):
+    model = plane_model()
+    filter_ = make_filter("etkf", model, **OWN, least_deviation=0.05, inflation_by_state=by_state)
+    _, z = simulated(model.replace(process_noise_cov=9.0 * model.process_noise_cov), 12)
+    z[0, 4] = np.nan
+    belief, u, widest, narrowest = filter_.init(KEY), np.zeros(model.inputs), width_of(0.3), width_of(0.05)
+    count = model.n if by_state else 1
+    np.testing.assert_allclose(belief.extras, [1.0] * count + [widest] * count)
+    for k in range(12):
+        factors, widths = belief.extras.reshape(2, count)
+        forecast = filter_.predict(belief, u)
+        belief, innovation = filter_.update(forecast, z[0, k])
+        if np.isnan(z[0, k]).all():
+            np.testing.assert_array_equal(belief.extras, forecast.extras)
+            continue
+        slopes = slopes_of(factors, forecast, innovation, model, ~np.isnan(z[0, k]))
+        expected = np.array([naive_update(*one) for one in zip(factors, widths, slopes, strict=True)]).T
+        limited = [np.maximum(expected[0], 1.0), np.clip(expected[1], narrowest, widest)]
+        np.testing.assert_allclose(belief.extras.reshape(2, count), limited, rtol=1e-4)
+    assert (belief.extras[count:] != widest).any()
+
+
+@pytest.mark.usefixtures("as_python")
+def test_where_the_model_s_error_is_steady_the_deviation_shrinks_and_the_factor_comes_to_rest():
+    _, z = simulated(drifting(0.1), 300, count=1)
+    seen = {}
+    for least in (0.0, 0.1):
+        own = {"ensemble_size": 20, "adaptive_inflation": 0.3, "least_deviation": least}
+        filter_ = make_filter("etkf", drifting(0.001), **own)
+        belief, factors = filter_.init(KEY), []
+        for one in z[0]:
+            belief, _ = filter_.update(filter_.predict(belief, []), one)
+            factors.append(belief.extras[0])
+        seen[least] = np.mean(factors[100:]), np.std(factors[100:])
+    assert width_of(0.1) <= belief.extras[1] < 0.6 * width_of(0.3)
+    assert seen[0.1][0] == pytest.approx(seen[0.0][0], rel=0.05) and seen[0.1][0] > 1.2
+    assert seen[0.1][1] < 0.75 * seen[0.0][1]
 
 
 def test_wrong_numbers_are_refused():
-    with pytest.raises(ValueError, match="adaptive_inflation must be zero or positive, but got -1"):
-        make_filter("etkf", plane_model(), adaptive_inflation=-1)
-    with pytest.raises(ValueError, match="with inflation_by_state must be positive, but got 0"):
-        make_filter("etkf", plane_model(), inflation_by_state=1)
-    with pytest.raises(ValueError, match="inflation_by_state must be 0 or 1, but got 2"):
-        make_filter("etkf", plane_model(), adaptive_inflation=0.1, inflation_by_state=2)
+    for rule, numbers in (
+        ("adaptive_inflation must be zero or positive, but got -1", {"adaptive_inflation": -1}),
+        ("with inflation_by_state must be positive, but got 0", {"inflation_by_state": 1}),
+        ("inflation_by_state must be 0 or 1, but got 2", {**OWN, "inflation_by_state": 2}),
+        ("least_deviation must be at most adaptive_inflation, 0.3, but got 0.4", {**OWN, "least_deviation": 0.4}),
+        ("least_deviation must be zero or positive, but got -1", {**OWN, "least_deviation": -1}),
+    ):
+        refused(rule, make_filter, "etkf", plane_model(), **numbers)

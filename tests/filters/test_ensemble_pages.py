@@ -14,10 +14,12 @@ from filters.ensembles.ensemble import EnsembleFilter, add_process_noise, compar
 from filters.pages.kernels import with_extras
 from filters.pages.page import Page
 from filters.sensitivity import differentiable
+from tests.filters.checks import refused
 from tests.filters.of_arrays import OfArrays, parameters_of
 from tests.filters.test_pages import turn_if, wide_pendulum
 from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.models import random_affine, simulated, wide_model
+from tests.oracles import each_close
 from tests.slow import slow_but
 from thruster_env.core.checks import covariance_root
 from thruster_env.core.compiled import interpreted
@@ -159,8 +161,7 @@ def test_a_filter_of_ones_own_is_its_page_and_by_name_too():
     assert_page_is_the_filter(filter_)
     inputs, z = simulated(model, 12)
     half, denkf = (make_filter(name, model, ensemble_size=SIZE) for name in (f"{__name__}:PartlyFilter", "denkf"))
-    for one, other in zip(run(half, None, inputs, z), run(denkf, None, inputs, z), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+    each_close(run(half, None, inputs, z), run(denkf, None, inputs, z), rtol=1e-12, atol=1e-12)
     assert abs(run(filter_, None, inputs, z).means - run(denkf, None, inputs, z).means).max() > 1e-3
 
 
@@ -180,5 +181,4 @@ def test_what_is_of_all_members_must_not_be_of_each():
 
 def test_an_ensemble_has_no_derivatives():
     model = wide_model()
-    with pytest.raises(ValueError, match="a filter with derivatives must be one of"):
-        differentiable(model, PartlyFilter(model=model))
+    refused("a filter with derivatives must be one of", differentiable, model, PartlyFilter(model=model))

@@ -5,6 +5,8 @@ import pytest
 
 from filters import FILTERS, make_filter, run, thruster_model
 from filters.engine.session import Session
+from filters.registry import filter_type
+from tests.filters.checks import refused
 from tests.filters.test_wrapper import ADDED, infos_of, played, voltages, wrapped
 from tests.models import KEY, MODELS, OF_EACH_KIND, scalar_model, simulated, small, varying_noise
 from tests.oracles import each_close, equal
@@ -121,21 +123,34 @@ def test_compiled_and_interpreted_agree(name, kind):
         assert_compiled_as_python(filter_, *data, **varying_noise(model, 25))
 
 
-@pytest.mark.parametrize("name", ["enkf", "ienkf"])
-def test_compiled_and_interpreted_agree_where_ensembles_are_stretched(name):
-    model = thruster_model()
-    filter_ = make_filter(name, model, ensemble_size=10, inflation=1.05, relaxation=0.4)
-    inputs, measurements = simulated(model, 12, count=3)
-    measurements[0, 3] = measurements[0, 6, 0] = np.nan
-    assert_compiled_as_python(filter_, filter_keys(range(3)), inputs, measurements)
+ADAPTIVE = {"adaptive_inflation": 0.3, "inflation": 1.02}
+WITH_PARAMETERS = [  # each compiles what the defaults do not
+    ("kf", "thruster", {"schedule": 5}),
+    ("fuzzy", "thruster", {"blending": "moments"}),
+    ("fuzzy", "thruster", {"blending": "output"}),
+    ("enkf", "thruster", {"inflation": 1.05, "relaxation": 0.4}),
+    ("ienkf", "thruster", {"inflation": 1.05, "relaxation": 0.4}),
+]
+SELDOM = [
+    ("ienkf", "wide affine", {"inflation": 1.05, "relaxation": 0.2, "window": 2}),
+    ("rhf", "wide affine", {"inflation": 1.02, "relaxation": 0.3}),
+    ("etkf", "wide affine", {**ADAPTIVE, "rotations": 1}),
+    ("etkf", "wide affine", {**ADAPTIVE, "inflation_by_state": 1}),
+    ("etkf", "wide affine", {**ADAPTIVE, "inflation_by_state": 1, "least_deviation": 0.05}),
+    ("pf", "wide affine", {"proposal": "optimal", "resampling": "gaussian", "resampling_threshold": 0.9}),
+]
 
 
-@pytest.mark.parametrize("blending", ["moments", "output"])
-def test_compiled_and_interpreted_agree_however_rules_are_blended(blending):
-    filter_ = make_filter("fuzzy", thruster_model(), blending=blending)
+@pytest.mark.parametrize(
+    ("name", "kind", "numbers"), [*WITH_PARAMETERS, *(pytest.param(*case, marks=SLOW) for case in SELDOM)]
+)
+def test_compiled_and_interpreted_agree_with_parameters(name, kind, numbers):
+    size = {"ensemble_size": 10} if filter_type(name).has_ensemble else {}
+    filter_ = make_filter(name, MODELS[kind](), **size, **numbers)
     inputs, measurements = simulated(filter_.model, 12, count=3)
-    measurements[0, 3] = np.nan
-    assert_compiled_as_python(filter_, filter_keys(range(3)), inputs, measurements)
+    measurements[0, 3] = measurements[0, 6, 0] = np.nan
+    noise = varying_noise(filter_.model, 12) if "window" in numbers else {}
+    assert_compiled_as_python(filter_, filter_keys(range(3)), inputs, measurements, **noise)
 
 
 @compiled_names
@@ -199,8 +214,7 @@ def test_the_same_key_gives_the_same_numbers_and_only_ensembles_use_it(name):
 )
 def test_a_batch_whose_shapes_do_not_fit_is_refused(keys, inputs, measurements, rule):
     data = np.zeros(keys), np.zeros(inputs), np.zeros(measurements)
-    with pytest.raises(ValueError, match=rule):
-        run(make_filter("ekf", thruster_model()), *data)
+    refused(rule, run, make_filter("ekf", thruster_model()), *data)
 
 
 @pytest.mark.parametrize(("u", "z"), [(np.nan, 0.0), (np.inf, 0.0), (0.0, np.inf)])

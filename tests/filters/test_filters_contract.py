@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import FILTERS, run
+from filters import FILTERS, make_filter, run
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.particles.kernels import WeightedFilter
+from tests.filters.checks import refused
 from tests.models import KEY, MODELS, simulated, small, state_space, varying_noise, wide_model
-from tests.oracles import equal
+from tests.oracles import each_close, each_equal, equal
 from thruster_env.core.streams import filter_keys
 
 GAUSSIAN = [name for name, kind in FILTERS.items() if kind.gaussian_likelihood]
@@ -86,10 +87,8 @@ class TestInPython:
         filter_ = small(name, model)
         belief = filter_.predict(filter_.init(KEY), np.ones(model.inputs))
         updated, innovation = filter_.update(belief, np.full(model.m, np.nan))
-        np.testing.assert_allclose(updated.mean, belief.mean, rtol=1e-15)
-        np.testing.assert_allclose(updated.cov, belief.cov, rtol=1e-15)
-        np.testing.assert_array_equal(updated.members, belief.members)
-        np.testing.assert_array_equal(innovation.value, np.zeros(model.m))
+        each_close((updated.mean, updated.cov), (belief.mean, belief.cov), rtol=1e-15)
+        each_equal((updated.members, innovation.value), (belief.members, np.zeros(model.m)))
         assert np.isfinite(innovation.cov).all()
         assert (np.linalg.eigvalsh(innovation.cov) > 0).all() or not filter_.has_covariance
         assert innovation.log_likelihood == 0.0
@@ -158,8 +157,7 @@ class TestInPython:
         measurements[..., 1 - channel] = np.nan
         of_both = run(small(name, both), np.array([KEY]), inputs, measurements)
         close = {"rtol": 1e-11, "atol": 1e-11}
-        np.testing.assert_allclose(of_both.means, of_one.means, **close)
-        np.testing.assert_allclose(of_both.covs, of_one.covs, **close)
+        each_close((of_both.means, of_both.covs), (of_one.means, of_one.covs), **close)
         np.testing.assert_allclose(of_both.innovations[..., [channel]], of_one.innovations, **close)
         own = of_both.innovation_covs[..., channel, channel]
         np.testing.assert_allclose(own, of_one.innovation_covs[..., 0, 0], **close)
@@ -168,14 +166,12 @@ class TestInPython:
     @pytest.mark.parametrize("u", [[1.0, 2.0, 3.0], [1.0, np.nan], [np.inf, 0.0]])
     def test_a_wrong_input_is_refused(self, name, u):
         filter_ = small(name, wide_model())
-        with pytest.raises(ValueError, match="u must be 2 numbers, each finite, but got"):
-            filter_.predict(filter_.init(KEY), u)
+        refused("u must be 2 numbers, each finite, but got", filter_.predict, filter_.init(KEY), u)
 
     @pytest.mark.parametrize("z", [[1.0], [1.0, np.inf]])
     def test_a_wrong_measurement_is_refused(self, name, z):
         filter_ = small(name, wide_model())
-        with pytest.raises(ValueError, match="z must be 2 numbers, each finite or NaN, but got"):
-            filter_.update(filter_.init(KEY), z)
+        refused("z must be 2 numbers, each finite or NaN, but got", filter_.update, filter_.init(KEY), z)
 
 
 def model_constants(filter_):
@@ -209,6 +205,12 @@ def test_only_real_members_are_put_through_the_model(name):
     for _ in range(20):
         belief, _ = filter_.update(filter_.predict(belief, [0.0]), [4.5])
     assert belief.mean[0] == pytest.approx(4.5, abs=0.3)
+
+
+@pytest.mark.parametrize("size", [1, 0, -3, 2.5, math.nan, "many", None, 1_000_001])
+@pytest.mark.parametrize("name", OF_MEMBERS)
+def test_a_number_of_members_that_cannot_be_is_refused(name, size):
+    refused("ensemble_size must be .* but got", make_filter, name, wide_model(), ensemble_size=size)
 
 
 class TestNoiseThatVaries:
@@ -256,5 +258,4 @@ class TestNoiseThatVaries:
                 if k > 0:
                     belief = filter_.predict(belief, inputs[b, k - 1], process_noise_cov=qs[k - 1])
                 belief, _ = filter_.update(belief, measurements[b, k], measurement_noise_cov=rs[k])
-                np.testing.assert_allclose(found.means[b, k], belief.mean, rtol=1e-9, atol=1e-12)
-                np.testing.assert_allclose(found.covs[b, k], belief.cov, rtol=1e-9, atol=1e-12)
+                each_close((found.means[b, k], found.covs[b, k]), (belief.mean, belief.cov), rtol=1e-9, atol=1e-12)

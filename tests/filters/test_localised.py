@@ -11,8 +11,10 @@ from filters import make_filter, run, smooth
 from filters.c.project import c_filter
 from filters.ensembles.stochastic import gaspari_cohn
 from filters.tensors import torch
+from tests.filters.checks import refused
 from tests.filters.test_c import assert_same, built, estimated
 from tests.models import KEY, simulated, state_space, wide_model
+from tests.oracles import each_close
 from thruster_env.core.compiled import interpreted
 from thruster_env.model.quantities import Positions
 
@@ -48,8 +50,7 @@ def updated(name, members, z, model=None, **numbers):
     filter_ = make_filter(name, model or ring(), ensemble_size=SIZE, **numbers)
     with interpreted():
         belief, innovation = filter_.update(filter_.init(KEY)._replace(members=np.array(members)), z)
-    np.testing.assert_allclose(belief.mean, belief.members.mean(axis=1), atol=1e-12)
-    np.testing.assert_allclose(belief.cov, np.cov(belief.members), atol=1e-12)
+    each_close((belief.mean, belief.cov), (belief.members.mean(axis=1), np.cov(belief.members)), atol=1e-12)
     return belief.members, innovation
 
 
@@ -144,8 +145,7 @@ def test_few_members_follow_a_long_ring_only_with_a_radius(name):
         found = run(local, None, inputs, z)
         plain = run(make_filter(name, model, **numbers), None, inputs, z)
     if name in ("enkf", "letkf"):
-        for one, other in zip(run(local, None, inputs, z), found, strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+        each_close(run(local, None, inputs, z), found, rtol=1e-9, atol=1e-9)
     assert found.divergences.tolist() == [0, 0]
     assert found.log_likelihoods[:, 5:].mean() > plain.log_likelihoods[:, 5:].mean()
 
@@ -166,22 +166,17 @@ def test_tapered_covariances_are_those_of_c_and_of_tensors(name, tmp_path):
 def test_a_radius_needs_positions(name):
     with pytest.raises(ValueError, match="radius must be 0 for a model without positions, but got 2"):
         make_filter(name, wide_model(), radius=2.0)
-    with pytest.raises(ValueError, match="radius must be zero or positive, but got -1"):
-        make_filter(name, ring(), radius=-1.0)
+    refused("radius must be zero or positive, but got -1", make_filter, name, ring(), radius=-1.0)
     filter_ = make_filter(name, ring(), ensemble_size=SIZE, radius=2.0)
     inputs, z = simulated(ring(), 3)
-    with pytest.raises(ValueError, match="must have one gain for all states, but got .* a radius of 2"):
-        smooth(filter_, None, inputs, z)
+    refused("must have one gain for all states, but got .* a radius of 2", smooth, filter_, None, inputs, z)
 
 
 @pytest.mark.parametrize("name", ["ensrf", "letkf"])
 def test_an_update_by_parts_is_refused_where_there_is_only_a_page(name):
     filter_ = make_filter(name, ring(), radius=2.0)
     for use, where in ((torch, "on tensors"), (c_filter, "in C")):
-        with pytest.raises(
-            ValueError, match=f"an ensemble {where} must have a page for its whole update.* radius of 2"
-        ):
-            use(filter_)
+        refused(f"an ensemble {where} must have a page for its whole update.* radius of 2", use, filter_)
 
 
 @pytest.mark.parametrize(
@@ -193,5 +188,4 @@ def test_an_update_by_parts_is_refused_where_there_is_only_a_page(name):
     ],
 )
 def test_positions_that_do_not_fit_are_refused(positions, rule):
-    with pytest.raises(ValueError, match=rule):
-        ring(positions=positions)
+    refused(rule, ring, positions=positions)

@@ -18,7 +18,7 @@ from tests.filters.test_particle import (
     weighted_covariance,
 )
 from tests.models import KEY, line_model, plane_model, scalar_model, simulated, state_space, varying_noise
-from tests.oracles import assert_normal, each_close, normals
+from tests.oracles import assert_normal, each_close, each_equal, normals
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import FILTER_KERNEL, FILTER_PRIOR, FILTER_PROCESS, FILTER_PROPOSAL, filter_keys
 
@@ -255,8 +255,7 @@ def test_single_steps_and_batches_agree_to_the_last_bit(name, numbers):
     session.start(filter_keys([0])[0], z[0, 0])
     for k in range(40):
         session.step(inputs[0, k], z[0, k + 1])
-        np.testing.assert_array_equal(session.mean, found.means[0, k + 1])
-        np.testing.assert_array_equal(session.cov, found.covs[0, k + 1])
+        each_equal((session.mean, session.cov), (found.means[0, k + 1], found.covs[0, k + 1]))
 
 
 def test_what_the_kinds_may_not_be():

@@ -1,24 +1,35 @@
-"""Ensemble filters without perturbed measurements: against the Kalman filter and N x N textbook forms."""
+"""Ensembles without perturbed measurements: Kalman filter, N x N textbooks, costs, quantiles by quadrature."""
 
 import numpy as np
 import pytest
-from scipy.linalg import sqrtm
+from scipy.integrate import quad
+from scipy.linalg import cholesky, solve, sqrtm
+from scipy.optimize import brentq, minimize_scalar
+from scipy.stats import norm
 
 from filters import (
     DeterministicEnsembleKalmanFilter,
     EnsembleTransformFilter,
+    FiniteSizeEnsembleFilter,
     KalmanFilter,
     SerialSquareRootFilter,
     make_filter,
     run,
+    smooth,
 )
 from filters.algebra.operations import geometric_mean_of
-from tests.models import KEY, simulated, wide_model
-from tests.oracles import convergence
+from filters.c.project import c_filter
+from filters.tensors import torch
+from tests.filters.checks import refused
+from tests.models import KEY, plane_model, state_space, wide_model
+from tests.oracles import each_close
+from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.sources import is_array
-from thruster_env.core.streams import filter_keys
 from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.runs import state_errors
+from tuning.experiments import lorenz63
+from tuning.experiments.benchmark import mean_of_roots
 from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds
 
@@ -121,8 +132,7 @@ def test_its_moments_are_the_kalman_filter_s(kind, m, missing):
     forecast, analysis, innovation = updated(kind, model, z)
     with interpreted():
         expected, of_kalman = by_kalman(model, forecast, z)
-    np.testing.assert_allclose(analysis.mean, expected.mean, rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(analysis.cov, expected.cov, rtol=1e-10, atol=1e-10)
+    each_close((analysis.mean, analysis.cov), (expected.mean, expected.cov), rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(innovation.value, of_kalman.value, rtol=1e-10, atol=1e-10)
     assert innovation.log_likelihood == pytest.approx(of_kalman.log_likelihood, rel=1e-10)
 
@@ -166,7 +176,7 @@ def test_the_geometric_mean_is_the_middle_of_two_covariances(size, decades):
     np.testing.assert_array_equal(mean, mean.T)
 
 
-@pytest.mark.parametrize("name", ["etkf", "ensrf", "denkf", "ienkf", "enkf-n"])
+@pytest.mark.parametrize("name", ["enkf", "etkf", "ensrf", "denkf", "ienkf", "enkf-n"])
 @pytest.mark.parametrize("noise", [1e-9, 1e9])
 def test_two_members_and_any_ratio_of_noise_to_spread_are_enough_to_run(name, noise):
     model = linear_model(3)
@@ -176,38 +186,6 @@ def test_two_members_and_any_ratio_of_noise_to_spread_are_enough_to_run(name, no
         estimates = run(make_filter(name, model, ensemble_size=2), *data)
     assert np.isfinite(estimates.means).all() and np.isfinite(estimates.covs).all()
     assert estimates.divergences.tolist() == [0]
-
-
-def half_gain_recursion(model, inputs, measurements):
-    """Means and covariances that the DEnKF has in the limit of many members, (B, K + 1, ...)."""
-    a, b, offset, h, shift = model.matrices()
-    q, r = model.process_noise_cov, model.measurement_noise_cov
-    x, p, found = np.tile(model.prior_mean, (len(inputs), 1)), model.prior_cov, []
-    for k in range(measurements.shape[1]):
-        if k > 0:
-            x, p = x @ a.T + inputs[:, k - 1] @ b.T + offset, a @ p @ a.T + q
-        gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + r)
-        x = x + (measurements[:, k] - x @ h.T - shift) @ gain.T
-        p = p - gain @ h @ p + gain @ h @ p @ h.T @ gain.T / 4
-        found.append((x, np.tile(p, (len(inputs), 1, 1))))
-    means, covs = zip(*found, strict=True)
-    return np.stack(means, axis=1), np.stack(covs, axis=1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["etkf", "denkf"])
-def test_it_converges_to_its_limit_like_one_over_root_n(name):
-    model = linear_model(1)
-    inputs, measurements = simulated(model, 30, count=60, seed=0, level=1.0, compiled=True)
-    data = filter_keys(range(60)), inputs, measurements
-    if name == "denkf":
-        means, covs = half_gain_recursion(model, inputs, measurements)
-    else:
-        means, covs, *_ = run(KalmanFilter(model=model), *data)
-    sizes = [20, 80, 320, 1280]
-    errors, _ = convergence(lambda size: make_filter(name, model, ensemble_size=size), sizes, data, means, covs)
-    for slope in np.polyfit(np.log(sizes), np.log(errors.T), 1)[0]:
-        assert -0.6 < slope < -0.4  # 60 independent runs give each error to about 6 %, the slope to 0.03
 
 
 @pytest.mark.parametrize("name", ["enkf", "etkf", "ensrf"])
@@ -230,3 +208,213 @@ def test_with_the_published_noise_ensembles_beat_the_extended_filter_and_iterati
     # On 200 seeds 0.63, 0.63 and 0.44 of the extended filter's, each to 0.02.
     for name, most in (("enkf", 0.7), ("etkf", 0.7), ("ienkf", 0.5)):
         assert flow_errors[name] < most * flow_errors["ekf"]
+
+
+def naive_factor(y, v, r, certainty):
+    """The inflation squared, by a search over the cost in the singular values of Bocquet, Raanes and Hannart."""
+    size = y.shape[1]
+    root = cholesky(r, lower=True)
+    u, s, _ = np.linalg.svd(solve(root, y - y.mean(axis=1, keepdims=True)))
+    s, du = np.append(s, np.zeros(max(0, len(v) - len(s)))), u.T @ solve(root, v)
+    weights = np.append(s, np.zeros(max(0, size - len(s))))[:size] ** 2 + size - 1
+    share = (size - 1) * np.mean(1 / weights)
+    a, b = (size + 1) / size, size / (size - 1)
+    shift = (a / b) ** (share / 2)
+    a, b = certainty * a / shift, certainty * b * shift
+
+    def cost(log_inflation):
+        t = np.exp(2 * log_inflation)
+        return np.sum(du**2 / (t * s**2 + size - 1)) + a / t + b * np.log(t)
+
+    found = minimize_scalar(cost, bounds=(-3.0, 3.0), method="bounded", options={"xatol": 1e-10})
+    return np.exp(2 * found.x)
+
+
+def naive_finite_size(model, members, z, here, certainty=1.0):
+    """The inflation, and the members after the transform filter's update of the channels `here`."""
+    y, r, here = predicted(model, members)[list(here)], model.measurement_noise_cov[np.ix_(here, here)], list(here)
+    spread = np.sqrt(naive_factor(y, z[here] - y.mean(axis=1), r, certainty))
+    mean = members.mean(axis=1, keepdims=True)
+    inflated = mean + spread * (members - mean)
+    return spread, naive_transform(inflated, predicted(model, inflated)[here], z[here], r)
+
+
+@pytest.mark.parametrize("certainty", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize("far", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize("m", SCALES)
+def test_an_update_is_that_of_the_transform_filter_after_the_inflation_of_least_cost(m, far, certainty):
+    model = linear_model(m)
+    forecast, _, innovation = updated(FiniteSizeEnsembleFilter, model, np.zeros(m))
+    y = predicted(model, forecast.members)
+    z = y.mean(axis=1) + far * np.sqrt(np.diag(innovation.cov)) * np.sign(np.arange(m) - 0.5)
+    _, analysis, innovation = updated(FiniteSizeEnsembleFilter, model, z, certainty=certainty)
+    spread, expected = naive_finite_size(model, forecast.members, z, range(m), certainty)
+    # A search over values finds the place of a minimum to the root of rounding.
+    np.testing.assert_allclose(analysis.members, expected, rtol=1e-6, atol=1e-6 * abs(expected).max())
+    assert spread < 1.01 or far > 0.0
+    _, _, plain = updated(EnsembleTransformFilter, model, z)
+    np.testing.assert_allclose(innovation.value, plain.value, atol=1e-12)
+    np.testing.assert_allclose(innovation.cov, plain.cov, rtol=1e-12)
+    assert innovation.log_likelihood == pytest.approx(plain.log_likelihood, rel=1e-12)
+
+
+@pytest.mark.parametrize(("noise", "certainty", "same"), [(1e9, 1.0, True), (1.0, 1e9, False), (1.0, 1.0, False)])
+def test_where_measurements_say_nothing_it_is_the_transform_filter(noise, certainty, same):
+    model = linear_model(2)
+    model = model.replace(measurement_noise_cov=noise * model.measurement_noise_cov)
+    z = np.array([9.0, -200.0])
+    _, found, _ = updated(FiniteSizeEnsembleFilter, model, z, certainty=certainty)
+    _, expected, _ = updated(EnsembleTransformFilter, model, z)
+    assert np.allclose(found.members, expected.members, rtol=1e-6, atol=1e-6) == same
+
+
+def test_a_missing_channel_takes_no_part():
+    model, z = linear_model(3), np.array([2.0, np.nan, 0.05])
+    forecast, analysis, _ = updated(FiniteSizeEnsembleFilter, model, z)
+    _, expected = naive_finite_size(model, forecast.members, z, [0, 2])
+    np.testing.assert_allclose(analysis.members, expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_it_needs_no_inflation_where_the_transform_filter_loses_the_truth():
+    data = lorenz63.problem.data(range(8))
+
+    def score(name):
+        filter_ = make_filter(name, lorenz63.model(), ensemble_size=6)
+        estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
+        return np.median(mean_of_roots(state_errors(filter_, estimates, data)[:, data.late]))
+
+    assert 1.2 * score("enkf-n") < score("etkf")
+
+
+@pytest.mark.parametrize("certainty", [0.0, -1.0, float("nan"), None])
+def test_a_certainty_that_is_not_positive_is_refused(certainty):
+    refused("certainty must be .* but got", FiniteSizeEnsembleFilter, model=linear_model(1), certainty=certainty)
+
+
+def stay(x, u, c):
+    return x
+
+
+def product(x, c):
+    return (x[0] * x[1],)
+
+
+def curved_model(noise=0.3):
+    """Two states, of which the product is measured."""
+    return state_space(stay, product, q=[0.0, 0.0], r=[noise], mean=[0.0, 0.0], cov=[1.0, 1.0], inputs=0)
+
+
+def prior_members(model, size):
+    with interpreted():
+        return make_filter("rhf", model, ensemble_size=size).init(KEY).members
+
+
+def moved_members(model, members, z, name="rhf", **numbers):
+    filter_ = make_filter(name, model, ensemble_size=len(members[0]), **numbers)
+    with interpreted():
+        belief, _ = filter_.update(filter_.init(KEY)._replace(members=np.array(members)), z)
+    return belief.members
+
+
+def naive_quantiles(y, z, noise):
+    """Quantiles k/(N + 1) of the posterior of one channel, by quadrature and a search for each."""
+    size, edges, spread = len(y), np.sort(y), np.std(y, ddof=1)
+    tail = norm.ppf(1.0 / (size + 1)) * spread
+    likelihood = lambda at: norm.pdf(z, at, noise**0.5)  # noqa: E731
+    density = [
+        lambda at: norm.pdf(at, edges[0] - tail, spread) * likelihood(at),
+        *(
+            lambda at, a=a, b=b: (likelihood(a) + likelihood(b)) / 2.0 / (size + 1) / (b - a)
+            for a, b in zip(edges, edges[1:], strict=False)
+        ),
+        lambda at: norm.pdf(at, edges[-1] + tail, spread) * likelihood(at),
+    ]
+    low, high = edges[0] - 40.0, edges[-1] + 40.0
+    ends = [low, *edges, high]
+
+    def part(i, until):
+        inside = [z] if ends[i] < z < until else None
+        return quad(density[i], ends[i], until, epsabs=0.0, limit=200, points=inside)[0]
+
+    below = np.cumsum([0.0, *(part(i, end) for i, end in enumerate(ends[1:]))])
+
+    def share(until):
+        i = min(np.searchsorted(ends, until, "right") - 1, size)
+        return (below[i] + part(i, until)) / below[-1]
+
+    return [brentq(lambda at, k=k: share(at) - k / (size + 1), low, high, xtol=1e-12) for k in range(1, size + 1)]
+
+
+@pytest.mark.parametrize("z", slow_but([-0.4, 1.5, 6.0], [1.5]))
+def test_an_update_moves_each_rank_to_its_quantile_and_states_by_regression(z):
+    x = np.random.default_rng(2).normal(size=(2, 6)) + [[0.5], [1.0]]
+    found, y = moved_members(curved_model(), x, [z]), x[0] * x[1]
+    moves = np.empty(6)
+    moves[np.argsort(y)] = naive_quantiles(y, z, 0.3) - np.sort(y)
+    slope = np.cov(np.vstack([x, y]))[:2, 2] / np.var(y, ddof=1)
+    np.testing.assert_allclose(found, x + np.outer(slope, moves), rtol=1e-8, atol=1e-8)
+
+
+def test_many_members_of_a_linear_model_have_the_kalman_filter_s_moments():
+    model = plane_model(b=np.zeros((2, 0)))
+    z, members = np.array([2.0, -1.0]), prior_members(model, 1500)
+    with interpreted():
+        kalman = KalmanFilter(model=model)
+        prior = kalman.init()._replace(mean=members.mean(axis=1), cov=np.cov(members))
+        expected, _ = kalman.update(prior, z)
+    found = moved_members(model, members, z)
+    spread = np.sqrt(np.diag(expected.cov))
+    assert (abs(found.mean(axis=1) - expected.mean) < 0.06 * spread).all()
+    np.testing.assert_allclose(
+        np.cov(found) / np.outer(spread, spread), expected.cov / np.outer(spread, spread), atol=0.03
+    )
+
+
+def test_two_clouds_stay_two_where_a_gain_moves_all_alike():
+    """Half of the members near -3, half near 3: a poor measurement of 1 makes one more probable, not both meet."""
+    normal = np.random.default_rng(1).normal(size=(2, 60))
+    x = np.where(np.arange(60) < 30, -3.0, 3.0) + 0.3 * normal
+    x[1] = 1.0
+    found = moved_members(curved_model(noise=9.0), x, [1.0])[0]
+    shares = norm.pdf(1.0, [-3.0, 3.0], 3.0)
+    upper = shares[1] / shares.sum()
+    assert abs((found > 1.5).mean() - upper) < 0.03 and (abs(found) < 2.0).mean() < 0.05
+    by_gain = moved_members(curved_model(noise=9.0), x, [1.0], "etkf")[0]
+    assert (abs(by_gain) < 2.4).mean() > 0.3
+
+
+@pytest.mark.parametrize("z", [1e4, -1e4])
+def test_a_measurement_far_beyond_all_members_leaves_finite_ones_in_their_order(z):
+    x = np.vstack([np.linspace(0.5, 1.5, 7), np.ones(7)])
+    found = moved_members(curved_model(0.01), x, [z])
+    assert np.isfinite(found).all() and (np.diff(found[0]) > 0.0).all() and np.sign(z) * found[0].mean() > 100.0
+
+
+def test_channels_with_correlated_noise_are_made_independent():
+    model, z = wide_model(b=np.zeros((3, 0))), np.array([1.0, -0.5])
+    x = prior_members(model, 9)
+    root = np.linalg.cholesky(model.measurement_noise_cov)
+    _, _, _, c, shift = model.matrices()
+    apart = wide_model(
+        b=np.zeros((3, 0)),
+        c=np.linalg.solve(root, c),
+        measurement_offset=np.linalg.solve(root, shift),
+        measurement_noise_cov=np.eye(2),
+    )
+    np.testing.assert_allclose(
+        moved_members(model, x, z), moved_members(apart, x, np.linalg.solve(root, z)), rtol=1e-10
+    )
+    alone = moved_members(model, x, [np.nan, -0.5])
+    second = wide_model(
+        b=np.zeros((3, 0)), c=c[1:], measurement_offset=shift[1:], measurement_noise_cov=[root[1] @ root[1]]
+    )
+    np.testing.assert_allclose(alone, moved_members(second, x, [-0.5]), rtol=1e-10)
+
+
+def test_what_needs_a_page_for_the_whole_update_or_one_gain_is_refused():
+    filter_ = make_filter("rhf", plane_model(), ensemble_size=9)
+    for use, where in ((torch, "on tensors"), (c_filter, "in C")):
+        refused(f"{where} must have a page for its whole update.* but got 'rhf'", use, filter_)
+    nothing = np.zeros((1, 1, 1)), np.zeros((1, 2, 2))
+    refused("must have one gain for all states, but got 'rhf'", smooth, filter_, None, *nothing)
