@@ -56,7 +56,7 @@ SOURCES = {
     "open_bladed": "the same",
     "tunnel_physical": "`tunnel`, corrected",
     "open_bladed_corrected": "`open_bladed`, corrected",
-    "t200": "Blue Robotics' bollard table of 2019; `tuning/cli/bollard.py`",
+    "t200": "Blue Robotics' bollard table of 2019; `tuning/plants/bollard.py`",
 }
 INFERRED = {
     "tunnel": "nothing: K_h = 17.79, as printed",

@@ -221,7 +221,7 @@ T200 = ThrusterParameters(
     angles="rotor-plane",
     thrust_asymmetry=0.1603,
 )
-"""A Blue Robotics T200, identified from its static bollard table by `tuning/cli/bollard.py`.
+"""A Blue Robotics T200, identified from its static bollard table by `tuning/plants/bollard.py`.
 
 Source: Blue Robotics, "T200 Public Performance Data 10-20V September 2019"; 14 and 18 V held out.
 
@@ -246,7 +246,7 @@ from measured speed 3.3 / 2.7 % ahead and 4.3 / 3.9 % astern. Nine rows in ten a
 throttle the model has too little thrust: 8 % ahead and 3 % astern, at the measured speed 8 and 10 %.
 
 V_s is what reaches the motor: 8.3 V at full throttle from 10 V, 13.3 V from 20 V
-(`tuning.cli.bollard` has the map from pulse width). `max_voltage` should thus be 13 V; the
+(`tuning.plants.bollard` has the map from pulse width). `max_voltage` should thus be 13 V; the
 thrust of 140 N at 24 V is extrapolated.
 """
 

@@ -7,15 +7,15 @@ import pytest
 from thruster_env.thruster.analysis import jacobians, required_substeps, steady_state
 from thruster_env.thruster.dynamics import thrust_and_torque
 from thruster_env.thruster.parameters import PRESETS, T200, checked, derive_constants
-from tuning.cli.bollard import (
+from tuning.plants.bollard import (
     FITTED,
     T200_PULSE_WIDTHS,
     Identified,
     PulseWidthMap,
     bollard_forces,
-    identify,
+    identify_bollard,
     predict,
-    read_table,
+    read_bollard,
     relative_errors,
 )
 
@@ -73,8 +73,8 @@ def table_path(tmp_path_factory):
 
 
 def test_a_table_gives_its_thruster_back(table_path):
-    table = read_table(table_path)
-    found = identify(table, (14.0, 18.0), T200)
+    table = read_bollard(table_path)
+    found = identify_bollard(table, (14.0, 18.0), T200)
     expected = identified_numbers(OTHER)
     assert identified_numbers(found) == pytest.approx(expected, rel=1e-5)
     for groups in relative_errors(found, table, (14.0, 18.0)).values():
@@ -83,9 +83,9 @@ def test_a_table_gives_its_thruster_back(table_path):
 
 
 def test_only_fitted_voltages_count(table_path):
-    table = read_table(table_path)
+    table = read_bollard(table_path)
     spoilt = table._replace(thrust=np.where(table.supply == 14, 2 * table.thrust, table.thrust))
-    assert identify(spoilt, (14.0,), T200) == identify(table, (14.0,), T200)
+    assert identify_bollard(spoilt, (14.0,), T200) == identify_bollard(table, (14.0,), T200)
     errors = relative_errors(OTHER, spoilt, (14.0,))["thrust from measured speed"]
     assert errors["held out"]["ahead"]["median"] == pytest.approx(0.5)
     assert errors["fitted"]["ahead"]["median"] == pytest.approx(0.0, abs=1e-9)
@@ -93,14 +93,14 @@ def test_only_fitted_voltages_count(table_path):
 
 @pytest.mark.parametrize("ahead", [True, False])
 def test_current_counts_in_both_directions(table_path, ahead):
-    table = read_table(table_path)
+    table = read_bollard(table_path)
     more = table._replace(current=np.where(table.ahead == ahead, 1.2 * table.current, table.current))
-    drag = [identify(rows, (14.0,), T200).thruster.drag_coefficient for rows in (table, more)]
+    drag = [identify_bollard(rows, (14.0,), T200).thruster.drag_coefficient for rows in (table, more)]
     assert drag[1] > 1.01 * drag[0]
 
 
 def test_slow_rows_are_left_out(table_path):
-    table = read_table(table_path)
+    table = read_bollard(table_path)
     assert len(table.speed) < 6 * 41
     for supply in range(10, 21, 2):
         for ahead in (True, False):
@@ -110,7 +110,7 @@ def test_slow_rows_are_left_out(table_path):
 
 
 def test_time_constants_do_not_show_in_a_static_table(table_path):
-    table = read_table(table_path)
+    table = read_bollard(table_path)
     slower = T200._replace(
         load_gain=T200.load_gain / 3, motor_damping=T200.motor_damping / 3, voltage_gain=T200.voltage_gain / 3
     )._replace(added_mass=2 * T200.added_mass)
@@ -174,8 +174,8 @@ def test_pulse_widths_become_voltages():
 
 
 def test_the_table_of_the_preset_gives_the_preset(tmp_path):
-    table = read_table(write_table(tmp_path / "own.csv", recorded_rows(PRESET)))
-    found = identify(table, (14.0, 18.0), T200)
+    table = read_bollard(write_table(tmp_path / "own.csv", recorded_rows(PRESET)))
+    found = identify_bollard(table, (14.0, 18.0), T200)
     assert identified_numbers(found) == pytest.approx(identified_numbers(PRESET), rel=1e-3)
     medians = {
         quantity: max(e["median"] for group in groups.values() for e in group.values())
@@ -187,12 +187,12 @@ def test_the_table_of_the_preset_gives_the_preset(tmp_path):
 @pytest.mark.parametrize(
     ("content", "rule"),
     [
-        (None, "cannot be read"),
-        ("", "lacks pwm_us, rpm, current_A, voltage_V, force_kgf"),
+        (None, "a file that can be read, but"),
+        ("", "must have a header and rows"),
         ("pwm_us,rpm,current_A,voltage_V\n1100,1,1,10\n", "but lacks force_kgf"),
-        ("pwm_us,rpm,current_A,voltage_V,force_kgf\n", "must have rows"),
-        ("pwm_us,rpm,current_A,voltage_V,force_kgf\n1100,900,1,10,-1\n1900,fast,1,10,1\n", "line 3: .*'fast'"),
-        ("pwm_us,rpm,current_A,voltage_V,force_kgf\n1100,900,1,10\n", "line 2: .*None"),
+        ("pwm_us,rpm,current_A,voltage_V,force_kgf\n", "must have a header and rows"),
+        ("pwm_us,rpm,current_A,voltage_V,force_kgf\n1100,900,1,10,-1\n1900,fast,1,10,1\n", "'fast' in line 3"),
+        ("pwm_us,rpm,current_A,voltage_V,force_kgf\n1100,900,1,10\n", "line 2"),
         ("pwm_us,rpm,current_A,voltage_V,force_kgf\n1100,900,1,10,-1\n", "must turn ahead at 10 V"),
         ("pwm_us,rpm,current_A,voltage_V,force_kgf\n1100,900,1,10,1\n1900,900,1,10,1\n", "in the direction"),
         ("pwm_us,rpm,current_A,voltage_V,force_kgf\n1100,900,1,10,-1\n1900,900,0,10,1\n", "above zero"),
@@ -205,10 +205,10 @@ def test_a_bad_file_is_refused(tmp_path, content, rule):
     if content is not None:
         path.write_bytes(content.encode("latin-1"))
     with pytest.raises(ValueError, match=rule):
-        identify(read_table(path), (14.0, 18.0), T200)
+        identify_bollard(read_bollard(path), (14.0, 18.0), T200)
 
 
 @pytest.mark.parametrize("held_out", [(13.0,), (10.0, 12.0, 14.0, 16.0, 18.0), ()])
 def test_held_out_voltages_are_checked(table_path, held_out):
     with pytest.raises(ValueError, match="held-out voltages must be some of 10, 12, 14, 16, 18, 20 V"):
-        identify(read_table(table_path), held_out, T200)
+        identify_bollard(read_bollard(table_path), held_out, T200)

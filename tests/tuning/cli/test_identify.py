@@ -85,7 +85,7 @@ MISTAKES = [
     (("identify",), "Missing argument 'LOG...'"),
     *((("identify", "run0.csv", *OF_LOGS, *arguments), message) for arguments, message in WITH_LOG),
     (("identify", "run0.csv", "--preset", "none.toml"), "a preset file must be readable, but none.toml is not"),
-    (("bollard", "none.csv"), "none.csv cannot be read"),
+    (("bollard", "none.csv"), "none.csv is not: No such file"),
     (("bollard", "t.csv", "--free", "x"), "No such option: --free"),
 ]
 
