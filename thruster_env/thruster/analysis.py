@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from thruster_env.core.checks import one_of, short_repr
+from thruster_env.core.files import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.core.matrices import observability, zero_order_hold
 from thruster_env.thruster.dynamics import (
     rates,
@@ -296,3 +298,76 @@ def analyse(model: LinearModel, dt: float, scale) -> Analysis:
         numerators={name: transfer_function(model, name)[0] for name in INPUTS},
         dc_gain=dc_gain(model),
     )
+
+
+def linear_model(p: ThrusterParameters, x, voltage: float = 0.0, ambient_velocity: float = 0.0) -> LinearModel:
+    """The slopes of rates and thrust at state x = (omega_m, U_a), voltage [V] and ambient flow [m/s].
+
+        B = [[K2, 0], [0, 2 (K4/K3) |U_a - U_0|]]
+
+    Beside `jacobians` it has the ambient flow as second input: the form in which the papers print theirs.
+    """
+    a, b, c = jacobians(p, x, voltage, ambient_velocity)
+    by_ambient = 2.0 * p.momentum_drag / p.added_mass * abs(float(x[1]) - ambient_velocity)
+    return LinearModel(a, np.column_stack([b, [0.0, by_ambient]]), c)
+
+
+def response_figure(path: str | Path, model: LinearModel, dt: float, title: str) -> Path:
+    """Bode plot of the thrust over the voltage, and the response to a step of 1 V.
+
+    Marked are the frequencies of the eigenvalues and the Nyquist frequency pi/dt, and the values that the
+    step settles to.
+
+    Args:
+        path: PNG file to write.
+        model: the thruster near an operating point.
+        dt: sample time [s].
+        title: said above the picture.
+
+    Raises:
+        ValueError: if the voltage does not move the thrust to first order, as at rest, or nothing can be written.
+    """
+    frequencies, times = response_grids(model)
+    gain = frequency_response(model, frequencies)
+    if not gain.all():
+        rule = "the thrust must move with the voltage for its Bode plot to be drawn (at rest it does not)"
+        raise ValueError(f"{rule}, but got C = {model.c[0].tolist()}")
+    figure = new_figure((9.6, 6.0))
+    left, right = figure.subfigures(1, 2)
+    _draw_bode(left.subplots(2, 1, sharex=True), frequencies, gain, np.linalg.eigvals(model.a), dt)
+    _draw_step(right.subplots(3, 1, sharex=True), times, step_response(model, times), model)
+    for part in (left, right):
+        part.align_ylabels()
+    figure.suptitle(title, fontsize=11)
+    return save_figure(figure, path)
+
+
+def _draw_bode(axes, frequencies, gain, eigenvalues, dt) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    tidy(axes)
+    magnitude, phase = axes
+    magnitude.loglog(frequencies, np.abs(gain), color=BLUE)
+    phase.semilogx(frequencies, np.rad2deg(np.unwrap(np.angle(gain))), color=BLUE)
+    for axis in axes:
+        for index, value in enumerate(np.abs(eigenvalues)):
+            axis.axvline(value, color=DARK, linestyle=":", linewidth=1, label="" if index else "eigenvalues")
+        axis.axvline(np.pi / dt, color=RUST, linestyle="--", linewidth=1, label=f"Nyquist, dt = {dt:g} s")
+    magnitude.set_title("thrust over voltage", fontsize=10)
+    magnitude.set_ylabel("magnitude [N/V]")
+    magnitude.legend(loc="lower left", fontsize=9, framealpha=1, edgecolor="none")
+    phase.yaxis.set_major_locator(MaxNLocator(6, steps=[1.5, 3, 4.5, 9, 10]))
+    phase.set_ylabel("phase [deg]")
+    phase.set_xlabel("frequency [rad/s]")
+
+
+def _draw_step(axes, times, response, model) -> None:
+    tidy(axes)
+    labels = (*STATES, ("thrust $T$", "N"))
+    for axis, (label, unit), values, settled in zip(axes, labels, response.T, dc_gain(model)[:, 0], strict=True):
+        axis.axhline(settled, color=DARK, linestyle=":", linewidth=1, label="settled")
+        axis.plot(times, values, color=BLUE)
+        axis.set_ylabel(f"{label}\n[{unit}]")
+    axes[0].set_title("deviation after a step of 1 V", fontsize=10)
+    axes[0].legend(frameon=False, fontsize=9)
+    axes[-1].set_xlabel("time [s]")

@@ -14,6 +14,8 @@ from thruster_env.thruster.analysis import (
     dc_gain,
     frequency_response,
     jacobians,
+    linear_model,
+    response_figure,
     response_grids,
     state_range,
     steady_state,
@@ -23,7 +25,6 @@ from thruster_env.thruster.analysis import (
 from thruster_env.thruster.dynamics import rates, thrust_and_torque_tangent
 from thruster_env.thruster.linear import PUBLISHED, SAMPLE_TIME
 from thruster_env.thruster.parameters import ANGLES, PRESETS, TUNNEL, derive_constants
-from tuning.cli.inspect import linear_model, response_figure
 
 every_preset = pytest.mark.parametrize("p", PRESETS.values(), ids=PRESETS.keys())
 every_print = pytest.mark.parametrize("name", PUBLISHED)
