@@ -30,7 +30,7 @@ from tuning.api.markers import (
     Augment,
     ExecutorOption,
     Option,
-    PresetOption,
+    Preset,
     ProblemOption,
     Progress,
     Seed,
@@ -169,11 +169,6 @@ class FilterComparison(Result):
         """Scores of all filters."""
         return {"Scores with 95 % intervals": self.plot_scores()}
 
-    @property
-    def exit_code(self) -> int:
-        """Of the command: 130 if it was interrupted."""
-        return 130 if self.interrupted else 0
-
 
 def left_out_lines(left_out: Mapping[str, str]) -> list[str]:
     """A line for each filter that could not run, and why."""
@@ -241,7 +236,7 @@ def compare(
     ensemble_size: Annotated[
         int | Mapping[str, int] | Sequence[str] | None, Option(FILTER, metavar="[FILTER=]N", type=list[str])
     ] = None,
-    preset: Annotated[str | Path | None, PresetOption] = None,
+    preset: Preset = None,
     seed: Seed = 0,
     executor: ExecutorOption = None,
     progress: Progress = None,

@@ -47,6 +47,7 @@ from tuning.api.markers import (
     Option,
     Seed,
     TunedArgument,
+    WrittenFile,
 )
 from tuning.api.read_logs import read_logs, recorded_runs
 from tuning.api.result import Result, drawn, frame, number, plain_data
@@ -294,7 +295,7 @@ def estimate(
     monitor: Annotated[Monitor | Mapping | float | str | None, Option(metavar="STEPS", type=str)] = None,
     isolate: bool = False,
     out: Annotated[str | Path | None, Option(OUTPUT, type=Path, file=WRITTEN)] = None,
-    plot: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
+    plot: WrittenFile = None,
     seed: Seed = 0,
     **numbers: Any,
 ) -> LogEstimates:

@@ -19,19 +19,17 @@ from thruster_env.logs.write import check_picture
 from tuning.api.held_out import CovarianceCheck, HeldOut
 from tuning.api.markers import (
     FILTER,
-    INPUT,
-    OUTPUT,
     RUNS,
-    WRITTEN,
     ExecutorOption,
     FilterOption,
-    ModelOption,
+    Model,
+    OneProblem,
     Option,
-    PresetOption,
-    ProblemOption,
+    Preset,
     Progress,
     Seed,
     TunedArgument,
+    WrittenFile,
 )
 from tuning.api.problems import given_for, is_filter, problem_of
 from tuning.api.progress import console_for, working
@@ -49,16 +47,14 @@ NOMINAL = "nominal"  # the problem of a filter that is not tuned, where none is 
 
 def evaluate(
     tuned: Annotated[str | Path | Study | None, TunedArgument] = None,
-    problem: Annotated[
-        Any, ProblemOption(INPUT, ("--problem", "--scenario"), type=str, choices="problems")
-    ] = None,
+    problem: OneProblem = None,
     *,
     filter: Annotated[Any, FilterOption] = None,
     given: Annotated[bool, Option(FILTER)] = False,
     seeds: Annotated[int, Option(RUNS)] = HELD_OUT_SEEDS,
-    consistency: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
-    preset: Annotated[str | Path | None, PresetOption] = None,
-    model: Annotated[Any, ModelOption] = None,
+    consistency: WrittenFile = None,
+    preset: Preset = None,
+    model: Model = None,
     seed: Seed = 0,
     executor: ExecutorOption = None,
     progress: Progress = None,

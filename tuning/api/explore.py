@@ -15,20 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.files import is_private
 from tuning.api.evaluate import subject_of
-from tuning.api.markers import (
-    INPUT,
-    RUNS,
-    FilterOption,
-    ModelOption,
-    Option,
-    PresetOption,
-    ProblemOption,
-    Seed,
-    TunedArgument,
-)
+from tuning.api.markers import RUNS, FilterOption, Model, OneProblem, Option, Preset, Seed, TunedArgument
 from tuning.api.problems import problem_of
 from tuning.api.progress import console_for, working
-from tuning.api.study import INTERRUPTED, Study, is_own
+from tuning.api.result import INTERRUPTED
+from tuning.api.study import Study, is_own
 from tuning.exploring.bench import MOST_SEEDS, Bench
 from tuning.search.storage import is_alive
 
@@ -44,14 +35,12 @@ FORWARD += '<meta http-equiv="refresh" content="0; url={url}"><title>thruster ex
 
 
 def explore(
-    problem: Annotated[
-        Any, ProblemOption(INPUT, ("--problem", "--scenario"), type=str, choices="problems")
-    ] = None,
+    problem: OneProblem = None,
     filter: Annotated[Any, FilterOption] = None,
     *,
     tuned: Annotated[str | Path | Study | None, TunedArgument] = None,
-    preset: Annotated[str | Path | None, PresetOption] = None,
-    model: Annotated[Any, ModelOption] = None,
+    preset: Preset = None,
+    model: Model = None,
     seeds: Annotated[int, Option(RUNS, least=1, most=MOST_SEEDS)] = 8,
     port: Annotated[int, Option(RUNS, least=0, most=65535)] = 0,
     browser: Annotated[bool, Option(RUNS, ("--browser/--no-browser",))] = True,

@@ -13,7 +13,7 @@ from filters.monitoring import Monitor, monitor_of
 from thruster_env.core.checks import one_of
 from thruster_env.core.files import check_target
 from tuning.api.estimate import monitor_for
-from tuning.api.markers import OUTPUT, CodeProblem, ModelOption, Option, PresetOption, TunedFile
+from tuning.api.markers import OUTPUT, CodeProblem, Model, Option, Preset, TunedFile
 from tuning.api.problems import given_for
 from tuning.api.result import Result
 from tuning.evaluation.tuned import read_tuned
@@ -57,8 +57,8 @@ def export(
     monitor: Annotated[Monitor | Mapping | float | str | None, Option(metavar="STEPS", type=str)] = None,
     board: Annotated[bool, Option(OUTPUT)] = False,
     problem: CodeProblem = None,
-    model: Annotated[Any, ModelOption] = None,
-    preset: Annotated[str | Path | None, PresetOption] = None,
+    model: Model = None,
+    preset: Preset = None,
 ) -> Exported:
     """Write a tuned Kalman or ensemble filter as C99, with its model, Q and R, and a program that filters a log.
 

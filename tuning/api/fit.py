@@ -9,7 +9,7 @@ from filters.named import AUTO
 from thruster_env.core.checks import short_repr
 from thruster_env.core.files import check_target, save_figure, write_whole
 from thruster_env.logs.write import check_picture
-from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, Argument, Option, Progress, PythonOnly
+from tuning.api.markers import INPUT, READ, Argument, Option, Progress, PythonOnly, WrittenFile
 from tuning.api.progress import console_for
 from tuning.series.answer import SeriesFit, choose_among_all
 from tuning.series.column import Column, column_of
@@ -25,8 +25,8 @@ def fit(
     times: Annotated[Any, PythonOnly()] = None,
     column: Annotated[Any, Option(INPUT, metavar="HEADER", type=str)] = None,
     model: Annotated[str, Option(INPUT)] = AUTO,
-    plot: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
-    code: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
+    plot: WrittenFile = None,
+    code: WrittenFile = None,
     progress: Progress = None,
 ) -> SeriesFit:
     """Find the model, Q and R of a column of numbers, or of a track with several axes, by maximum likelihood.

@@ -31,6 +31,7 @@ from tuning.api.markers import (
     Option,
     Progress,
     Seed,
+    WrittenFile,
 )
 from tuning.api.progress import console_for
 from tuning.api.read_logs import recorded_runs
@@ -238,11 +239,6 @@ class Identified(Result):
         }
         return plain_data(data)
 
-    @property
-    def exit_code(self) -> int:
-        """Of the command: 130 if it was interrupted."""
-        return 130 if self.interrupted else 0
-
     def __repr__(self) -> str:
         values = ", ".join(f"{name} {value:.4g}" for name, value in list(self.values.items())[:6])
         more = ", ..." if len(self.values) > 6 else ""
@@ -304,7 +300,7 @@ def identify(
     gate: Annotated[float, Option(SEARCH)] = math.inf,
     starts: Annotated[int, Option(SEARCH)] = STARTS,
     out: Annotated[str | Path | None, Option(OUTPUT, type=Path, file=WRITTEN, unset=DEFAULT_OUT)] = None,
-    plot: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
+    plot: WrittenFile = None,
     seed: Seed = 0,
     executor: ExecutorOption = None,
     progress: Progress = None,

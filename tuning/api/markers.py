@@ -92,5 +92,9 @@ FilterOption = Option(FILTER, ("--filter",), type=str, choices="filters")
 TunedArgument = Argument(FILTER, ("--tuned",), "FILE", str, file=READ)
 PresetOption = Option(INPUT, type=str, choices="presets", file=READ)
 ModelOption = Option(INPUT, metavar="MODEL", type=str)
+Preset = Annotated[str | Path | None, PresetOption]
+Model = Annotated[Any, ModelOption]
+OneProblem = Annotated[Any, ProblemOption(INPUT, ("--problem", "--scenario"), type=str, choices="problems")]
 CodeProblem = Annotated[Any, Option(INPUT, ("--problem",), "MODULE:OBJECT", list[str])]
 TunedFile = Annotated[str | Path, Argument(FILTER, metavar="FILE", type=Path, file=READ)]
+WrittenFile = Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)]

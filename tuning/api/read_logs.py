@@ -14,7 +14,7 @@ from thruster_env.logs.findings import OUTLIERS
 from thruster_env.logs.log import Log
 from thruster_env.logs.read import INPUTS_ACT
 from thruster_env.logs.recorders.bags import STAMPS
-from tuning.api.markers import LOGS, READ, Augment, ModelOption, Option, PresetOption
+from tuning.api.markers import LOGS, READ, Augment, Model, Option, Preset
 from tuning.logs.read import check_on_grid, model_of_logs, name_of, read_named, with_numbers
 from tuning.series.column import as_columns, is_numbers
 
@@ -92,8 +92,8 @@ class RecordedRuns:
 def read_logs(
     files: Annotated[Any, Option(LOGS, ("--log",), type=list[Path], file=READ)],
     *,
-    preset: Annotated[str | Path | None, PresetOption] = None,
-    model: Annotated[Any, ModelOption] = None,
+    preset: Preset = None,
+    model: Model = None,
     sensors: Annotated[Sequence[str] | None, Option(LOGS, ("--sensor",), choices="sensors")] = None,
     columns: Annotated[
         Mapping[str, str] | Sequence[str] | None, Option(LOGS, ("--column",), "NAME=HEADER[UNIT]", list[str])

@@ -17,26 +17,12 @@ from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import at_least, short_repr
 from thruster_env.core.files import check_target, write_whole
 from tuning.api.held_out import HeldOut
-from tuning.api.markers import (
-    INPUT,
-    OUTPUT,
-    Argument,
-    CodeProblem,
-    ModelOption,
-    Option,
-    PresetOption,
-    Progress,
-)
+from tuning.api.markers import INPUT, OUTPUT, Argument, CodeProblem, Model, Option, Preset, Progress
 from tuning.api.problems import given_for, problems_of
 from tuning.api.progress import console_for, working
 from tuning.api.result import Result
 from tuning.api.study import STUDIES, Study
-from tuning.evaluation.held_out import (
-    evaluate_held_out,
-    stored_comparison,
-    stored_sizes,
-    versions,
-)
+from tuning.evaluation.held_out import evaluate_held_out, stored_comparison, stored_sizes, versions
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.evaluation.tuned import problem_in, read_tuned, tuned_content
 from tuning.likelihood.identifiability import Identifiability, identify, sentences, too_many
@@ -85,8 +71,8 @@ def report(
     *,
     storage: Annotated[str | Path, Option(INPUT)] = STUDIES,
     problem: CodeProblem = None,
-    model: Annotated[Any, ModelOption] = None,
-    preset: Annotated[str | Path | None, PresetOption] = None,
+    model: Model = None,
+    preset: Preset = None,
     progress: Progress = None,
 ) -> Report:
     """Write a page on a tuned filter, for any browser without a network, and its tables as Markdown.

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from filters.consistency.nees import Interval
 
+INTERRUPTED = 130  # exit code
 PAGE = ".html"  # the end of a page's name
 
 
@@ -32,9 +33,14 @@ class Result:
     """
 
     @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended it."""
+        return False
+
+    @property
     def exit_code(self) -> int:
-        """Of the command."""
-        return 0
+        """Of the command: 130 if it was interrupted."""
+        return INTERRUPTED if self.interrupted else 0
 
     @property
     def title(self) -> str:

@@ -29,9 +29,7 @@ from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.tuning_report import as_json, report
 from tuning.search.plan import Plan, range_warning, reported, reported_name
 from tuning.search.space import Choice, untuned_choice
-from tuning.search.study import (
-    StudyResult,
-)
+from tuning.search.study import StudyResult
 from tuning.search.trials import is_consistent
 from tuning.search.validation import as_data
 
@@ -42,7 +40,7 @@ if TYPE_CHECKING:
     from tuning.api.report import Report
 
 STUDIES = "out/studies.journal"  # of commands
-INTERRUPTED, NONE_CONSISTENT = 130, 3  # exit codes
+NONE_CONSISTENT = 3  # exit code
 
 
 class MethodAnswer(NamedTuple):
@@ -252,7 +250,7 @@ class Study(Result):
     @property
     def exit_code(self) -> int:
         """Of the command: 130 if it was interrupted, 3 if no trial is consistent."""
-        return INTERRUPTED if self.interrupted else NONE_CONSISTENT if self.consistent is False else 0
+        return super().exit_code or NONE_CONSISTENT * (self.consistent is False)
 
     @property
     def comparison(self) -> Comparison:

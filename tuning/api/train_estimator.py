@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import TextColumn
 
 from filters.consistency.nees import Interval
 from filters.estimators.foreign import TRAINED, ForeignFilter
@@ -22,20 +22,9 @@ from thruster_env.core.checks import at_least, listening, one_of, positive
 from thruster_env.core.files import check_target, panels
 from thruster_env.core.text_tables import Table, verbatim
 from tuning.api import markers
-from tuning.api.markers import (
-    FILTER,
-    INPUT,
-    LEARNING,
-    OUTPUT,
-    READ,
-    WRITTEN,
-    Argument,
-    Option,
-    PresetOption,
-    Seed,
-)
+from tuning.api.markers import FILTER, INPUT, LEARNING, READ, Argument, Option, Preset, Seed, WrittenFile
 from tuning.api.problems import problem_of
-from tuning.api.progress import console_for
+from tuning.api.progress import bar, console_for
 from tuning.api.result import Result, about, drawn, frame, number, plain_data
 from tuning.api.tune import file_name
 from tuning.evaluation.baselines import ORACLE, oracle
@@ -206,11 +195,6 @@ class EstimatorTraining(Result):
         axis.legend()
         return drawn(figure)
 
-    @property
-    def exit_code(self) -> int:
-        """Of the command: 130 if it was interrupted."""
-        return 130 if self.interrupted else 0
-
     def __repr__(self) -> str:
         return f"EstimatorTraining({self.kind} on {self.problem.name}, {self.file})"
 
@@ -219,7 +203,7 @@ def train_estimator(
     kind: Annotated[str, Argument()] = "kalmannet",
     problem: Annotated[Any, Option(INPUT, type=str, choices="problems")] = "nominal",
     *,
-    preset: Annotated[str | Path | None, PresetOption] = None,
+    preset: Preset = None,
     runs: Annotated[int, Option(LEARNING)] = 200,
     steps: Annotated[int, Option(LEARNING)] = 1000,
     batch: Annotated[int, Option(LEARNING)] = 32,
@@ -231,7 +215,7 @@ def train_estimator(
     against: Annotated[Sequence[str | Path], Option(FILTER, metavar="FILE", type=list[Path], file=READ)] = (),
     seeds: Annotated[int, Option(markers.RUNS)] = HELD_OUT_SEEDS,
     seed: Seed = 0,
-    out: Annotated[str | Path | None, Option(OUTPUT, metavar="FILE", type=Path, file=WRITTEN)] = None,
+    out: WrittenFile = None,
     progress: markers.Progress = None,
 ) -> EstimatorTraining:
     """Train an estimator with a network on a problem's runs, and compare it with filters on held-out ones.
@@ -349,24 +333,17 @@ def _bar(
     title: str, total: int, console: Console
 ) -> Iterator[tuple[Callable[[int], None], Callable[[float], None]]]:
     """Callbacks after an update, with its number, and after a check, with its score."""
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("validation {task.fields[score]}", markup=False),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task(title, total=total, score="-")
+    column = TextColumn("validation {task.fields[score]}", markup=False)
+    with bar(title, console, column, total=total, score="-") as update:
         scores: list[float] = []
 
         def on_check(score: float) -> None:
             scores.append(score)
-            progress.update(task, score=f"{min(scores):.4g}")
+            update(score=f"{min(scores):.4g}")
 
         def show(far: str) -> None:
             if far == STOPPING:
-                progress.update(task, description=far, refresh=True)
+                update(description=far, refresh=True)
 
         with listening(show):
-            yield lambda step: progress.update(task, completed=step), on_check
+            yield lambda step: update(completed=step), on_check

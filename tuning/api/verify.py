@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from rich.console import RenderableType
 
@@ -13,7 +13,7 @@ from filters.tuned_file import read_tuned_file
 from thruster_env.core.checks import short_repr
 from thruster_env.core.parallel import task_map
 from thruster_env.core.text_tables import Table
-from tuning.api.markers import CodeProblem, ExecutorOption, ModelOption, PresetOption, Progress, TunedFile
+from tuning.api.markers import CodeProblem, ExecutorOption, Model, Preset, Progress, TunedFile
 from tuning.api.problems import given_for
 from tuning.api.progress import console_for, working
 from tuning.api.result import Result, plain_data
@@ -108,8 +108,8 @@ def verify(
     tuned: TunedFile,
     *,
     problem: CodeProblem = None,
-    model: Annotated[Any, ModelOption] = None,
-    preset: Annotated[str | Path | None, PresetOption] = None,
+    model: Model = None,
+    preset: Preset = None,
     executor: ExecutorOption = None,
     progress: Progress = None,
 ) -> Verification:

@@ -15,8 +15,8 @@ from tuning.api.markers import OUTPUT, RUNS, Option, Seed
 from tuning.api.progress import working
 from tuning.api.report import Report
 from tuning.api.report import report as write_report
-from tuning.api.result import Printed
-from tuning.api.study import INTERRUPTED, Study
+from tuning.api.result import INTERRUPTED, Printed
+from tuning.api.study import Study
 from tuning.api.tune import run_tuning
 from tuning.cli.output import progress_console
 from tuning.evaluation.evaluate import score_ratio

@@ -33,7 +33,7 @@ from tuning.api.markers import (
     Argument,
     FilterOption,
     Option,
-    PresetOption,
+    Preset,
 )
 from tuning.api.progress import bar
 from tuning.api.result import Printed
@@ -52,7 +52,7 @@ def command(
     voltage: Annotated[float | None, Option(INPUT)] = None,
     excitation: Annotated[str | None, Option(INPUT)] = None,
     log: Annotated[Path | None, Option(INPUT, file=READ)] = None,
-    preset: Annotated[str | Path | None, PresetOption] = None,
+    preset: Preset = None,
     sensor: Annotated[Sequence[str] | None, Option(INPUT, choices="sensors")] = None,
     column: Annotated[Sequence[str] | None, Option(INPUT, metavar="NAME=HEADER[UNIT]")] = None,
     filter: Annotated[str | None, FilterOption] = None,

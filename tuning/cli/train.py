@@ -3,49 +3,36 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from rich.console import RenderableType
 from rich.progress import TextColumn
-
-from filters.tuned_file import read_tuned_file
-from thruster_env.core.checks import at_least
-from thruster_env.core.text_tables import Table
-from tuning.api.markers import FILTER, INPUT, LEARNING, OUTPUT, READ, Option, PresetOption
-from tuning.api.progress import bar
-from tuning.api.result import Printed
-from tuning.api.study import INTERRUPTED
-from tuning.api.tune import file_name
-from tuning.cli.output import progress_console
-from tuning.plants.thruster_logs import of_preset
-from tuning.policies.algorithms import ALGORITHMS, OBSERVATION_SETS, check_installed
-from tuning.policies.setup import PLANTS, TASKS, TrainingConfiguration, make_configuration, plant_of
-from tuning.problems.scenario import plain
-
-if TYPE_CHECKING:
-    from tuning.policies.learn import Trained
-
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
-
 from rich.text import Text
 
 from filters.consistency.nees import mean_interval
-from thruster_env.core.checks import one_of
-from tuning.api.markers import RUNS, Argument, Seed
-from tuning.policies.algorithms import find_observation_set
-from tuning.policies.setup import in_scenario
+from filters.tuned_file import read_tuned_file
+from thruster_env.core.checks import at_least, one_of
+from thruster_env.core.text_tables import Table
+from tuning.api.markers import FILTER, INPUT, LEARNING, OUTPUT, READ, RUNS, Argument, Option, Preset, Seed
+from tuning.api.progress import bar
+from tuning.api.result import INTERRUPTED, Printed
+from tuning.api.tune import file_name
+from tuning.cli.output import progress_console
+from tuning.plants.thruster_logs import of_preset
+from tuning.policies.algorithms import ALGORITHMS, OBSERVATION_SETS, check_installed, find_observation_set
+from tuning.policies.setup import PLANTS, TASKS, TrainingConfiguration, in_scenario, make_configuration, plant_of
 from tuning.problems.data import held_out_seeds
-from tuning.problems.scenario import PlantScenario
+from tuning.problems.scenario import PlantScenario, plain
 from tuning.reporting.tables import about, unless_blank
 from tuning.search.plan import HELD_OUT_SEEDS
 
 if TYPE_CHECKING:
+    from tuning.policies.learn import Trained
     from tuning.policies.saved import Scores
 
 POLICIES = Path("out") / "policies"
@@ -62,7 +49,7 @@ def command(
     algo: Annotated[str, Option(LEARNING, choices=ALGORITHMS)] = "ppo",
     steps: Annotated[int | None, Option(LEARNING, metavar="N", listed=f"{FEWEST_STEPS}.")] = None,
     scenario: Annotated[str | None, Option(INPUT, listed=f"{LEARNABLE}; by default {DEFAULTS}.")] = None,
-    preset: Annotated[str | Path | None, PresetOption] = None,
+    preset: Preset = None,
     tuned: Annotated[Path | None, Option(FILTER, metavar="FILE", file=READ)] = None,
     untuned: Annotated[bool, Option(FILTER)] = False,
     controller: Annotated[str | None, Option(LEARNING, listed=f"{CORRECTABLE}.")] = None,
@@ -227,7 +214,7 @@ class Scored(NamedTuple):
 def score(
     models: Annotated[list[Path], Argument(INPUT, metavar="MODEL")],
     scenario: Annotated[str | None, Option(INPUT, listed=f"{LEARNABLE}.")] = None,
-    preset: Annotated[str | Path | None, PresetOption] = None,
+    preset: Preset = None,
     classical: Annotated[Sequence[str], Option(INPUT)] = (),
     seeds: Annotated[int, Option(RUNS)] = HELD_OUT_SEEDS,
     seed: Seed = 0,

@@ -33,12 +33,7 @@ import numpy as np
 
 from filters import StateSpaceModel
 from thruster_env.core.derivatives import complex_step, runge_kutta
-from tuning.experiments.benchmark import (
-    Benchmark,
-    Published,
-    against_published,
-    noise_free_problem,
-)
+from tuning.experiments.benchmark import Benchmark, Published, against_published, noise_free_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Parameter
 

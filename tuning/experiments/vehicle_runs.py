@@ -15,12 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.bounds import path_bound, wrapped_variances
-from filters.consistency.nees import (
-    Interval,
-    mean_interval,
-    normalized_squares,
-    rmse_intervals,
-)
+from filters.consistency.nees import Interval, mean_interval, normalized_squares, rmse_intervals
 from filters.engine.batch import run
 from filters.filter import Filter
 from filters.logs.findings import TRUTH as TRUTH_LOOK

@@ -17,17 +17,7 @@ from optuna.trial import FrozenTrial, TrialState
 from filters.consistency.nees import LEVELS, Interval, SquaresCheck
 from filters.consistency.report import ConsistencyReport, probability_text, rounded
 from filters.logs.findings import colour_of
-from thruster_env.core.files import (
-    BLUE,
-    DARK,
-    GREEN,
-    GREY,
-    MUSTARD,
-    PALE,
-    RUST,
-    legend_below,
-    panels,
-)
+from thruster_env.core.files import BLUE, DARK, GREEN, GREY, MUSTARD, PALE, RUST, legend_below, panels
 from thruster_env.core.text_tables import TITLE, verbatim
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED
 from tuning.evaluation.held_out import Comparison

@@ -41,10 +41,7 @@ from tuning.reporting.search_figures import (
     words,
 )
 from tuning.reporting.tables import kinds_table
-from tuning.reporting.time_figures import (
-    COLUMNS,
-    sections_over_time,
-)
+from tuning.reporting.time_figures import COLUMNS, sections_over_time
 from tuning.search.among_types import filter_types_tried
 from tuning.search.parameters import index_pairs
 from tuning.search.plan import (
