@@ -28,7 +28,7 @@ from tuning.likelihood.ascent import climb
 from tuning.series.column import Column, seconds_text
 from tuning.series.fit import CANDIDATES, Candidate, Choice, Number, behind, choose, filtered
 from tuning.series.likelihood import ColumnLikelihood, R, model_of
-from tuning.series.paste import ARDUINO, BURST, lines_of
+from tuning.series.paste import ARDUINO, BURST, UnequalSteps, lines_of
 
 if TYPE_CHECKING:
     import pandas
@@ -217,8 +217,12 @@ class SeriesFit(Result):
         Raises:
             ValueError: for a model of equal steps, as one with a season.
         """
+        return self._maker.continuous(dt=self.column.dt)
+
+    @property
+    def _maker(self) -> NamedMaker:
         mean = self.column.mean if self.level is None else self.level
-        maker = NamedMaker(
+        return NamedMaker(
             self.name,
             self.column.quantities,
             self.chosen.values,
@@ -226,7 +230,6 @@ class SeriesFit(Result):
             first=tuple(self.column.first.tolist()),
             spread=self.column.scales.spread,
         )
-        return maker.continuous(dt=self.column.dt)
 
     @cached_property
     def estimates(self) -> FilteredRuns:
@@ -490,7 +493,14 @@ class SeriesFit(Result):
                 f'but {self.name} {forgets}: take code("python") or code("filterpy"), whose gain varies, or '
                 "thruster tune and export, which write such a one in C"
             )
-        return lines_of(language, self.model, self._gains(), self.column.dt, self.gate, self.column.turns)
+        column, signal, unequal = self.column, named_model(self.name).signal(self._values), None
+        if column.stamps is not None and not signal.discrete:
+            axes, steps = np.eye(self.model.m), np.diff(column.stamps)
+            matrices = np.kron(axes, signal.slope), np.kron(axes, signal.densities)
+            unequal = UnequalSteps(self._maker, column.dt, *matrices, float(steps.min()), float(steps.max()))
+        off = 0 if self.left_out is None else ~np.isnan(self.left_out)
+        gaps = column.stamps is not None or not (column.measured | off).all()
+        return lines_of(language, self.model, self._gains(), column.dt, self.gate, column.turns, unequal, gaps)
 
 
 def _step_text(dt: float) -> str:

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
+from filters.named import NamedMaker
 from thruster_env.core.checks import one_of
 from thruster_env.model.affine import AffineModel
 
 ARDUINO = "arduino"  # the only one of constant gain
 BURST = 10  # far numbers in a row that are outliers; more are a jump
+
+
+class UnequalSteps(NamedTuple):
+    """What gives F and Q of a step of any length."""
+
+    maker: NamedMaker  # of the model in continuous time
+    dt: float  # usual step [s]
+    slope: np.ndarray  # A, (n, n), of all axes
+    densities: np.ndarray  # D, (n, n)
+    shortest: float  # step of the record [s]
+    longest: float
 
 
 def lines_of(
@@ -20,8 +33,12 @@ def lines_of(
     dt: float,
     gate: float | None = None,
     turns: Sequence[float] = (),
+    unequal: UnequalSteps | None = None,
+    has_gaps: bool = False,
 ) -> str:
     """The filter of a model without inputs as lines of a language, below a comment with sample time and units.
+
+    Lines for steps of any length compute F and Q of each, those of a constant gain cannot.
 
     Args:
         language: a key of `LANGUAGES`.
@@ -30,11 +47,19 @@ def lines_of(
         dt: sample time [s].
         gate: standard deviations of S beyond which measurements are left out; all are taken if None.
         turns: a whole turn of each measurement that wraps, 0 for others; none do if empty.
+        unequal: for steps of any length; None if all are of dt.
+        has_gaps: whether the record has steps of dt without a number.
 
     Raises:
         ValueError: for another language.
     """
-    lines = LANGUAGES[one_of("a language", language, tuple(LANGUAGES))](model, gain, gate)
+    lines = LANGUAGES[one_of("a language", language, tuple(LANGUAGES))](model, gain, gate, unequal)
+    step = f"a step is {dt:.12g} s"
+    if unequal is not None:
+        step = step if language == ARDUINO else "a step may have any length [s]"
+        step = f"{step}; those of the record have {unequal.shortest:.4g} to {unequal.longest:.4g} s"
+    elif has_gaps:
+        step = f"{step}; one without a measurement counts, with z = NaN"
     comment = COMMENTS.get(language, "#")
     units = [
         f"{word}: {', '.join(f'{quantity.symbol} [{quantity.unit or 1}]' for quantity in quantities)}"
@@ -46,11 +71,13 @@ def lines_of(
         for quantity, turn in zip(model.measurements, turns, strict=False)
         if turn
     ]
-    heads = [f"{comment} {line}" for line in (f"a step is {dt:.12g} s", *units, *unwrapped)]
+    heads = [f"{comment} {line}" for line in (step, *units, *unwrapped)]
     return "\n".join([*heads, lines])
 
 
-def _python(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
+def _python(model: AffineModel, gain: np.ndarray, gate: float | None, unequal: UnequalSteps | None = None) -> str:
+    if unequal is not None:
+        return _python_of_any_step(unequal, gate)
     a, _, _, c, d = model.matrices()
     session = f"""
 session = filter_.session(gate={gate}, most={BURST})  # it leaves outliers out, at most {BURST} in a row
@@ -71,7 +98,62 @@ filter_ = filters.make_filter("kf", filters.affine_model(
 ))""" + ("" if gate is None else session)
 
 
-def _filterpy(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
+def _python_of_any_step(unequal: UnequalSteps, gate: float | None) -> str:
+    maker, dt = unequal.maker, _number(unequal.dt)
+    quantities = ", ".join(f"Quantity{tuple(quantity[:3])}" for quantity in maker.quantities)
+    values = ", ".join(f"{name!r}: {_number(value)}" for name, value in maker.values.items())
+    means = {"mean": maker.mean, "first": maker.first}
+    advice = (
+        "" if gate is None else f"# outliers, beyond {gate} standard deviations of their prediction, are NaN\n"
+    )
+    return (
+        f"""import numpy as np
+import filters
+from filters.named import NamedMaker
+from thruster_env.model.quantities import Quantity
+
+plant = NamedMaker(
+    {maker.name!r},
+    quantities=[{quantities}],
+    values={{{values}}},
+"""
+        + "".join(
+            f"    {name}=[{', '.join(map(_number, numbers))}],\n"
+            for name, numbers in means.items()
+            if numbers is not None
+        )
+        + f"""    spread={_number(maker.spread)},
+).continuous(dt={dt})
+filter_ = filters.make_filter("ekf", plant.at({dt}))
+{advice}# z at times t [s]: filters.run(filter_, z, dt=np.diff(t), noise=plant.noise)"""
+    )
+
+
+def _step_of_python(unequal: UnequalSteps) -> str:
+    """A function of a step's length that gives F and Q, by halvings so that no exponential is large."""
+    n = len(unequal.slope)
+    return f"""from scipy.linalg import expm
+
+A = np.array({_rows(unequal.slope)})
+D = np.array({_rows(unequal.densities)})
+
+
+def step(dt):  # F and Q of a step of dt [s]
+    halvings = int(max(np.ceil(np.log2(1e-9 + np.abs(A).sum() * dt)), 0))
+    e = expm(np.block([[-A, D], [0 * A, A.T]]) * dt / 2**halvings)
+    F = e[{n}:, {n}:].T
+    Q = F @ e[:{n}, {n}:]
+    for _ in range(halvings):
+        F, Q = F @ F, Q + F @ Q @ F.T
+    return F, Q
+
+
+"""
+
+
+def _filterpy(
+    model: AffineModel, gain: np.ndarray, gate: float | None, unequal: UnequalSteps | None = None
+) -> str:
     a, _, _, c, d = model.matrices()
     begin, far, or_far = "", "", ""
     if gate is not None:
@@ -81,31 +163,38 @@ def _filterpy(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
 in_a_row = np.where(np.isnan(z), in_a_row, np.where(far, in_a_row + 1, 0))
 """
         or_far = f" or (far & (in_a_row <= {BURST})).any()"
+    head, after = "\n", "then for each further one"
+    noise, before = f"kf.F = np.array({_rows(a)})\nkf.Q = np.array({_rows(model.process_noise_cov)})\n", ""
+    if unequal is not None:
+        head, after, noise = _step_of_python(unequal), f"{after}, dt [s] later", ""
+        before = "kf.F, kf.Q = step(dt)\n"
     return f"""import numpy as np
 from filterpy.kalman import KalmanFilter
-
-kf = KalmanFilter(dim_x={model.n}, dim_z={model.m})
-kf.F = np.array({_rows(a)})
-kf.H = np.array({_rows(c)})
-kf.Q = np.array({_rows(model.process_noise_cov)})
+{head}kf = KalmanFilter(dim_x={model.n}, dim_z={model.m})
+{noise}kf.H = np.array({_rows(c)})
 kf.R = np.array({_rows(model.measurement_noise_cov)})
 kf.x = np.array([{_numbers(model.prior_mean)}]).T
 kf.P = np.array({_rows(model.prior_cov)})
-{begin}# the first measurement updates the state at once: kf.update(z[0]{_less(d)}), then for each further one
-kf.predict()
+{begin}# the first measurement updates the state at once: kf.update(z[0]{_less(d)}), {after}
+{before}kf.predict()
 {far}kf.update(None if np.isnan(z).any(){or_far} else z{_less(d)})"""
 
 
-def _pykalman(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
+def _pykalman(
+    model: AffineModel, gain: np.ndarray, gate: float | None, unequal: UnequalSteps | None = None
+) -> str:
     a, _, _, c, d = model.matrices()
     advice = "" if gate is None else "# pykalman has no gate: set outliers of z to NaN first\n"
+    head, steps, f, q = "\n", "", _rows(a), _rows(model.process_noise_cov)
+    if unequal is not None:
+        head, steps = _step_of_python(unequal), "steps = [step(dt) for dt in np.diff(t)]  # t: times of z [s]\n"
+        f, q = "np.array([F for F, _ in steps])", "np.array([Q for _, Q in steps])"
     return f"""import numpy as np
 from pykalman import KalmanFilter
-
-{advice}kf = KalmanFilter(
-    transition_matrices={_rows(a)},
+{head}{advice}{steps}kf = KalmanFilter(
+    transition_matrices={f},
     observation_matrices={_rows(c)},
-    transition_covariance={_rows(model.process_noise_cov)},
+    transition_covariance={q},
     observation_covariance={_rows(model.measurement_noise_cov)},
     observation_offsets={_numbers(d)},
     initial_state_mean={_numbers(model.prior_mean)},
@@ -114,7 +203,7 @@ from pykalman import KalmanFilter
 means, covs = kf.filter(np.ma.masked_invalid(z))"""
 
 
-def _matlab(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
+def _matlab(model: AffineModel, gain: np.ndarray, gate: float | None, unequal: UnequalSteps | None = None) -> str:
     a, _, _, c, d = model.matrices()
     z, offset = "z(:, k)" if model.m > 1 else "z(k)", _matlab_rows(d[:, None]) if model.m > 1 else _number(d[0])
     less = f" - {offset}" if d.any() else ""
@@ -125,15 +214,27 @@ def _matlab(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
     in_a_row = far.*(in_a_row + 1) + isnan(v).*in_a_row;
 """
         near = f" && ~any(far & in_a_row <= {BURST})"
-    return f"""F = {_matlab_rows(a)};
-H = {_matlab_rows(c)};
-Q = {_matlab_rows(model.process_noise_cov)};
+    noise, step = f"F = {_matlab_rows(a)};\nQ = {_matlab_rows(model.process_noise_cov)};\n", ""
+    if unequal is not None:
+        n = model.n
+        noise = f"A = {_matlab_rows(unequal.slope)};\nD = {_matlab_rows(unequal.densities)};\n"
+        step = f"""        dt = t(k) - t(k - 1);  % t: times of z [s]
+        halvings = max(ceil(log2(1e-9 + sum(abs(A(:)))*dt)), 0);
+        E = expm([-A, D; 0*A, A']*dt/2^halvings);
+        F = E({n + 1}:end, {n + 1}:end)';
+        Q = F*E(1:{n}, {n + 1}:end);
+        for i = 1:halvings
+            Q = Q + F*Q*F';
+            F = F*F;
+        end
+"""
+    return f"""{noise}H = {_matlab_rows(c)};
 R = {_matlab_rows(model.measurement_noise_cov)};
 x = {_matlab_rows(model.prior_mean[:, None])};
 P = {_matlab_rows(model.prior_cov)};
 {begin}for k = 1:{"size(z, 2)" if model.m > 1 else "numel(z)"}
     if k > 1
-        x = F*x;
+{step}        x = F*x;
         P = F*P*F' + Q;
     end
     v = {z} - H*x{less};
@@ -146,7 +247,7 @@ P = {_matlab_rows(model.prior_cov)};
 end"""
 
 
-def _arduino(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
+def _arduino(model: AffineModel, gain: np.ndarray, gate: float | None, unequal: UnequalSteps | None = None) -> str:
     a, _, _, c, d = model.matrices()
     names = [f"x{i + 1}" for i in range(model.n)]
     inputs = [f"z{j + 1}" for j in range(model.m)] if model.m > 1 else ["z"]
@@ -166,6 +267,7 @@ def _arduino(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
         *([f"int {', '.join(f'far{j + 1} = 0' for j in range(model.m))};"] if gate is not None else []),
         f"void filter({arguments}) {{",
         "  if (!begun) {",
+        f"    if ({' || '.join(f'{z} != {z}' for z in inputs)}) return;  // NaN",
         *(f"    {name} = {value};" for name, value in first.items()),
         "    begun = 1;",
         "    return;",
@@ -176,7 +278,9 @@ def _arduino(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
         f"  double {difference} = {z} - ({_products(row, p, offset)});"
         for difference, z, row, offset in zip(v, inputs, c, offsets, strict=True)
     ]
-    if gate is not None:  # v = 0 for outliers, but after some in a row the level is another one
+    if gate is None:
+        lines += [f"  if ({difference} != {difference}) {difference} = 0.0;  // NaN" for difference in v]
+    else:  # v = 0 for outliers, but after some in a row the level is another one
         s = np.diag(model.measurement_noise_cov) / (1.0 - np.einsum("ji,ij->j", c, gain))
         for j, (difference, limit) in enumerate(zip(v, gate * np.sqrt(s), strict=True)):
             is_missing = f"if ({difference} != {difference}) {difference} = 0.0; else"
@@ -190,7 +294,7 @@ def _arduino(model: AffineModel, gain: np.ndarray, gate: float | None) -> str:
     return "\n".join([*lines, "}"])
 
 
-LANGUAGES: dict[str, Callable[[AffineModel, np.ndarray, float | None], str]] = {
+LANGUAGES: dict[str, Callable[[AffineModel, np.ndarray, float | None, UnequalSteps | None], str]] = {
     "python": _python,
     "filterpy": _filterpy,
     "pykalman": _pykalman,
