@@ -16,7 +16,7 @@ from filters import (
 from filters.adaptive import bounded_step
 from filters.engine.session import Session
 from tests.models import plane_model, simulated
-from tests.oracles import each_close, kalman_update
+from tests.oracles import kalman_update
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
@@ -130,25 +130,6 @@ def test_for_one_channel_it_is_the_inverse_gamma_recursion_of_sarkka_and_nummenm
             x, p = new_x, new_p
             assert filter_.estimated_noise(belief)[0, 0] == pytest.approx(beta / alpha, rel=1e-6)
             np.testing.assert_allclose(belief.mean, x, rtol=1e-6, atol=1e-8)
-
-
-NEUTRAL = [
-    (SageHusaFilter, {"forgetting_factor": 1.0}),
-    (VariationalBayesFilter, {"forgetting_factor": 1.0, "prior_weight": 1e12}),
-    (RobustExtendedKalmanFilter, {"degrees_of_freedom": 1e14}),
-]
-
-
-@pytest.mark.parametrize(("kind", "numbers"), NEUTRAL)
-@pytest.mark.parametrize("make", [plane_model, thruster_model])
-def test_with_nothing_to_learn_it_is_the_extended_filter(kind, numbers, make):
-    model = make()
-    inputs, z = simulated(model, 40, level=1.0)
-    z[0, 7], z[0, 9, 0] = np.nan, np.nan
-    with interpreted():
-        expected = run(ExtendedKalmanFilter(model=model), np.zeros((1, 2)), inputs, z)
-        found = run(kind(model=model, **numbers), np.zeros((1, 2)), inputs, z)
-    each_close(found, expected, rtol=1e-8, atol=1e-8)
 
 
 def many_long(model):
@@ -270,27 +251,3 @@ def test_the_robust_filter_is_the_naive_fixed_point():
     np.testing.assert_allclose(
         innovation.cov, h @ belief.cov @ h.T + r, rtol=1e-12
     )  # the NIS is to tell an outlier
-
-
-@pytest.mark.parametrize(
-    ("kind", "numbers", "rule"),
-    [
-        (SageHusaFilter, {"forgetting_factor": 0.0}, "forgetting_factor must be above 0 and at most 1"),
-        (SageHusaFilter, {"process_forgetting_factor": 1.1}, "process_forgetting_factor must be above 0"),
-        (VariationalBayesFilter, {"forgetting_factor": -1}, "forgetting_factor must be above 0 and at most 1"),
-        (VariationalBayesFilter, {"prior_weight": 0.0}, "prior_weight must be positive"),
-        (VariationalBayesFilter, {"iterations": 0}, "iterations must be a whole number of at least 1"),
-        (RobustExtendedKalmanFilter, {"degrees_of_freedom": 0}, "degrees_of_freedom must be positive"),
-        (RobustExtendedKalmanFilter, {"iterations": 1.5}, "iterations must be a whole number of at least 1"),
-    ],
-)
-def test_numbers_that_make_no_sense_are_refused(kind, numbers, rule):
-    with pytest.raises(ValueError, match=f"{rule}.*but got"):
-        kind(model=plane_model(), **numbers)
-
-
-@adaptive
-def test_noise_that_is_learnt_cannot_be_given_as_well(kind):
-    filter_ = kind(model=plane_model())
-    with interpreted(), pytest.raises(ValueError, match="cannot vary from step to step"):
-        filter_.update(filter_.init(KEY), [1.0, 1.0], measurement_noise_cov=[1.0, 1.0])

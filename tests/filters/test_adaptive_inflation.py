@@ -8,7 +8,6 @@ from scipy.stats import invgamma, multivariate_normal
 
 from filters import make_filter, run
 from filters.ensembles.ensemble import relative_move, width_of
-from tests.filters.checks import refused
 from tests.filters.test_localised import ring
 from tests.models import KEY, plane_model, random_affine, simulated, state_space
 
@@ -228,14 +227,3 @@ def test_where_the_model_s_error_is_steady_the_deviation_shrinks_and_the_factor_
     assert width_of(0.1) <= belief.extras[1] < 0.6 * width_of(0.3)
     assert seen[0.1][0] == pytest.approx(seen[0.0][0], rel=0.05) and seen[0.1][0] > 1.2
     assert seen[0.1][1] < 0.75 * seen[0.0][1]
-
-
-def test_wrong_numbers_are_refused():
-    for rule, numbers in (
-        ("adaptive_inflation must be zero or positive, but got -1", {"adaptive_inflation": -1}),
-        ("with inflation_by_state must be positive, but got 0", {"inflation_by_state": 1}),
-        ("inflation_by_state must be 0 or 1, but got 2", {**OWN, "inflation_by_state": 2}),
-        ("least_deviation must be at most adaptive_inflation, 0.3, but got 0.4", {**OWN, "least_deviation": 0.4}),
-        ("least_deviation must be zero or positive, but got -1", {**OWN, "least_deviation": -1}),
-    ):
-        refused(rule, make_filter, "etkf", plane_model(), **numbers)

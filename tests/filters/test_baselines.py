@@ -164,18 +164,3 @@ def test_a_root_beyond_reach_is_none():
     assert solve((1.0, 0.0), 9.0, (), 3.0)[0] == pytest.approx(3.0)
     assert solve((1.0, 0.0), 9.0, (), 1.0)[0] == pytest.approx(2.0)  # as near as it comes
     assert solve((1.0, 0.0), -1.0, (), 3.0)[0] == pytest.approx(0.0, abs=1e-7)  # the extremum
-
-
-@pytest.mark.parametrize(
-    ("kind", "numbers", "rule"),
-    [
-        (Inversion, {"inverted": 2}, "inverted must be a whole number from -2 to 1, but got 2"),
-        (Inversion, {"inverted": -3}, "inverted must be a whole number of at least -2, but got -3"),
-        (LowPass, {"channel": 1}, "channel must be a whole number from -1 to 0, but got 1"),
-        (Inversion, {"reach": 0.0}, "reach must be positive, but got 0.0"),
-        (LowPass, {"time_constant": -1.0}, "time_constant must be positive, but got -1.0"),
-    ],
-)
-def test_numbers_that_make_no_sense_are_refused(kind, numbers, rule):
-    with pytest.raises(ValueError, match=rule):
-        kind(model=bumpy_model(), **numbers)

@@ -9,7 +9,6 @@ import pytest
 from filters import EnsembleKalmanFilter, KalmanFilter, make_filter, run, smooth, thruster_model
 from filters.engine.belief import memory_offsets
 from filters.ensembles.stochastic import rotator
-from tests.filters.checks import refused
 from tests.models import KEY, line_model, plane_model, simulated
 from tests.oracles import assert_normal, convergence, each_close, normals, relative_errors
 from tests.slow import slow_but
@@ -57,8 +56,6 @@ def test_centred_perturbations_move_the_mean_as_the_gain_says():
     _, _, _, c, _ = model.matrices()
     gain = prior.cov @ c.T @ np.linalg.inv(innovation.cov)
     np.testing.assert_allclose(belief.mean, prior.mean + gain @ innovation.value, rtol=1e-12)
-    rule = "centred_perturbations must be 0 or 1, but got 2"
-    refused(rule, EnsembleKalmanFilter, model=model, centred_perturbations=2)
 
 
 def test_members_are_stirred_by_the_prior_the_process_noise_and_the_measurement_noise():
@@ -182,7 +179,3 @@ def test_a_smoother_refuses_rotations():
     filter_ = make_filter("etkf", thruster_model(), ensemble_size=5, rotations=1)
     with pytest.raises(ValueError, match="a smoothed filter must have rotations 0, but got 1"):
         smooth(filter_, np.zeros((1, 2)), np.zeros((1, 3, 1)), np.zeros((1, 4, 1)), lag=2)
-
-
-def test_rotations_are_none_or_one():
-    refused("rotations must be 0 or 1, but got 2", make_filter, "etkf", thruster_model(), rotations=2)

@@ -5,13 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model
+from filters import ExtendedKalmanFilter, linearize, make_filter, run, thruster_model
 from tests import models
-from tests.models import DT, held_voltages, line_model, look, simulated, swing
+from tests.filters.test_attitude import TAKE_ROTATIONS
+from tests.models import DT, look, simulated, swing, wide_model
 from tests.oracles import each_close, kalman_update
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.streams import episode_keys
-from thruster_env.model import simulate
 
 
 def swing_jacobian(x, u, c):
@@ -52,15 +51,6 @@ def test_it_is_the_textbook_filter():
         np.testing.assert_allclose(estimates.covs[0, k], p, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(estimates.innovations[0, k], innovation, rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(estimates.innovation_covs[0, k], s, rtol=1e-10, atol=1e-12)
-
-
-def test_on_an_affine_model_it_is_the_kalman_filter():
-    model = line_model()
-    inputs, measurements = simulated(model, 150)
-    by_kalman = estimates_of(model, inputs, measurements, KalmanFilter)
-    for derivatives in ({}, {"transition_jacobian": None, "observe_jacobian": None}):
-        extended = estimates_of(model.replace(**derivatives), inputs, measurements)
-        each_close(extended[:5], by_kalman[:5], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("x", [(0.0, 0.0), (0.5, -2.0), (-3.0, 100.0), (30.0, 0.02)])
@@ -108,24 +98,14 @@ def test_the_thruster_s_jacobians_are_those_of_its_functions(preset, x):
     np.testing.assert_allclose(model.observe_jacobian(x, c), [by_thrust], rtol=1e-6, atol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def nominal():
-    """The thruster with its default noise: 100 truths under voltages held for 0.25 s, with what the EKF says."""
-    model = thruster_model(process_noise_cov=[1.0, 4e-4], measurement_noise_cov=0.25)
-    inputs = held_voltages(100, 20)
-    drawn = simulate.simulate(model, episode_keys(range(100)), inputs)
-    return drawn, run(ExtendedKalmanFilter(model=model), np.zeros((100, 2)), inputs, drawn.measurements)
+AT_LIMITS = {name: numbers for name, (numbers, kin, _) in TAKE_ROTATIONS.items() if kin == "ekf"}
 
 
-def test_on_the_thruster_its_errors_are_as_large_as_it_says(nominal):
-    drawn, estimates = nominal
-    errors = (drawn.states - estimates.means)[:, 50:]
-    nees = np.einsum("bki,bkij,bkj->bk", errors, np.linalg.inv(estimates.covs[:, 50:]), errors).mean(axis=1)
-    assert abs(nees.mean() - 2.0) < 1.96 * nees.std(ddof=1) / math.sqrt(100)
-    assert (estimates.divergences == 0).all()
-
-
-def test_on_the_thruster_its_innovations_are_as_large_as_it_says(nominal):
-    _, estimates = nominal
-    nis = (estimates.innovations[:, 50:, 0] ** 2 / estimates.innovation_covs[:, 50:, 0, 0]).mean(axis=1)
-    assert abs(nis.mean() - 1.0) < 1.96 * nis.std(ddof=1) / math.sqrt(100)
+@pytest.mark.parametrize("name", AT_LIMITS)
+@pytest.mark.parametrize("make", [wide_model, thruster_model])
+@pytest.mark.usefixtures("as_python")
+def test_parameters_at_their_limits_make_the_extended_filter(name, make):
+    model = make()
+    inputs, z = simulated(model, 40, level=1.0, missing=0.2)
+    filters = make_filter(name, model, **AT_LIMITS[name]), make_filter("ekf", model)
+    each_close(*(run(filter_, None, inputs, z) for filter_ in filters), rtol=1e-8, atol=1e-8)

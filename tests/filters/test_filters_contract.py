@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import FILTERS, make_filter, run
+from filters import FILTERS, run
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.particles.kernels import WeightedFilter
 from tests.filters.checks import refused
@@ -205,12 +205,6 @@ def test_only_real_members_are_put_through_the_model(name):
     for _ in range(20):
         belief, _ = filter_.update(filter_.predict(belief, [0.0]), [4.5])
     assert belief.mean[0] == pytest.approx(4.5, abs=0.3)
-
-
-@pytest.mark.parametrize("size", [1, 0, -3, 2.5, math.nan, "many", None, 1_000_001])
-@pytest.mark.parametrize("name", OF_MEMBERS)
-def test_a_number_of_members_that_cannot_be_is_refused(name, size):
-    refused("ensemble_size must be .* but got", make_filter, name, wide_model(), ensemble_size=size)
 
 
 class TestNoiseThatVaries:

@@ -208,21 +208,6 @@ def test_the_thruster_s_range_is_that_of_its_voltages():
     np.testing.assert_array_equal([filter_.low, filter_.high], [model.state_low, model.state_high])
 
 
-@pytest.mark.parametrize(
-    ("numbers", "rule"),
-    [
-        ({"low": [0.0, 1.0]}, "low must be 6 finite numbers, but got"),
-        ({"high": ["a"] * 6}, "high must be 6 finite numbers, but got"),
-        ({"low": [2.0] * 6}, "low must be below high in every state, but got"),
-        ({"blending": "mean"}, "blending must be one of weights, moments, output, but got 'mean'"),
-        ({"offsets": 1}, "offsets must be True or False, but got 1"),
-    ],
-)
-def test_a_wrong_argument_is_refused(numbers, rule):
-    with pytest.raises(ValueError, match=rule):
-        FuzzyKalmanFilter(model=six_states(), **numbers)
-
-
 def test_a_nonlinear_model_without_a_range_is_refused():
     model = six_states().replace(state_low=None)
     with pytest.raises(ValueError, match="must know the range of the states, but got neither"):

@@ -106,15 +106,3 @@ def test_a_component_that_is_known_is_not_split():
         found, _ = GaussianSumFilter(model=model).update(GaussianSumFilter(model=model).init(), [2.0])
     np.testing.assert_allclose(found.mean, exact.mean, rtol=1e-12)
     np.testing.assert_allclose(found.cov, exact.cov, rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("numbers", "rule"),
-    [
-        ({"parts": 6}, "parts must be a whole number of at least 7, but got 6"),
-        ({"component": 2}, "component must be a whole number from -2 to 1, but got 2"),
-    ],
-)
-def test_numbers_that_make_no_sense_are_refused(numbers, rule):
-    with pytest.raises(ValueError, match=rule):
-        GaussianSumFilter(model=line_model(), **numbers)

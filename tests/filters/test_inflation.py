@@ -5,7 +5,6 @@ import pytest
 
 from filters import FILTERS, make_filter, run
 from filters.ensembles.ensemble import EnsembleFilter
-from tests.filters.checks import refused
 from tests.models import KEY, plane_model, rescaled, simulated
 from tests.oracles import each_close, each_equal
 from thruster_env.core.streams import filter_keys
@@ -117,17 +116,3 @@ def test_a_change_of_units_changes_no_estimate(name, states):
     after = run(*filters_of(name, other, choice), keys, inputs, measurements * channels)
     np.testing.assert_allclose(after.means / states, before.means, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(after.covs / np.outer(states, states), before.covs, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("numbers", "rule"),
-    [
-        ({"inflation": 0.0}, "inflation must be positive, but got 0.0"),
-        ({"inflation": float("inf")}, "inflation must be a finite number, but got inf"),
-        ({"relaxation": -0.1}, "relaxation must be zero or positive, but got -0.1"),
-        ({"relaxation": 1.1}, "relaxation must be at most 1, but got 1.1"),
-        ({"relaxation": "half"}, "relaxation must be a finite number, but got 'half'"),
-    ],
-)
-def test_a_factor_that_makes_no_sense_is_refused(name, numbers, rule):
-    refused(rule, make_filter, name, far_plane(), **numbers)

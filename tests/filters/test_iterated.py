@@ -9,12 +9,8 @@ from scipy.optimize import minimize
 from filters import (
     ExtendedKalmanFilter,
     IteratedExtendedKalmanFilter,
-    KalmanFilter,
-    run,
-    thruster_model,
 )
-from tests.models import plane_model, simulated, state_space
-from tests.oracles import each_close, each_equal
+from tests.models import state_space
 
 KEYS = np.zeros((1, 2))
 
@@ -78,24 +74,6 @@ def test_many_iterations_find_the_most_probable_state():
     assert misfit(found.mean) < 0.9 * misfit(once.mean)
 
 
-@pytest.mark.parametrize("model", [landmark(), thruster_model()], ids=["landmark", "thruster"])
-def test_one_iteration_is_the_extended_filter(model):
-    inputs, measurements = simulated(model, 60)
-    measurements[0, 7] = np.nan
-    once = run(IteratedExtendedKalmanFilter(model=model, iterations=1), KEYS, inputs, measurements)
-    extended = run(ExtendedKalmanFilter(model=model), KEYS, inputs, measurements)
-    each_equal(once, extended)
-
-
-def test_on_an_affine_model_it_is_the_kalman_filter():
-    model = plane_model(prior_cov=[0.0, 2.0])
-    inputs, measurements = simulated(model, 60)
-    measurements[0, 10, 0] = measurements[0, 20] = np.nan
-    by_kalman = run(KalmanFilter(model=model), KEYS, inputs, measurements)
-    found = run(IteratedExtendedKalmanFilter(model=model), KEYS, inputs, measurements)
-    each_close(found[:5], by_kalman[:5], rtol=1e-10, atol=1e-10)
-
-
 def test_a_missing_channel_of_a_nonlinear_measurement_has_no_effect():
     both = landmark()
     one = landmark(
@@ -113,11 +91,3 @@ def test_a_missing_channel_of_a_nonlinear_measurement_has_no_effect():
     np.testing.assert_allclose(found.cov, expected.cov, rtol=1e-12)
     assert innovation.value[1] == 0.0
     assert innovation.log_likelihood == pytest.approx(alone.log_likelihood, rel=1e-12)
-
-
-@pytest.mark.parametrize("iterations", [0, -1, 1.5, math.nan, "many", 21])
-def test_iterations_must_be_a_whole_number_from_1_to_20(iterations):
-    with pytest.raises(
-        ValueError, match="iterations must be (a whole number|a finite number|at most 20).* but got"
-    ):
-        IteratedExtendedKalmanFilter(model=landmark(), iterations=iterations)

@@ -9,7 +9,7 @@ from scipy.linalg import solve_discrete_are
 from filters import ExtendedKalmanFilter, KalmanFilter, SteadyStateKalmanFilter, linearize, run, thruster_model
 from filters.bounds import riccati_covariances
 from tests.filters.checks import refused
-from tests.models import held_voltages, random_affine, simulated, state_space, wide_model
+from tests.models import held_voltages, random_affine, simulated, wide_model
 from tests.oracles import each_close, each_equal, kalman_filter
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
@@ -297,21 +297,6 @@ def test_on_the_thruster_a_schedule_is_much_better_than_the_filter_of_one_point(
         return np.sqrt(np.mean(errors**2, axis=(0, 1)))
 
     assert (rmse(KalmanFilter(model=model, schedule=9)) < 0.75 * rmse(KalmanFilter(model=model))).all()
-
-
-@pytest.mark.parametrize(
-    ("numbers", "rule"),
-    [
-        ({"schedule": 3}, "schedule must come with .*operating points, but got schedule=3"),
-        ({"schedule": 0}, "schedule must be a whole number of at least 1, but got 0"),
-        ({"schedule": 2.5}, "schedule must be a whole number of at least 1, but got 2.5"),
-    ],
-)
-def test_a_schedule_needs_points_to_lie_between(numbers, rule):
-    point = {"operating_state": [0.5], "operating_input": [0.25]}
-    grow = lambda x, u, c: (x[0] * x[0] + u[0],)  # noqa: E731
-    model = state_space(grow, lambda x, c: (x[0],), q=[0.1], r=[0.1], mean=[0.5], cov=[0.1], **point)
-    refused(rule, KalmanFilter, model=model, **numbers)
 
 
 def test_a_schedule_has_the_covariance_form_only():

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from filters import StateSpaceModel, bounds, make_filter, run, sensitivity, thruster_model
+from filters import StateSpaceModel, make_filter, run, sensitivity, thruster_model
 from filters import bounds as posterior
 from filters.augmented import augmented_model
 from filters.registry import FILTERS, filter_type
@@ -137,54 +137,6 @@ def linear(n, m):
     return random_affine(n, m, 2, seed=5)
 
 
-def kalman_step(model, mean, p, u, z):
-    """The textbook's Kalman filter, without a thought for rounding."""
-    a, b, offset, c, shift = model.matrices()
-    mean, p = a @ mean + b @ u + offset, a @ p @ a.T + model.process_noise_cov
-    s = c @ p @ c.T + model.measurement_noise_cov
-    gain = p @ c.T @ np.linalg.inv(s)
-    return mean + gain @ (z - c @ mean - shift), p - gain @ s @ gain.T
-
-
-GAUSSIAN = {
-    **{name: (name, {}) for name in ("kf", "ekf", "iekf", "ukf", "ckf", "fuzzy")},
-    "information": ("kf", {"form": "information"}),
-    "square-root": ("kf", {"form": "square-root"}),
-    "sage-husa": ("sage-husa", {"forgetting_factor": 1.0}),
-    "ekf-robust": ("ekf-robust", {"degrees_of_freedom": 1e12}),
-    "vb": ("vb", {"forgetting_factor": 1.0, "prior_weight": 1e12}),
-    "mhe": ("mhe", {"loss": "quadratic"}),
-}
-
-
-@pytest.mark.parametrize("name", GAUSSIAN)
-def test_a_filter_of_twelve_states_is_the_kalman_filter_on_an_affine_model(name):
-    model, (kind, numbers) = linear(12, 4), GAUSSIAN[name]
-    u, z = np.array([0.5, -1.0]), np.arange(4.0)
-    with interpreted():
-        made = make_filter(kind, model, **numbers)
-        belief, _ = made.update(made.predict(made.init(), u), z)
-    mean, p = kalman_step(model, model.prior_mean, model.prior_cov, u, z)
-    np.testing.assert_allclose(belief.mean, mean, rtol=1e-7, atol=1e-8)
-    np.testing.assert_allclose(belief.cov, p, rtol=1e-7, atol=1e-8)
-
-
-@pytest.mark.parametrize("name", ["kf", "ekf", "kf-steady"])
-def test_a_filter_of_forty_states_is_the_kalman_filter_on_an_affine_model(name):
-    model = linear(40, 40)
-    u, z = np.array([0.5, -1.0]), np.linspace(-1.0, 1.0, 40)
-    if name == "kf-steady":
-        a, _, _, c, _ = model.matrices()
-        predicted, updated = bounds.riccati_covariances(model)
-        model = model.replace(prior_cov=updated)  # A P A' + Q is the solution of Riccati's equation
-    with interpreted():
-        made = make_filter(name, model)
-        belief, _ = made.update(made.predict(made.init(), u), z)
-    mean, p = kalman_step(model, model.prior_mean, model.prior_cov, u, z)
-    np.testing.assert_allclose(belief.mean, mean, rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(belief.cov, p, rtol=1e-6, atol=1e-7)
-
-
 @pytest.mark.parametrize(("n", "m"), [(12, 4), (40, 40)])
 @pytest.mark.parametrize("name", ["enkf", "etkf", "ensrf", "denkf", "ienkf"])
 def test_an_ensemble_of_a_large_model_is_updated_by_the_moments_of_its_members(name, n, m):
@@ -211,26 +163,6 @@ def test_an_ensemble_of_a_large_model_is_updated_by_the_moments_of_its_members(n
     if name == "denkf":  # half the gain: P - K H P + K H P H'K'/4
         expected = covs[:n, :n] - gain @ covs[n:, :n] + gain @ covs[n:, n:] @ gain.T / 4
     np.testing.assert_allclose(after.cov, expected, rtol=1e-6, atol=1e-7)
-
-
-@pytest.mark.parametrize("name", ["pf", "apf"])
-def test_particles_of_a_large_model_weigh_what_their_measurements_say(name):
-    model, z = linear(12, 4), np.zeros(4)
-    with interpreted():
-        made = make_filter(name, model, ensemble_size=30)
-        before = made.init((1, 2))
-        after, _ = made.update(before, z)
-    _, _, _, c, shift = model.matrices()
-    x = after.members[:12]
-    misfit = z[:, None] - c @ (x if name == "apf" else before.members[:12]) - shift[:, None]
-    logs = -0.5 * np.einsum("ij,ik,kj->j", misfit, np.linalg.inv(model.measurement_noise_cov), misfit)
-    weights = np.exp(after.members[12])
-    if name == "pf":
-        np.testing.assert_allclose(
-            weights, np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum(), atol=1e-12
-        )
-    np.testing.assert_allclose(after.mean, x @ weights, rtol=1e-9, atol=1e-9)
-    assert weights.sum() == pytest.approx(1.0)
 
 
 def headings(x, u, c):

@@ -7,7 +7,6 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from filters import AuxiliaryParticleFilter, KalmanFilter, ParticleFilter, run
-from tests.filters.checks import refused
 from tests.models import KEY, line_model, plane_model
 from tests.oracles import each_close, normals
 from tests.slow import slow_but
@@ -192,9 +191,3 @@ def test_a_million_particles_are_enough_for_any_moment():
     spread = np.sqrt(np.einsum("bkii->bki", exact.covs))
     # The weights leave about a third of the particles; five standard errors of their mean.
     assert (np.abs(found.means - exact.means) < 5 * spread * math.sqrt(3.0 / 1e6)).all()
-
-
-@pytest.mark.parametrize("threshold", [-0.1, 1.1, math.nan, "often"])
-def test_a_threshold_that_is_no_fraction_is_refused(threshold):
-    rule = "resampling_threshold must be .* but got"
-    refused(rule, ParticleFilter, model=line_model(), resampling_threshold=threshold)

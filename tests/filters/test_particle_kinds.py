@@ -256,14 +256,3 @@ def test_single_steps_and_batches_agree_to_the_last_bit(name, numbers):
     for k in range(40):
         session.step(inputs[0, k], z[0, k + 1])
         each_equal((session.mean, session.cov), (found.means[0, k + 1], found.covs[0, k + 1]))
-
-
-def test_what_the_kinds_may_not_be():
-    with pytest.raises(ValueError, match="proposal must be one of prior, optimal, but got 'best'"):
-        make_filter("pf", scalar_model(), proposal="best")
-    with pytest.raises(ValueError, match="resampling must be one of systematic, gaussian, but got 1"):
-        make_filter("pf", scalar_model(), resampling=1)
-    with pytest.raises(ValueError, match="smoothed must be a whole number from -1 to 0, but got 1"):
-        make_filter("pf", scalar_model(), smoothed=[1])
-    with pytest.raises(ValueError, match="must have no regularisation"):
-        make_filter("pf", scalar_model(), resampling="gaussian", regularisation=0.5)

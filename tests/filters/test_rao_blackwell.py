@@ -7,7 +7,6 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from filters import RaoBlackwellisedParticleFilter, affine_model, make_filter, run
-from tests.filters.checks import refused
 from tests.models import KEY, line_model, plane_model, simulated, state_space
 from tests.oracles import assert_normal, each_close, normals
 from thruster_env.core.compiled import interpreted
@@ -222,9 +221,3 @@ def test_a_tenth_of_the_particles_is_as_good_and_compiled_code_gives_what_python
     with interpreted():
         as_python = run(filter_, *first)
     each_close(compiled, as_python, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("sampled", [(), "0", 1, (3,), (0.5,)])
-def test_sampled_states_must_be_indices_of_states(sampled):
-    refused("sampled must be", make_filter, "rbpf", mixed_model(), sampled=sampled)
-    assert make_filter("rbpf", mixed_model(), sampled=[-1, 0, 2]).sampled == (0, 2)

@@ -287,11 +287,6 @@ def test_it_needs_no_inflation_where_the_transform_filter_loses_the_truth():
     assert 1.2 * score("enkf-n") < score("etkf")
 
 
-@pytest.mark.parametrize("certainty", [0.0, -1.0, float("nan"), None])
-def test_a_certainty_that_is_not_positive_is_refused(certainty):
-    refused("certainty must be .* but got", FiniteSizeEnsembleFilter, model=linear_model(1), certainty=certainty)
-
-
 def stay(x, u, c):
     return x
 

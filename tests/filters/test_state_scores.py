@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import ExtendedKalmanFilter, KalmanFilter, run
+from filters import run
 from filters.sensitivity import state_score
 from tests.filters.test_differentiated import swing_if
 from tests.filters.test_likelihood import directions, two_channels
-from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.models import pendulum
 from thruster_env.core.angles import wrapped
 from thruster_env.core.compiled import interpreted
@@ -16,7 +15,6 @@ from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
 
 WEIGHTS = np.array([4.0, 0.25])
-CASES = {"affine": (two_channels, KalmanFilter), "angle": (turning_pendulum, ExtendedKalmanFilter)}
 
 
 def data_of(model, count=5, steps=30):
@@ -51,30 +49,6 @@ def textbook(model, filter_, data, score):
         cov = estimates.covs[b, k][np.ix_(seen, seen)]
         sums[b] += multivariate_normal(np.zeros(seen.sum()), cov).logpdf(off[b, k][seen])
     return sums
-
-
-@pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("score", ["log-score", "squares"])
-@pytest.mark.parametrize("case", CASES)
-def test_a_score_is_that_of_the_estimates_and_its_gradient_that_of_central_differences(case, score):
-    make, filter_ = CASES[case]
-    model = make()
-    data = data_of(model, steps=15)
-    q_slopes, r_slopes = directions(model)
-    found = state_score(model, *data[1:], q_slopes, r_slopes, score, WEIGHTS)
-    np.testing.assert_allclose(found.values, textbook(model, filter_, data, score), rtol=1e-10)
-    q, r = model.process_noise_cov, model.measurement_noise_cov
-    for j, (dq, dr) in enumerate(zip(q_slopes, r_slopes, strict=True)):
-        h = 1e-4 * min(np.diag(q).min() if dq.any() else 1.0, np.diag(r).min() if dr.any() else 1.0)
-        above, below = (
-            textbook(
-                model.replace(process_noise_cov=q + s * dq, measurement_noise_cov=r + s * dr), filter_, data, score
-            )
-            for s in (h, -h)
-        )
-        slope = (above - below) / (2 * h)
-        np.testing.assert_allclose(found.gradients[:, j], slope, rtol=1e-6, atol=1e-6 * abs(slope).max())
-        assert abs(slope).max() > 0
 
 
 @pytest.mark.parametrize("score", ["log-score", "squares"])

@@ -11,7 +11,7 @@ import torch
 import filters
 from filters import make_filter, run, thruster_model
 from filters.sensitivity import likelihood
-from tests.filters.test_c import KEPT, OWN, made
+from tests.filters.test_c import ENSEMBLES, KEPT, OWN, made
 from tests.filters.test_filter_paths import diverging
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_pages import wide_pendulum
@@ -96,9 +96,10 @@ def test_estimates_of_a_users_filter_are_those_of_run(which):
     assert_same(filters.torch(filter_).run(inputs, z), run(filter_, None, inputs, z))
 
 
-def test_estimates_are_those_of_compiled_code_over_many_steps():
-    filter_ = made("ekf", thruster_model())
-    inputs, z = simulated(filter_.model, 200, count=4, missing=0.2)
+@pytest.mark.parametrize("name", ["ekf", "enkf"])
+def test_estimates_are_those_of_compiled_code_over_many_steps(name):
+    filter_ = made(name, thruster_model())
+    inputs, z = simulated(filter_.model, 60, count=4, missing=0.2)
     assert_same(filters.torch(filter_).run(torch.tensor(inputs), torch.tensor(z)), run(filter_, None, inputs, z))
 
 
@@ -208,7 +209,7 @@ def test_functions_of_tensors_are_differentiated_as_traced_ones_are(name):
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", NAMES[1:])
+@pytest.mark.parametrize("name", [*NAMES[1:], "etkf"])
 def test_a_network_in_a_model_has_a_gradient(name):
     torch.manual_seed(0)
     drag, model = Drag(), wide_pendulum(start=0.5, spread=0.2)
@@ -230,14 +231,14 @@ def test_a_network_in_a_model_has_a_gradient(name):
         assert float(weights.grad[at]) == pytest.approx(float(sides[0] - sides[1]) / 2e-5, rel=1e-6)
 
 
-def test_a_belief_that_is_lost_becomes_the_prior():
-    for name in ("ekf", "ukf", "kf-steady", "ekf-robust", "sage-husa", "vb"):
-        filter_, inputs, z = diverging(name)
-        with interpreted(), np.errstate(all="ignore"):
-            expected = run(filter_, None, inputs, z)
-        found = filters.torch(filter_).run(inputs, z)
-        assert found.divergences.tolist() == expected.divergences.tolist() != [0]
-        assert_same(found, expected)
+@pytest.mark.parametrize("name", ["ekf", "ukf", "kf-steady", "ekf-robust", "sage-husa", "vb", *ENSEMBLES])
+def test_a_belief_that_is_lost_becomes_the_prior(name):
+    filter_, inputs, z = diverging(name.split()[0])
+    with interpreted(), np.errstate(all="ignore"):
+        expected = run(filter_, None, inputs, z)
+    found = filters.torch(filter_).run(inputs, z)
+    assert found.divergences.tolist() == expected.divergences.tolist() != [0]
+    assert_same(found, expected)
 
 
 @pytest.mark.usefixtures("as_python")
@@ -269,20 +270,17 @@ def test_a_state_that_is_known_has_a_root():
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", [*NAMES[1:], "ekf-robust", "sage-husa", "vb"])
+@pytest.mark.parametrize("name", [*NAMES[1:], "ekf-robust", "sage-husa", "vb", *ENSEMBLES])
 def test_single_precision_and_devices(name):
-    for model in (wide_pendulum(), thruster_model()):  # which begins at rest, where a constant of 1e-200 matters
+    at_rest = () if name in ENSEMBLES else (thruster_model(),)  # where a constant of 1e-200 matters
+    for model in (wide_pendulum(), *at_rest):
         inputs, z = simulated(model, 20, count=3, missing=0.3)
-        check_single_precision(name, model, inputs, z)
-
-
-def check_single_precision(name, model, inputs, z):
-    single = filters.torch(made(name, model), dtype=torch.float32, device="cpu").run(inputs, z)
-    double = filters.torch(made(name, model), device=torch.device("cpu")).run(inputs, z)
-    assert {one.dtype for one in single[:5]} == {torch.float32} and single.means.device.type == "cpu"
-    assert_same([one.double() for one in single[:5]], [one.numpy() for one in double[:5]], 1e-3)
-    assert not single.divergences.any()
-    assert float((single.means.double() - double.means).abs().max()) > 1e-9
+        single = filters.torch(made(name, model), dtype=torch.float32, device="cpu").run(inputs, z)
+        double = filters.torch(made(name, model), device=torch.device("cpu")).run(inputs, z)
+        assert {one.dtype for one in single[:5]} == {torch.float32} and single.means.device.type == "cpu"
+        assert_same([one.double() for one in single[:5]], [one.numpy() for one in double[:5]], 1e-3)
+        assert not single.divergences.any()
+        assert float((single.means.double() - double.means).abs().max()) > 1e-9
 
 
 @pytest.mark.usefixtures("as_python")

@@ -13,12 +13,10 @@ from filters.ensembles.ensemble import EnsembleFilter
 from filters.registry import FILTERS
 from tests.filters.test_c import ENSEMBLES, made
 from tests.filters.test_ensemble_pages import PartlyFilter
-from tests.filters.test_filter_paths import diverging
 from tests.filters.test_pages import wide_pendulum
 from tests.filters.test_tensors import Drag, assert_same, one_thread  # noqa: F401 - a fixture
 from tests.models import lonely_model, random_affine, scalar_model, simulated, wide_model
 from tests.slow import slow_but
-from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 
 MODELS = {
@@ -45,12 +43,6 @@ def test_estimates_are_those_of_run(name, which):
     assert_same(filters.torch(filter_).run(inputs, z), run(filter_, None, inputs, z))
     keys = episode_keys([5, 6, 7])
     assert_same(filters.torch(filter_).run(inputs, z, keys), run(filter_, keys, inputs, z))
-
-
-def test_estimates_are_those_of_compiled_code_over_many_steps():
-    filter_ = make_filter("enkf", thruster_model(), ensemble_size=50)
-    inputs, z = simulated(filter_.model, 60, count=4, missing=0.2)
-    assert_same(filters.torch(filter_).run(torch.tensor(inputs), torch.tensor(z)), run(filter_, None, inputs, z))
 
 
 @pytest.mark.usefixtures("as_python")
@@ -140,49 +132,6 @@ def test_own_parameters_as_tensors_are_those_of_the_filter():
     assert_same(filters.torch(user).run(inputs, z), run(user, None, inputs, z))
     with pytest.raises(ValueError, match="a number of a filter must be one of process_noise_cov, .*inflation"):
         changed.replace(ensemble_size=3)
-
-
-@pytest.mark.usefixtures("as_python")
-def test_a_network_in_a_model_has_a_gradient():
-    torch.manual_seed(0)
-    drag, model = Drag(), wide_pendulum(start=0.5, spread=0.2)
-    inputs, z = simulated(model, 4, count=2, level=0.3)
-    learning = filters.torch(made("etkf", model), transition=drag)
-
-    def score():
-        return learning.run(inputs, z).log_likelihoods.sum()
-
-    score().backward()
-    weights, at = drag.layers[0].weight, (2, 1)
-    with torch.no_grad():
-        sides = []
-        for step in (1e-5, -2e-5):
-            weights[at] += step
-            sides.append(score())
-    assert float(weights.grad[at]) == pytest.approx(float(sides[0] - sides[1]) / 2e-5, rel=1e-6)
-
-
-@pytest.mark.parametrize("name", ENSEMBLES)
-def test_a_belief_that_is_lost_becomes_the_prior(name):
-    filter_, inputs, z = diverging(name.split()[0])
-    with interpreted(), np.errstate(all="ignore"):
-        expected = run(filter_, None, inputs, z)
-    found = filters.torch(filter_).run(inputs, z)
-    assert found.divergences.tolist() == expected.divergences.tolist() != [0]
-    assert_same(found, expected)
-
-
-@pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", ENSEMBLES)
-def test_single_precision(name):
-    inputs, z = simulated(wide_pendulum(), 20, count=3, missing=0.3)
-    single, double = (
-        filters.torch(made(name, wide_pendulum()), dtype=dtype).run(inputs, z)
-        for dtype in (torch.float32, torch.float64)
-    )
-    assert {one.dtype for one in single[:5]} == {torch.float32} and not single.divergences.any()
-    assert_same([one.double() for one in single[:5]], [one.numpy() for one in double[:5]], 1e-3)
-    assert float((single.means.double() - double.means).abs().max()) > 1e-9
 
 
 @pytest.mark.usefixtures("as_python")

@@ -4,25 +4,9 @@ import numpy as np
 import pytest
 
 from filters import make_filter, run
-from filters.registry import FILTERS
-from tests.models import random_affine, scalar_model, simulated, wide_model
-from thruster_env.thruster.model import thruster_model
+from tests.models import random_affine, scalar_model, simulated
 
 NO_MORE = {"fading": {"fading": 1.0}, "h-infinity": {"theta": 1e-12}, "schmidt": {}}
-
-
-@pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", NO_MORE)
-@pytest.mark.parametrize("make", [thruster_model, wide_model])
-def test_without_its_number_each_is_the_extended_filter(name, make):
-    model = make()
-    inputs, z = simulated(model, 40, missing=0.2)
-    found, expected = (
-        run(make_filter(name, model, **NO_MORE[name]), None, inputs, z),
-        run(make_filter("ekf", model), None, inputs, z),
-    )
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-9)
 
 
 def naive(model, inputs, z, correct, fading=1.0):
@@ -115,18 +99,3 @@ def test_a_bound_that_nothing_keeps_is_a_divergence():
     filter_ = make_filter("h-infinity", model, theta=100.0, scale=[0.1])
     belief, _ = filter_.update(filter_.predict(filter_.init(), [0.0]), [0.0])
     assert belief.divergences == 1
-
-
-@pytest.mark.parametrize(
-    ("name", "numbers", "rule"),
-    [
-        ("fading", {"fading": 0.9}, "fading must be"),
-        ("h-infinity", {"theta": 0.0}, "theta must be positive"),
-        ("h-infinity", {"scale": [1.0, 0.0]}, "scale must be positive"),
-        ("schmidt", {"considered": [2]}, "considered must be"),
-        ("schmidt", {"considered": "last"}, "considered must be a list of indices, but got"),
-    ],
-)
-def test_what_is_refused(name, numbers, rule):
-    with pytest.raises(ValueError, match=rule):
-        FILTERS[name](model=thruster_model(), **numbers)
