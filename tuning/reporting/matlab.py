@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from thruster_env.core.files import read_toml
 from thruster_env.graphs.graphs import COMPARISONS, UNARY, Graph, Number, needed_by
 from thruster_env.model.affine import AffineModel
 from thruster_env.model.shape import constants_form
@@ -47,11 +48,6 @@ EXPRESSIONS = {
     "where": "choose({}, {}, {})",
 }
 """What MATLAB has for the operations of graphs."""
-CHOOSE = """
-function y = choose(condition, a, b)
-if condition, y = a; else, y = b; end
-end
-"""
 
 
 def lines_of(function: Callable, arguments: Sequence[Sequence[str]], constants: Any, count: int) -> list[str]:
@@ -93,81 +89,8 @@ def _known(number: Number) -> str:
 
 STEPPED = ("kf", "ekf")  # of which there is a step
 LONGEST = 1500  # lines of f or h
-HEAD = """function [x, P, e, S] = {name}(x, P, z, u)
-%{shout}  The {filter} filter tuned on {problem}, model, Q and R included.
-%   m = {name}() gives the model: m.f(x, u), m.h(x), m.Q, m.R, m.x0, m.P0{more}.
-%   Covariances are per step and do not scale with dt.
-%   States: {states}
-%   Inputs: {inputs}
-%   Measurements: {measurements}
-"""
-STEP = """%   [x, P, e, S] = {name}(x, P, z, u) updates with what was measured (NaN: missing), z, which gives the
-%   estimate that x and P hold after it, the innovation e and its covariance S, and where u is given it then
-%   predicts over one step. Begin with x = m.x0, P = m.P0.
-%
-%   m = {name}(); x = m.x0; P = m.P0;
-%   for k = 1:size(z, 2)
-%       [x, P, e, S] = {name}(x, P, z(:, k));
-%       estimate(:, k) = x;
-%       if k < size(z, 2), [x, P] = {name}(x, P, [], u(:, k)); end
-%   end
-"""
-TOOLBOX = """%   With MATLAB's toolboxes, here as an unscented Kalman filter:
-%   o = unscentedKalmanFilter(m.f, m.h, m.x0, 'StateCovariance', m.P0, ...
-%       'ProcessNoise', m.Q, 'MeasurementNoise', m.R);
-%   for k = 1:size(z, 2), estimate(:, k) = correct(o, z(:, k)); predict(o, u(:, k)); end
-"""
-UPDATE = """
-e = []; S = [];
-if ~isempty(z)
-    there = ~isnan(z(:));
-    e = z(:) - m.h(x);{wrap}
-    H = slopes(m.h, x);
-    S = H * P * H' + m.R;
-    S = (S + S') / 2;
-    if any(there)
-        K = P * H(there, :)' / S(there, there);
-        x = x + K * e(there);
-        I = eye(numel(x)) - K * H(there, :);
-        P = I * P * I' + K * m.R(there, there) * K';
-    end
-end
-if nargin > 3
-    F = slopes(@(y) m.f(y, u), x);
-    x = m.f(x, u);
-    P = F * P * F' + m.Q;
-    P = (P + P') / 2;
-end
-end
-
-function J = slopes(g, x)  % central differences
-J = zeros(numel(g(x)), numel(x));
-for j = 1:numel(x)
-    d = zeros(numel(x), 1);
-    d(j) = 1e-6 * max(1, abs(x(j)));
-    J(:, j) = (g(x + d) - g(x - d)) / (2 * d(j));
-end
-end
-"""
-
-FED = (  # of a model whose h takes the input: its text in place of that of others
-    (
-        "z, u) updates with what was measured (NaN: missing), z, which",
-        "z, u, before) updates with z, measured (NaN:\n%   missing) under the input until then, before, which",
-    ),
-    ("where u is given it then", "where u is not empty it then"),
-    ("(x, P, z, u)\n%{shout}", "(x, P, z, u, before)\n%{shout}"),
-    ("x = m.x0; P = m.P0;\n%   for", "x = m.x0; P = m.P0; before = zeros({inputs_count}, 1);\n%   for"),
-    ("(x, P, z(:, k));", "(x, P, z(:, k), [], before);"),
-    ("[x, P] = {name}(x, P, [], u(:, k)); end", "before = u(:, k); [x, P] = {name}(x, P, [], before); end"),
-    (
-        "correct(o, z(:, k)); predict(o, u(:, k)); end",
-        "correct(o, z(:, k), before); before = u(:, k); predict(o, before); end",
-    ),
-    ("m.h(x)", "m.h(x, before)"),
-    ("slopes(m.h, x)", "slopes(@(y) m.h(y, before), x)"),
-    ("if nargin > 3\n", "if nargin > 3 && ~isempty(u)\n"),
-)
+TEXTS = read_toml(Path(__file__).with_name("lines_to_copy.toml"), "texts of lines to copy")
+PYTHON, MATLAB = TEXTS["python"], TEXTS["matlab"]
 
 
 def matlab_function(choice: Choice, model: StateSpaceModel, problem: str, dt: float | None) -> str:
@@ -185,8 +108,8 @@ def matlab_function(choice: Choice, model: StateSpaceModel, problem: str, dt: fl
     except ValueError as error:
         pieces, fields, why = "", [], str(error)
     steps = choice.name in STEPPED and pieces and (choice.name == "ekf" or isinstance(model, AffineModel))
-    head, update = HEAD + (STEP if steps else TOOLBOX if pieces else ""), UPDATE
-    for plain, fed in FED if model.feeds else ():
+    head, update = MATLAB["head"] + (MATLAB["step" if steps else "toolbox"] if pieces else ""), MATLAB["update"]
+    for plain, fed in MATLAB["fed"] if model.feeds else ():
         head, update = head.replace(plain, fed), update.replace(plain, fed)
     text = head.format(
         name=name,
@@ -250,7 +173,7 @@ def _functions(model: StateSpaceModel) -> tuple[str, list[str]]:
     loop = f"for part = 1:{model.substeps}\n{substep}\nend\ny = x;"
     measurement = "\n".join((*h[:-1], f"z = {h[-1]};"))
     text = _written(loop, measurement, model)
-    return text + CHOOSE * ("choose(" in text), []
+    return text + MATLAB["choose"] * ("choose(" in text), []
 
 
 def _written(transition: str, measurement: str, model: StateSpaceModel) -> str:
@@ -272,23 +195,6 @@ def _listed(quantities) -> str:
     return ", ".join(quantity.label for quantity in quantities) or "none"
 
 
-ON_ENV = """from filters import EstimateState
-{problem}
-env = EstimateState(problem.make_env(), tuned={file!r})  # observations are estimates
-tuned = env.filter  # with its model, Q and R
-"""
-ON_LOG = """import tuning
-
-found = tuning.estimate("run.csv", tuned={file!r})  # of a log; the same as `thruster estimate`
-tuned = found.filter  # with its model, Q and R
-"""
-BY_HAND = """
-belief = tuned.init()
-for measurement, command in zip(measurements, inputs):  # arrays of your own, a row per step
-    belief, innovation = tuned.update(belief, measurement)
-    print(belief.mean, belief.cov)
-    belief = tuned.predict(belief, command)
-"""
 UNSAVED = "TUNED.json"  # a name to be replaced
 
 
@@ -302,8 +208,8 @@ def lines_section(choice: Choice, problem: Problem, file: str | None) -> Section
     """
     name = Path(file).name if file else UNSAVED
     model = problem.model(**choice.model)
-    lines = ON_LOG if isinstance(within(problem), LogProblem) else ON_ENV
-    python = lines.format(file=name, problem=_found_by(problem)) + BY_HAND
+    lines = PYTHON["on_log" if isinstance(within(problem), LogProblem) else "on_env"]
+    python = lines.format(file=name, problem=_found_by(problem)) + PYTHON["by_hand"]
     noise = {"process_noise_cov": model.process_noise_cov, "measurement_noise_cov": model.measurement_noise_cov}
     entry = {"name": choice.name, "numbers": dict(choice.numbers)}
     entry["model"] = {key: value.tolist() for key, value in noise.items()} | dict(choice.model)
