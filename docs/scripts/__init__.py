@@ -12,6 +12,7 @@ import importlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 
 from filters.consistency.nees import Interval
@@ -106,6 +107,37 @@ def digits(value: float, count: int = 3) -> str:
 def about(value: Interval, decimals: int = 3) -> str:
     """A value with half of its interval."""
     return f"{value.value:.{decimals}f} ± {(value.high - value.low) / 2:.{decimals}f}"
+
+
+def save_frame(env, path: Path) -> Path:
+    """Write what an env shows as a PNG file, and close the env."""
+    from matplotlib.image import imsave
+
+    picture = env.render()
+    env.close()
+    write_whole(path, lambda stream: imsave(stream, picture, format="png"))
+    return path
+
+
+def returns_of(env, controller, idle: Sequence[float], seed: int = 0) -> np.ndarray:
+    """The return (N,) of the first episode of each copy of a vector env, which no copy may end before its time.
+
+    Args:
+        env: with N copies.
+        controller: what acts; None for a constant action.
+        idle: that action.
+        seed: of the first copy.
+    """
+    observations, _ = env.reset(seed=seed)
+    action, state, total = np.tile(np.float32(idle), (env.num_envs, 1)), None, np.zeros(env.num_envs)
+    for _ in range(gym.spec(env.spec.id).max_episode_steps):
+        if controller is not None:
+            action, state = controller.predict(observations, state)
+        observations, rewards, terminated, *_ = env.step(action)
+        if terminated.any():
+            raise RuntimeError(f"no episode of {env.spec.id} may end early, but one did")
+        total += rewards
+    return total
 
 
 def subplots(size: tuple[float, float], *shape: int, **options):

@@ -10,14 +10,14 @@ import gymnasium as gym
 import numpy as np
 
 import thruster_env.auv  # noqa: F401 - registers the envs
-from docs.scripts import by_name, digits
+from docs.scripts import by_name, digits, returns_of, save_frame
 from docs.scripts.ranking import leaderboard
 from filters import EstimateState
 from filters.augmented import Unknown
 from filters.consistency.nees import Interval
 from thruster_env.auv.dynamics import ROTATING, angled_state
 from thruster_env.auv.paths import MANOEUVRES, DepthAndCourse
-from thruster_env.core.files import new_figure, save_figure, tidy, write_whole
+from thruster_env.core.files import new_figure, save_figure, tidy
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.env.env import ObserveStateVector
 from thruster_env.model import rotations
@@ -27,24 +27,19 @@ from tuning.plants.auv import Scenario, find_scenario
 from tuning.problems.problem import Problem
 from tuning.search.space import Choice
 
-EPISODES = 50
+EPISODES, STILL = 50, (2.845, 0.0, 0.0)  # copies of an env; its action that cruises with planes held still
 
 
 def frame(path: Path) -> Path:
     """A frame of path IV under PD on the estimate of an extended Kalman filter."""
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    from matplotlib.image import imsave
-
     env = EstimateState(gym.make("SegorogeniAUVPath-v0", path="IV", render_mode="rgb_array"), "ekf")
     controller, state = DepthAndCourse.for_env(env, "navigation"), None
     observation, _ = env.reset(seed=3)
     for _ in range(420):
         action, state = controller.predict(observation, state)
         observation, *_ = env.step(action)
-    picture = env.render()
-    env.close()
-    write_whole(path, lambda stream: imsave(stream, picture, format="png"))
-    return path
+    return save_frame(env, path)
 
 
 def loop(path: Path) -> Path:
@@ -95,26 +90,12 @@ def returns() -> str:
         env = gym.make_vec(name, EPISODES, **arguments)
         true = ObserveStateVector(gym.make_vec(name, EPISODES, **arguments))
         scores = (
-            mean_return(env, DepthAndCourse.for_env(env)),
-            mean_return(true, DepthAndCourse.for_env(true, "navigation")),
-            mean_return(env, None),
+            returns_of(env, DepthAndCourse.for_env(env), STILL).mean(),
+            returns_of(true, DepthAndCourse.for_env(true, "navigation"), STILL).mean(),
+            returns_of(env, None, STILL).mean(),
         )
         rows.append([f"path {arguments['path']}" if arguments else "depth", *(digits(score) for score in scores)])
     return markdown_table(["task", "PD on measurements", "PD on the true state", "planes still, 2.845 N"], rows)
-
-
-def mean_return(env, controller: DepthAndCourse | None) -> float:
-    """Mean return of the first episodes of all copies, which none may end before its time."""
-    observations, _ = env.reset(seed=0)
-    action, state, total = np.tile(np.float32([2.845, 0.0, 0.0]), (env.num_envs, 1)), None, 0.0
-    for _ in range(gym.spec(env.spec.id).max_episode_steps):
-        if controller is not None:
-            action, state = controller.predict(observations, state)
-        observations, rewards, terminated, *_ = env.step(action)
-        if terminated.any():
-            raise RuntimeError(f"no episode of {env.spec.id} may end early, but one did")
-        total += rewards.mean()
-    return total
 
 
 RUNS, FEW = 50, 20  # 1 kHz runs of 5 s are few: each is 5000 steps of every member

@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from docs.scripts import by_name, digits, label_grid, subplots
-from thruster_env.core.files import BLUE, DARK, RUST, SKY, legend_below, save_figure, write_whole
+from docs.scripts import by_name, digits, label_grid, returns_of, save_frame, subplots
+from thruster_env.core.files import BLUE, DARK, RUST, SKY, legend_below, save_figure
 from thruster_env.core.streams import episode_keys
 from thruster_env.core.text_tables import markdown_table
 from thruster_env.env.env import ObserveStateVector
@@ -150,13 +150,7 @@ def returns() -> str:
 
 
 def _mean_return(env, controller) -> str:
-    observations, _ = env.reset(seed=FIRST_SEED)
-    voltages, state, total = np.zeros((env.num_envs, 1), dtype=np.float32), None, 0.0
-    for _ in range(env.spec.max_episode_steps):
-        if controller is not None:
-            voltages, state = controller.predict(observations, state)
-        observations, rewards, *_ = env.step(voltages)
-        total = total + rewards
+    total = returns_of(env, controller, (0.0,), FIRST_SEED)
     return f"{total.mean():.3g} ± {1.96 * total.std(ddof=1) / len(total) ** 0.5:.2g}"
 
 
@@ -344,18 +338,13 @@ def references(path: Path) -> Path:
 
 def frame(path: Path) -> Path:
     """A frame of the reversal task; the voltage is the one that would hold the reference in the steady state."""
-    from matplotlib.image import imsave
-
     env = gym.make("BowThrusterReversal-v0", render_mode="rgb_array", ambient_velocity=0.5)
     top, full = env.unwrapped.plant.max_voltage, env.unwrapped.thrust_scale
     observation, _ = env.reset(seed=SEED)
     for _ in range(400):
         share = observation[1] / full  # the thrust grows nearly with the square of the voltage
         observation, *_ = env.step(np.array([top * math.copysign(abs(share) ** 0.5, share)], dtype=np.float32))
-    picture = env.render()
-    env.close()
-    write_whole(path, lambda stream: imsave(stream, picture, format="png"))
-    return path
+    return save_frame(env, path)
 
 
 def run(plant: Plant, voltages: np.ndarray, task: Task | None = None, seed: int = SEED) -> dict[str, np.ndarray]:

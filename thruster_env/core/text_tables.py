@@ -174,6 +174,10 @@ class Table(NamedTuple):
         below = ["", markdown_text(self.caption)] if self.caption else []
         return "\n".join([*title, *lines, *below])
 
+    def on_page(self) -> str:
+        """Heads and rows as a page of the docs has them, in Markdown that its script wrote."""
+        return markdown_table(self.columns, self.rows)
+
     def as_dict(self) -> dict[str, Any]:
         """The texts, for JSON."""
         rows = [[str(cell) for cell in row] for row in self.rows]

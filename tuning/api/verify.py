@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -183,15 +182,10 @@ def _count(stored, path: str | Path) -> int:
         ) from None
 
 
-def _numbers(value, path: str = "") -> dict[str, Any]:
+def _numbers(value: Any, path: str = "") -> dict[str, Any]:
     """All values within nested mappings and lists, by their path."""
-    return dict(_leaves(value, path))
-
-
-def _leaves(value, path: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, dict | list | tuple):
-        parts = value.items() if isinstance(value, dict) else enumerate(value)
-        for key, part in parts:
-            yield from _leaves(part, f"{path} {key}".strip())
-    else:
-        yield path, value
+    if not isinstance(value, dict | list | tuple):
+        return {path: value}
+    parts = value.items() if isinstance(value, dict) else enumerate(value)
+    by_part = [_numbers(part, f"{path} {key}".strip()) for key, part in parts]
+    return {place: leaf for leaves in by_part for place, leaf in leaves.items()}

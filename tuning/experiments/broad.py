@@ -19,7 +19,6 @@ Estimation", Data 6(7):72, doi 10.3390/data6070072; data CC BY 4.0.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -28,7 +27,7 @@ import numpy as np
 import filters
 from filters.inertial import FREE, attitude
 from filters.starts import begun_at
-from thruster_env.core.text_tables import Table, markdown_table
+from thruster_env.core.text_tables import Table
 from thruster_env.logs.recorders.arrays import arrays_of
 from thruster_env.model import rotations
 from tuning.api.identify import identify as maximum_likelihood
@@ -238,9 +237,4 @@ def reproduce(data: Annotated[Path, Option(INPUT)], identify: Annotated[bool, Op
 
 def tables_from(data: Path) -> dict[str, Callable[[], str]]:
     """The tables of docs/attitude.md by name, from BROAD's folder."""
-    tables = tables_of(rows(read_trials(data)))
-
-    def markdown(name: str) -> str:
-        return markdown_table(tables[name].columns, tables[name].rows)
-
-    return {name: partial(markdown, name) for name in tables}
+    return {name: table.on_page for name, table in tables_of(rows(read_trials(data))).items()}

@@ -21,6 +21,7 @@ import numpy as np
 from filters.consistency.nees import Interval
 from thruster_env.core.files import write_whole
 from thruster_env.core.parallel import Where, task_map
+from tuning.api.result import plain_data
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.evaluate import compute_metrics
 from tuning.evaluation.runs import metrics_of_all
@@ -77,12 +78,12 @@ class Result(NamedTuple):
     case: str
     method: str
     set: int
-    by_runs: Mapping[str, Scored]
-    by_seconds: Mapping[str, Scored]
-    last: Scored | None  # None where the method cannot run
-    taken_runs: float
-    taken_seconds: float
-    choice: Mapping[str, Any]
+    by_runs: Mapping[str, Scored] = {}
+    by_seconds: Mapping[str, Scored] = {}
+    last: Scored | None = None  # None where the method cannot run
+    taken_runs: float = 0.0
+    taken_seconds: float = 0.0
+    choice: Mapping[str, Any] = {}
     error: str = ""
 
 
@@ -135,15 +136,13 @@ def run_method(case: Case, method: str, set_index: int, protocol: Protocol) -> R
     informed = method.endswith(FROM_NOISE)
     if informed or method.endswith(WITH_FULL):
         if case.options == FULL and not informed:
-            return Result(
-                case.name, label, set_index, {}, {}, None, 0.0, 0.0, {}, "all methods have full Q and R here"
-            )
+            return Result(case.name, label, set_index, error="all methods have full Q and R here")
         method = method.removesuffix(FROM_NOISE).removesuffix(WITH_FULL)
         case = case._replace(options=FULL)
     try:
         _check(case, method, _task(case, data, set_index, Budget()))
     except ValueError as lacking:
-        return Result(case.name, label, set_index, {}, {}, None, 0.0, 0.0, {}, str(lacking))
+        return Result(case.name, label, set_index, error=str(lacking))
     if method in ALONE:  # so that nothing is left to compile
         with suppress(ValueError):
             find_method(method).run(method, _task(case, data.slice(0, 4), set_index, Budget(60, 5.0)))
@@ -164,17 +163,15 @@ def run_method(case: Case, method: str, set_index: int, protocol: Protocol) -> R
         return known[id(choice)]
 
     last = task.start if error else task.best
-    by_runs = {
-        f"{limit:g}": at(last if error else task.best_within(runs=limit))
-        for limit in RUNS
-        if limit <= protocol.runs
-    }
-    by_seconds = {
-        f"{limit:g}": at(last if error else task.best_within(seconds=limit))
-        for limit in SECONDS
-        if limit <= protocol.seconds
-    }
-    return Result(case.name, label, set_index, by_runs, by_seconds, at(last), *cost, _plain(last), error)
+
+    def by_budget(kind: str, limits: Sequence[float], most: float) -> dict[str, Scored]:
+        budgets = [limit for limit in limits if limit <= most]
+        return {f"{limit:g}": at(last if error else task.best_within(**{kind: limit})) for limit in budgets}
+
+    by_runs = by_budget("runs", RUNS, protocol.runs)
+    by_seconds = by_budget("seconds", SECONDS, protocol.seconds)
+    choice = plain_data(last._asdict())
+    return Result(case.name, label, set_index, by_runs, by_seconds, at(last), *cost, choice, error)
 
 
 def _task(case: Case, data: Data, set_index: int, budget: Budget) -> Task:
@@ -258,14 +255,8 @@ def reference(case: Case, protocol: Protocol) -> Result:
             if value < least:
                 least, choice = value, simplex.best
     found_score, seconds = scored(choice, case, protocol.held_out), time.process_time() - begin
-    return Result(case.model, REFERENCE, 0, {}, {}, found_score, 0.0, seconds, _plain(choice))
-
-
-def _plain(choice: Choice) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads(
-        json.dumps(choice._asdict(), default=lambda array: np.asarray(array).tolist())
-    )
-    return content
+    plain = plain_data(choice._asdict())
+    return Result(case.model, REFERENCE, 0, last=found_score, taken_seconds=seconds, choice=plain)
 
 
 def jobs_of(protocol: Protocol) -> Iterator[tuple[Case, str, int]]:

@@ -104,7 +104,7 @@ def what_to_use(results: Sequence[Result], protocol: Protocol) -> str:
         everywhere = set.intersection(*({regret.method for regret in each} for each in allowed)) - {SCALED}
         if not everywhere:
             continue
-        error = _cheapest(allowed, everywhere, lambda regret: math.log(regret.ratio.value), ENOUGH)
+        error = _cheapest(allowed, everywhere, _log_ratio, ENOUGH)
         proper = _cheapest(allowed, everywhere, lambda regret: _finite(regret.log_score), ENOUGH_NATS)
         cells = [[f"`{method}`", _both(allowed, method), _nees(allowed, method)] for method in (error, proper)]
         rows.append([situation.text, *cells[0], *cells[1]])
@@ -130,6 +130,10 @@ def _of(by_case: Sequence[Sequence[Regret]], method: str) -> list[Regret]:
 
 def _mean(by_case: Sequence[Sequence[Regret]], method: str, of: Callable[[Regret], float]) -> float:
     return float(np.mean([of(regret) for regret in _of(by_case, method)]))
+
+
+def _log_ratio(regret: Regret) -> float:
+    return math.log(regret.ratio.value)
 
 
 def _finite(value: float) -> float:
@@ -217,19 +221,7 @@ def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> P
         for budget in budgets:
             by_case = [regrets(results, case, within("by_runs", f"{budget:g}")) for case in cases]
             methods = dict.fromkeys(regret.method for each in by_case for regret in each)
-            points[budget] = {
-                method: float(
-                    np.mean(
-                        [
-                            math.log(regret.ratio.value)
-                            for each in by_case
-                            for regret in each
-                            if regret.method == method
-                        ]
-                    )
-                )
-                for method in methods
-            }
+            points[budget] = {method: _mean(by_case, method, _log_ratio) for method in methods}
         if not points or not points[budgets[-1]]:
             continue
         order = sorted(points[budgets[-1]], key=points[budgets[-1]].__getitem__, reverse=True)

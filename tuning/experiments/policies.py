@@ -21,6 +21,7 @@ from scipy.stats import t as student
 from filters.consistency.nees import Interval
 from thruster_env.core.files import write_whole
 from thruster_env.core.parallel import Where, one_thread, task_map
+from tuning.api.result import plain_data
 from tuning.plants.thruster import Scenario, find_scenario
 from tuning.policies.environments import make_environments
 from tuning.policies.learn import train
@@ -150,7 +151,7 @@ def _run(comparison: Comparison, noise: str, kind: str, observed: str, variant: 
         algo,
         steps=comparison.steps,
         seed=seed,
-        filter_arguments=_plain(arguments),
+        filter_arguments=plain_data(dict(arguments)),
         controller=BEST if kind in CORRECTING else None,
     )
     return Run(noise, kind, variant, setup)
@@ -174,10 +175,6 @@ def _tuned(filter_name: str, noise: str, variant: str) -> Mapping:
     plan = Plan(filter_name, (scenario,))
     study = open_study("policies", plan, None)
     return run_study(study, plan, TUNING_TRIALS).or_interrupted().choice.model
-
-
-def _plain(arguments: Mapping) -> dict:
-    return {name: np.asarray(value).tolist() for name, value in arguments.items()}
 
 
 OnRun = Callable[[Run, int, int], None]  # a finished run, number of finished runs, number of all runs

@@ -384,14 +384,16 @@ def tables_of(
     runs: Sequence[Recording], estimates: Estimates, tasks: Mapping[str, Mapping] | None = None
 ) -> dict[str, Table]:
     """All tables by name, in their order; those of structures and parameters where these were identified again."""
+    which = "the project's parameters" if tasks is None else "parameters identified without the run"
+    title, errors = f"RMSE of thrust over 0.2 s; {which}", "RMSE over 0.2 s, N: all rows / settled"
     tables = {
-        "ratios": Table("", RATIO_HEADER, ratio_rows(runs, estimates)),
-        "estimators": Table("", ["run", *estimates], baseline_rows(runs, estimates)),
-        "clocks": Table("", CLOCK_HEADER, clock_rows(runs)),
+        "ratios": Table(title, RATIO_HEADER, ratio_rows(runs, estimates)),
+        "estimators": Table(errors, ["run", *estimates], baseline_rows(runs, estimates)),
+        "clocks": Table("how far the load cell's clock is ahead", CLOCK_HEADER, clock_rows(runs)),
     }
     if tasks is not None:
-        tables["structures"] = Table("", LADDER_HEADER, ladder_rows(runs, tasks))
-        tables["numbers"] = Table("", NUMBER_HEADER, number_rows(runs, tasks))
+        tables["structures"] = Table("the contribution of each effect", LADDER_HEADER, ladder_rows(runs, tasks))
+        tables["numbers"] = Table("numbers found", NUMBER_HEADER, number_rows(runs, tasks))
     return tables
 
 
@@ -476,30 +478,19 @@ def reproduce(
             hour.
         out: with --identify: file of results; existing ones are not recomputed.
     """
-    runs = read_recordings(data)
+    runs, tasks = read_recordings(data), None
     if identify:
         check_target(out)
-    tasks = None
-    if identify:
         with progress_of("identifying", out) as progress:
             tasks = identify_all(runs, out, progress=progress)
     estimates = estimates_of(runs, tasks)
-    which = "parameters identified without the run" if identify else "the project's parameters"
-    titles = {
-        "ratios": f"RMSE of thrust over 0.2 s; {which}",
-        "estimators": "RMSE over 0.2 s, N: all rows / settled",
-        "clocks": "how far the load cell's clock is ahead",
-        "structures": "the contribution of each effect",
-        "numbers": "numbers found",
-    }
     tables = tables_of(runs, estimates, tasks)
-    output = [content._replace(title=titles[name]) for name, content in tables.items()]
     named = {
         name: [dict(zip(content.columns, row, strict=True)) for row in content.rows]
         for name, content in tables.items()
     }
     answers = sentences(estimates, runs)
-    return Printed([*output, *answers], {**named, "answers": answers})
+    return Printed([*tables.values(), *answers], {**named, "answers": answers})
 
 
 def tables_from(recordings: Path, results: Path = RESULTS) -> dict[str, Callable[[], str]]:
@@ -519,14 +510,10 @@ def tables_from(recordings: Path, results: Path = RESULTS) -> dict[str, Callable
         ]
         return markdown_table(["Q times", "log-likelihood of the tachometer", "mean NIS", "ratio, mean"], rows)
 
-    tables = {
-        name: (lambda table=table: markdown_table(table.columns, table.rows))
-        for name, table in tables_of(runs, left_out, tasks).items()
-    }
-    ratios = tables["ratios"]
+    tables = tables_of(runs, left_out, tasks)
     return {
-        **tables,
-        "ratios": lambda: "\n\n".join([ratios(), *sentences(left_out, runs)]),
+        **{name: table.on_page for name, table in tables.items()},
+        "ratios": lambda: "\n\n".join([tables["ratios"].on_page(), *sentences(left_out, runs)]),
         "regime": regime,
     }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 
 from filters.consistency.nees import Interval, interval, resampled_means
 from thruster_env.core.checks import at_least
-from thruster_env.core.text_tables import Table, markdown_table
+from thruster_env.core.text_tables import Table
 from thruster_env.logs.write import check_picture
 from tuning.api.markers import OUTPUT, WRITTEN, Option, PythonOnly, Seed
 from tuning.api.markers import RUNS as RUNS_PANEL
@@ -298,19 +298,11 @@ def results(paper: str) -> list[PathResult]:
     return run_tasks(tasks_of(paper), runs=RUNS_OF[paper])
 
 
-def _of_page(table: Callable[[], Table]) -> Callable[[], str]:
-    def markdown() -> str:
-        _, columns, rows, *_ = table()
-        return markdown_table(columns, rows)
-
-    return markdown
-
-
 FIGURES = {"auv_papers.png": lambda path: paths_figure(path, path_runs("ngatini2017"))}
 TABLES = {
-    "papers_members": _of_page(lambda: members(results("ngatini2019")[0])),
-    "papers_velocities": _of_page(lambda: velocities(results("ngatini2019")[0], omitted=NOT_ON_PAGE)),
-    "papers_paths": _of_page(lambda: paths(results("ngatini2017"))),
-    "papers_ends": _of_page(lambda: ends(results("ngatini2017"))),
-    "papers_world": _of_page(lambda: velocities(results("ngatini2017")[-1], "EKF6 level", NOT_ON_PAGE)),
+    "papers_members": lambda: members(results("ngatini2019")[0]).on_page(),
+    "papers_velocities": lambda: velocities(results("ngatini2019")[0], omitted=NOT_ON_PAGE).on_page(),
+    "papers_paths": lambda: paths(results("ngatini2017")).on_page(),
+    "papers_ends": lambda: ends(results("ngatini2017")).on_page(),
+    "papers_world": lambda: velocities(results("ngatini2017")[-1], "EKF6 level", NOT_ON_PAGE).on_page(),
 }
