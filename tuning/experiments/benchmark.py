@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from filters.consistency.nees import Interval, mean_interval
 from filters.engine.batch import run
 from filters.filter import Filter
 from thruster_env.core.checks import at_least, one_of
+from thruster_env.core.files import read_toml
 from thruster_env.core.text_tables import Table, markdown_table
 from tuning.api.markers import RUNS as RUNS_PANEL
 from tuning.api.markers import Option, PythonOnly, Seed
@@ -101,8 +103,9 @@ class Benchmark(NamedTuple):
     theirs: str  # heading of `Row.theirs`
     score: str  # the score that is compared
     source: str
-    remarks: tuple[str, ...]
+    remarks: Sequence[str]
     rows: Callable[[Sequence[int], OnRow], list[Row]]
+    published: Sequence[Published] = ()
 
     @property
     def header(self) -> list[str]:
@@ -229,3 +232,19 @@ def against_published(
         return rows
 
     return rows
+
+
+def published_benchmark(
+    name: str, problem: ModelProblem, model: Callable[..., StateSpaceModel], *more: Published
+) -> Benchmark:
+    """A benchmark of `published.toml` by name, with more published scores after those of the file.
+
+    Args:
+        name: of the benchmark.
+        problem: makes the data.
+        model: makes the filters' model from the arguments `Published.model`.
+        *more: scores.
+    """
+    entry = read_toml(Path(__file__).with_name("published.toml"), "published scores")[name]
+    published = [*(Published(**score) for score in entry.pop("published")), *more]
+    return Benchmark(name, **entry, rows=against_published(problem, model, published), published=published)

@@ -33,7 +33,7 @@ import numpy as np
 
 from filters import StateSpaceModel
 from thruster_env.core.derivatives import complex_step, runge_kutta
-from tuning.experiments.benchmark import Benchmark, Published, against_published, noise_free_problem
+from tuning.experiments.benchmark import Published, noise_free_problem, published_benchmark
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Parameter
 
@@ -117,41 +117,12 @@ def particles(size: int, width: float, threshold: float) -> dict[str, float]:
     return {"ensemble_size": size, "regularisation": width / KERNEL, "resampling_threshold": threshold}
 
 
-PUBLISHED = (
-    Published("enkf", {"ensemble_size": 10, "inflation": 1.04, "centred_perturbations": 1}, 0.65),
-    Published("enkf", {"ensemble_size": 100, "inflation": 1.01, "centred_perturbations": 1}, 0.56),
-    Published("etkf", {"ensemble_size": 10, "inflation": 1.02, "rotations": 1}, 0.60),
-    Published("etkf", {"ensemble_size": 3, "inflation": 1.30}, 0.80),
-    Published("enkf-n", {"ensemble_size": 10, "rotations": 1}, 0.54),
-    Published("enkf-n", {"ensemble_size": 3}, 0.60),
-    Published("ienkf", {"ensemble_size": 10, "inflation": 1.02, "window": 1}, 0.31),
-    Published("ekf", {}, 0.92, {"inflation": 180.0}),
+PARTICLES = (
     Published("pf", particles(100, 2.4, 0.3), 0.38),
     Published("pf", particles(800, 0.9, 0.2), 0.28),
     Published("pf", particles(4000, 0.7, 0.05), 0.27),
 )
-BENCHMARK = Benchmark(
-    name="lorenz63",
-    about="Lorenz-63: three chaotic states, all measured every 25 steps of 0.01, R = 2 I, no process noise",
-    theirs="published",
-    score="rmse.a",
-    source="P. Sakov, D. S. Oliver, L. Bertino (2012), Mon. Wea. Rev. 140, Table 1, as DAPPER quotes it",
-    remarks=(
-        "Our inflation acts on the forecast, the published one on the analysis: without process noise the two "
-        "differ by one forecast.",
-        "The EKF's inflation is a factor on its covariance per unit of time, here within the Jacobian.",
-        "The published EnKF has centred perturbations of the measurements. Independent ones have a mean of "
-        "variance R/N, which shifts the estimate: with N = 10 the mean of 64 runs is 0.81, their median 0.75.",
-        "The published iterated filter has rotations, and up to ten iterations, where ours has three.",
-        "In few runs a small ensemble loses the truth for a time, which affects the mean; published values rest "
-        "on a single run, which is more like the median. Over 64 runs of the EnKF with N = 10 the mean is "
-        "0.72, the median 0.64, the maximum 1.8; 16 runs of DAPPER's own EnKF give 0.65 +- 0.02 and 0.64.",
-        "Without process noise particles die out. The published filter spreads particles drawn more than "
-        "once by a Gaussian kernel of width 2.4, 0.9 and 0.7 times N^(-1/7); ours spreads all particles drawn by "
-        "the same kernel: regularisation 1 is the width (4/5)^(1/7) N^(-1/7).",
-    ),
-    rows=against_published(problem, model, PUBLISHED),
-)
+BENCHMARK = published_benchmark("lorenz63", problem, model, *PARTICLES)
 
 
 SPARSE_SUBSTEPS, SPARSE_BURN_IN = 12, 133  # an analysis every 0.12; again 16 units of time do not count
@@ -164,29 +135,5 @@ def sparse_model() -> StateSpaceModel:
 
 SPARSE_SETTINGS = {"first_scored_step": SPARSE_BURN_IN + 1, "dt": SPARSE_SUBSTEPS * SUBSTEP}
 sparse = noise_free_problem(sparse_model(), **SETTINGS | SPARSE_SETTINGS)
-TAILS = "theirs has no tails beyond the outermost members"
-
-SPARSE_PUBLISHED = (
-    Published("ensrf", {"ensemble_size": 20, "inflation": 1.01, "rotations": 1}, 0.87),
-    Published("enkf-n", {"ensemble_size": 20, "rotations": 1}, 0.87),
-    Published("rhf", {"ensemble_size": 50, "inflation": 1.10}, 1.28, why=TAILS),
-    Published("rhf", {"ensemble_size": 50, "rotations": 1}, 0.94, why=f"{TAILS}, and deflates by 0.95"),
-    Published("rhf", {"ensemble_size": 20, "rotations": 1}, 1.07, why=f"{TAILS}, and deflates by 0.95"),
-)
-SPARSE = Benchmark(
-    name="lorenz63-sparse",
-    about="Lorenz-63 measured half as often and four times as poorly: every 12 steps of 0.01, R = 8 I",
-    theirs="published",
-    score="rmse.a",
-    source="J. L. Anderson (2010), Mon. Wea. Rev. 138, figure 10, as DAPPER quotes it",
-    remarks=(
-        "DAPPER's rank histogram filter is a sketch of Anderson's, as its authors say: there members stay between "
-        "the outermost ones. Its scores need a deflation by 0.95, with which some of our runs lose the truth. "
-        "With inflation 1.1 four runs of it have 1.41, and 0.93 once it moves members as Anderson's does, tails "
-        "included.",
-    ),
-    rows=against_published(sparse, sparse_model, SPARSE_PUBLISHED),
-)
-
-
+SPARSE = published_benchmark("lorenz63-sparse", sparse, sparse_model)
 TABLES = {"lorenz63": BENCHMARK.markdown, "lorenz63_sparse": SPARSE.markdown}

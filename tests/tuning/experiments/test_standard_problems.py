@@ -127,14 +127,14 @@ def row_of_page(table, first_cells):
 
 
 # A cheap row of each table. States are chaotic, so that rounding of another machine moves single runs.
-DENSE = lorenz63.problem, lorenz63.model, lorenz63.PUBLISHED
-SPARSE = lorenz63.sparse, lorenz63.sparse_model, lorenz63.SPARSE_PUBLISHED
+DENSE = lorenz63.problem, lorenz63.model, lorenz63.BENCHMARK.published
+SPARSE = lorenz63.sparse, lorenz63.sparse_model, lorenz63.SPARSE.published
 OF_PAGE = {
     "lorenz63": (DENSE, "etkf, N = 3, inflation 1.3"),
     "lorenz63, particles": (DENSE, "pf, N = 100, regularisation 2.48, threshold 0.3"),
     "lorenz63_sparse": (SPARSE, "ensrf, N = 20, inflation 1.01, rotations"),
     "lorenz96": (
-        (lorenz96.problem, lorenz96.model, lorenz96.PUBLISHED),
+        (lorenz96.problem, lorenz96.model, lorenz96.BENCHMARK.published),
         "letkf, N = 7, radius 4, inflation 1.04, rotations",
     ),
 }
