@@ -30,6 +30,7 @@ import numpy as np
 
 from thruster_env.core.angles import wrapped
 from thruster_env.logs.columns import converted, parted
+from thruster_env.logs.digits import refuse_clock_digits, seconds_in_digits, seconds_of_dates
 
 SAME_STAMP = 1e-9  # of a sample time: two stamps that are no further apart are one
 ROUNDING = 1e-6  # of a sample time: so much longer it is still one step
@@ -320,8 +321,20 @@ def unit_of(stamps: np.ndarray, header: str, where: str) -> tuple[str, str]:
 
 
 def in_seconds(stamps: np.ndarray, unit: str | None, header: str, where: str) -> tuple[np.ndarray, str]:
-    """Stamps (rows,) of a column in a unit, None for what `unit_of` finds; and what that took, in words."""
+    """Stamps (rows,) of a column in a unit, and what was taken for the unit, in words.
+
+    Without a unit they may be dates in digits (20260501), years or days in a column of dates, or what `unit_of`
+    finds.
+    """
     assumption = ""
     if unit is None:
-        unit, assumption = unit_of(stamps, parted(header.rpartition(".")[2])[0], where)
+        base = parted(header.rpartition(".")[2])[0]
+        dates = seconds_in_digits(stamps)
+        if dates is not None:
+            return dates[0], f"times in {where} are taken as dates such as {dates[1]}"
+        refuse_clock_digits(stamps, where)
+        of_dates = seconds_of_dates(stamps, base, where)
+        if of_dates is not None:
+            return of_dates
+        unit, assumption = unit_of(stamps, base, where)
     return converted(stamps, unit, SECOND, where), assumption
