@@ -142,40 +142,8 @@ class Words(NamedTuple):
     fails: str
 
 
-WORDS_TEXT = """
-kf | affine f and h, or nearly so around an operating point | mean, P | 1 | away from that point
-kf-steady | the same, and gaps are rare | mean; P is for reports | 1 | as `kf`; start-up
-ekf | f and h nearly linear within P | mean, P | 1 | h nonlinear within P: badly overconfident
-iekf | f nearly linear; one mode | mean, P | 1 | two modes; full steps may overshoot
-ukf | belief nearly Gaussian | mean, P | 2 | strong nonlinearity: the gain is that of a wide average
-ckf | belief nearly Gaussian | mean, P | 1 | as `ukf`
-mhe | one mode | L steps, mean, P | 100 | two modes
-fading | f and h nearly linear; the model drifts | mean, P | 1 | a model that is right: it forgets too soon
-h-infinity | bounded noise of any kind | mean, P | 1 | random noise: larger errors than `ekf`
-schmidt | some states are better not corrected | mean, P | 1 | as `ekf`
-enkf | belief nearly Gaussian | N members | 30 | small N: overconfident; sampling noise
-etkf | belief nearly Gaussian | N members | 30 | small N: overconfident
-letkf | as `etkf`; what is far is not correlated | N members | 30 | a radius too small or too large
-ensrf | belief nearly Gaussian | N members | 20 | small N: overconfident
-denkf | good models, poor measurements | N members | 30 | accurate sensors: P too wide
-ienkf | one mode | N members | 30 | two modes; large N at strong nonlinearity
-enkf-n | as `etkf`; N is small | N members | 30 | a wrong model, taken for sampling error
-rhf | states follow what is measured linearly | N members | 60 | few members; many channels: slow
-pf | none on shape | N weighted particles | 400 | few particles: one takes all the weight
-apf | none on shape | N weighted particles | 600 | as `pf`, later
-rbpf | linear where the sampled states are known | N weighted Gaussians | 200 | few particles; others nonlinear
-gsf | h nonlinear in one component of the state | mean, P between updates | 20 | nonlinearity in others
-imm | one of K models at a time | K means and P, probabilities | 3 | a mode that no model has
-mmae | one of K models, always | K means and P, probabilities | 4 | a plant that switches
-fuzzy | the state stays within a narrow range | mean, P of 2^n rules | 3 | a wide range
-sage-husa | R (and Q) unknown, steady | mean, P, R, Q | 3 | where `ekf` fails: takes nonlinearity for noise
-vb | R unknown, steady | mean, P, distribution of R | 5 | R that changes faster than it forgets
-ekf-robust | heavy-tailed v | mean, P, last weight | 5 | a noisy sensor looks like many outliers
-open-loop | a perfect model | a point | 2 | any disturbance or wrong parameter
-low-pass | slow signals | a point | 60 | transients: it lags
-inversion | h solvable for one component | a point | 70 | noise, most where h is flat
-"""
-WORDS = {name: Words(*cells) for name, *cells in (line.split(" | ") for line in WORDS_TEXT.strip().splitlines())}
+WORDS_TEXT = Path(__file__).with_suffix(".txt").read_text(encoding="utf-8")
+WORDS = {name: Words(*cells) for name, *cells in (line.split(" | ") for line in WORDS_TEXT.splitlines()[1:])}
 
 
 def kinds() -> str:
