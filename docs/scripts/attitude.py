@@ -108,16 +108,10 @@ def heave_in_seas() -> str:
         model = model_of(height, period)
         parts = [errors(model, sea(height, period, peak, seed)) for seed in range(SEEDS)]
         rms = {key: np.sqrt(np.mean([part[key] ** 2 for part in parts])) for key in parts[0]}
-        rows.append(
-            [
-                f"{name}, {height:g} m, {period:g} s",
-                f"{100.0 * rms['heave'] / height:.2f} %",
-                f"{100.0 * rms['heave']:.1f} cm",
-                f"{100.0 * rms['stated']:.1f} cm",
-                f"{rms['roll']:.2f} deg",
-                f"{rms['pitch']:.2f} deg",
-            ]
-        )
+        lengths = [f"{100.0 * rms[what]:.1f} cm" for what in ("heave", "stated")]
+        angles = [f"{rms[what]:.2f} deg" for what in ("roll", "pitch")]
+        share = f"{100.0 * rms['heave'] / height:.2f} %"
+        rows.append([f"{name}, {height:g} m, {period:g} s", share, *lengths, *angles])
     return markdown_table(["sea, H_s, T", "heave, of H_s", "heave", "stated", "roll", "pitch"], rows)
 
 

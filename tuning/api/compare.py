@@ -21,7 +21,7 @@ from thruster_env.core.files import panels
 from thruster_env.core.parallel import task_map
 from thruster_env.core.text_tables import TITLE, Table, verbatim
 from tuning.api.evaluate import NOMINAL
-from tuning.api.held_out import cells_of
+from tuning.api.held_out import cells_of, cells_of_interval
 from tuning.api.markers import (
     FILTER,
     INPUT,
@@ -124,14 +124,14 @@ class FilterComparison(Result):
         columns["filter"] = [row.label for _, row in pairs]
         cells: list[dict[str, Any]] = []
         for board, row in pairs:
-            ratio, gain = row.score_ratio, row.likelihood_gain
-            cells.append(cells_of(row.evaluation))
-            cells[-1] |= {"score over first": ratio.value, "score over first low": ratio.low}
-            cells[-1] |= {"score over first high": ratio.high, "log-likelihood less first": gain.value}
-            cells[-1] |= {"median NEES": row.evaluation.median_nees, "us/step": row.microseconds}
+            verdict = "" if row is board.rows[0] else row.verdict  # the first is compared with itself
+            cells.append(cells_of(row.evaluation) | cells_of_interval("score over first", row.score_ratio))
+            cells[-1] |= {"log-likelihood less first": row.likelihood_gain.value}
             cells[-1] |= {
-                "verdict": "" if row is board.rows[0] else row.verdict
-            }  # the first is compared with itself
+                "median NEES": row.evaluation.median_nees,
+                "us/step": row.microseconds,
+                "verdict": verdict,
+            }
         for name in dict.fromkeys(name for values in cells for name in values):
             columns[name] = [values.get(name, np.nan) for values in cells]
         return frame(columns)

@@ -308,16 +308,18 @@ def _of_squares(check: SquaresCheck) -> dict[str, Any]:
 
 def cells_of(evaluation: Evaluation) -> dict[str, float]:
     """The results of an evaluation by column names."""
-    cells: dict[str, float] = {}
-    errors = [(state.short_label, rmse) for state, rmse in zip(evaluation.states, evaluation.rmse, strict=True)]
-    errors += [(evaluation.outputs[symbol].short_label, rmse) for symbol, rmse in evaluation.output_rmse.items()]
-    for label, rmse in errors:
-        cells |= {f"RMSE {label}": rmse.value, f"RMSE {label} low": rmse.low, f"RMSE {label} high": rmse.high}
-    for name, value in (
-        ("score", evaluation.score),
-        ("log score", evaluation.log_score),
-        ("NEES", evaluation.nees),
-        ("NIS", evaluation.nis),
-    ):
-        cells |= {name: value.value, f"{name} low": value.low, f"{name} high": value.high}
+    pairs = zip(evaluation.states, evaluation.rmse, strict=True)
+    intervals = {f"RMSE {state.short_label}": rmse for state, rmse in pairs}
+    for symbol, rmse in evaluation.output_rmse.items():
+        intervals[f"RMSE {evaluation.outputs[symbol].short_label}"] = rmse
+    intervals |= {"score": evaluation.score, "log score": evaluation.log_score}
+    intervals |= {"NEES": evaluation.nees, "NIS": evaluation.nis}
+    cells = {
+        key: value for name, part in intervals.items() for key, value in cells_of_interval(name, part).items()
+    }
     return cells | {"log-likelihood": evaluation.log_likelihood, "restarts": evaluation.divergences}
+
+
+def cells_of_interval(name: str, value: Interval) -> dict[str, float]:
+    """A value and its ends by column names."""
+    return {name: value.value, f"{name} low": value.low, f"{name} high": value.high}

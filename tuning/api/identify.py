@@ -269,15 +269,8 @@ def with_ranges(
             )
         if not low <= at <= high:
             raise ValueError(f"the start of {parameter.name} must be within {low:g} and {high:g}, but got {at:g}")
-        parameters.append(
-            replace(
-                parameter,
-                low=low,
-                high=high,
-                log=low > 0 and (parameter.log or parameter.name in ranges),
-                default=at,
-            )
-        )
+        is_log = low > 0 and (parameter.log or parameter.name in ranges)
+        parameters.append(replace(parameter, low=low, high=high, log=is_log, default=at))
     return tuple(parameters)
 
 

@@ -188,4 +188,4 @@ def _numbers(value: Any, path: str = "") -> dict[str, Any]:
         return {path: value}
     parts = value.items() if isinstance(value, dict) else enumerate(value)
     by_part = [_numbers(part, f"{path} {key}".strip()) for key, part in parts]
-    return {place: leaf for leaves in by_part for place, leaf in leaves.items()}
+    return {name: leaf for leaves in by_part for name, leaf in leaves.items()}

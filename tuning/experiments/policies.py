@@ -42,11 +42,7 @@ BEST = "mpc"  # the best known controller: on the true state the end of "gap clo
 CORRECTING = {"ppo+mpc": "ppo", "sac+mpc": "sac"}  # policies that correct it, and their algorithm
 OF_MEDIUM = {"sac": ("ekf", "true"), "ppo+mpc": ("true",), "sac+mpc": ("ekf", "true")}  # at medium noise only
 VARIANT_NOISE = "medium"
-WRONG = {
-    "wrong model": "mismatch",
-    "dead band": "deadband",
-    "unknown flow": "ambient",
-}  # and the scenario it is of
+WRONG = {"wrong model": "mismatch", "dead band": "deadband", "unknown flow": "ambient"}  # with the scenario
 VARIANTS = (
     ("ekf", "untuned"),
     ("ekf", "tuned"),

@@ -412,18 +412,9 @@ def published_table(name: str, case: str, results: list[Finding]) -> Table:
     """A paper's values on one case beside ours."""
     rows = []
     for f in results:
-        free = f.from_unupdated is not None
-        rows.append(
-            [
-                f"{f.q:g}",
-                "EnKF" if f.filter == "enkf" else "KF",
-                _lines(f.published[:2]),
-                _lines(f.ours.rmse),
-                _distances(f.optimum, f.from_optimum),
-                _distances(f.unupdated.rmse, f.from_unupdated) if free else "",
-                f.why,
-            ]
-        )
+        values = _lines(f.published[:2]), _lines(f.ours.rmse), _distances(f.optimum, f.from_optimum)
+        free = "" if f.from_unupdated is None else _distances(f.unupdated.rmse, f.from_unupdated)
+        rows.append([f"{f.q:g}", "EnKF" if f.filter == "enkf" else "KF", *values, free, f.why])
     why = "why they differ"
     columns = ["q", "filter", "published", "ours", "optimum (sd)", "un-updated ensemble (sd)", why]
     caption = (

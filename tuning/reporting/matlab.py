@@ -135,15 +135,8 @@ def matlab_function(choice: Choice, model: StateSpaceModel, problem: str, dt: fl
     text += "\n".join(lines) + "\nif nargin == 0, x = m; return; end\n"
     turns = [j + 1 for j, channel in enumerate(model.measurements) if channel.angle]
     wrap = f"\n    e({turns}) = mod(e({turns}) + pi, 2 * pi) - pi;  % the short way round" if turns else ""
-    return (
-        text
-        + (
-            update.replace("{wrap}", wrap)
-            if steps
-            else "error('the step of this filter is not written out');\nend\n"
-        )
-        + pieces
-    )
+    refused = "error('the step of this filter is not written out');\nend\n"
+    return text + (update.replace("{wrap}", wrap) if steps else refused) + pieces
 
 
 def function_name(*parts: str) -> str:

@@ -321,15 +321,8 @@ def _rows(name: str, matrix, quantities: Sequence[Quantity]) -> list[list[str]]:
     for i, quantity in enumerate(quantities):
         unit = f" {quantity.unit}" if quantity.unit else ""
         square = f" ({quantity.unit})²" if set("/ ^") & set(quantity.unit) else f"{unit}²" if unit else ""
-        deviation = sqrt(max(matrix[i, i], 0.0))
-        rows.append(
-            [
-                index_pairs(f"{name}{i + 1}{i + 1}"),
-                quantity.text_symbol,
-                f"{matrix[i, i]:.4g}{square}",
-                f"{deviation:.4g}{unit}",
-            ]
-        )
+        label, deviation = index_pairs(f"{name}{i + 1}{i + 1}"), sqrt(max(matrix[i, i], 0.0))
+        rows.append([label, quantity.text_symbol, f"{matrix[i, i]:.4g}{square}", f"{deviation:.4g}{unit}"])
     return rows
 
 
@@ -360,10 +353,7 @@ def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
         *([["budget", f"{plan.budget:g} µs a step of one core"]] if plan.budget is not None else []),
         ["scenarios" if len(about) > 1 else "scenario", "; ".join(about)],
         ["minimised", "; ".join(f"{name}: {find_objective(name).about}" for name in plan.objectives)],
-        [
-            "mean NIS",
-            _nis_words(nis, plan) if plan.is_constrained else "free",
-        ],
+        ["mean NIS", _nis_words(nis, plan) if plan.is_constrained else "free"],
         ["sampler", plan.sampler],
         *([["ranges", range_words(plan)]] if range_words(plan) else []),
         [f"training {word}", "; ".join(f"{seeds[0]} to {seeds[-1]}" for seeds in trained)],
@@ -484,15 +474,8 @@ def draw_slices(trials: Sequence[FrozenTrial], label: str, objective: str = SCOR
     faces = [BLUE if is_consistent(trial) else "white" for trial in done]
     for axis, name in zip(axes, names, strict=True):
         tried = [trial.params[name] for trial in done]
-        axis.scatter(
-            tried,
-            [reported(objective, value) for value in values],
-            s=16,
-            facecolors=faces,
-            edgecolors=BLUE,
-            linewidths=0.8,
-            alpha=0.7,
-        )
+        circles = {"s": 16, "facecolors": faces, "edgecolors": BLUE, "linewidths": 0.8, "alpha": 0.7}
+        axis.scatter(tried, [reported(objective, value) for value in values], **circles)
         crosses = [trial.params[name] for trial, _ in early], [reported(objective, value) for _, value in early]
         axis.plot(*crosses, "x", **CROSS)
         axis.axvline(best.params[name], color=RUST, linestyle="--", linewidth=1)
@@ -520,15 +503,8 @@ def draw_front(
     best = np.array(sorted(trial.values for trial in front))
     signs = np.array([reported(name, 1.0) for name in objectives])
     axis.plot(*(signs * done).T, "o", color=GREY, markersize=4, label="trial")
-    axis.plot(
-        *(signs * best).T,
-        "o-",
-        color=BLUE,
-        markersize=6,
-        linewidth=1,
-        drawstyle="steps-post",
-        label="Pareto front",
-    )
+    steps = {"color": BLUE, "markersize": 6, "linewidth": 1, "drawstyle": "steps-post"}
+    axis.plot(*(signs * best).T, "o-", label="Pareto front", **steps)
     axis.plot(*(signs * best[0]), "s", color=RUST, markersize=8, label="best in the first objective")
     for axis_name, column in (("x", 0), ("y", 1)):
         low, high = best[:, column].min(), best[:, column].max()

@@ -144,15 +144,10 @@ def without(columns: Sequence[str], rows: Sequence[Sequence[str]], head: str) ->
 
 def _innovations_table(evaluations: Mapping[str, Evaluation], where: str) -> Table:
     first = next(iter(evaluations.values()))
-    rows = [
-        [
-            name,
-            unless_blank(evaluation.log_likelihood, ".2f"),
-            consistency_cells(evaluation)[1],
-            str(evaluation.divergences),
-        ]
-        for name, evaluation in evaluations.items()
-    ]
+    rows = []
+    for name, evaluation in evaluations.items():
+        likelihood, nis = unless_blank(evaluation.log_likelihood, ".2f"), consistency_cells(evaluation)[1]
+        rows.append([name, likelihood, nis, str(evaluation.divergences)])
     caption = f"log L: of a run, higher is better. Ideal: NIS {right_nis(first)}. div.: restarts."
     return Table(f"Innovations on {where}", ["filter", "log L", "NIS", "div."], rows, caption=caption)
 

@@ -228,14 +228,8 @@ def _rows(
     """Each state above its error; without truth all states, then the innovations of the channels."""
     rows = []
     for i in indices:
-        rows.append(
-            Row(
-                TALL,
-                axis_label(states[i]),
-                partial(_values, i=i, angle=states[i].angle),
-                partial(_limit_values, i=i),
-            )
-        )
+        draw = partial(_values, i=i, angle=states[i].angle)
+        rows.append(Row(TALL, axis_label(states[i]), draw, partial(_limit_values, i=i)))
         if has_truth:
             label = axis_label(Quantity("error", "error", states[i].unit))
             rows.append(Row(LOW, label, partial(_error, i=i), partial(_limit_errors, i=i)))
@@ -550,9 +544,8 @@ def sections_over_time(
         caption = (
             f"Innovations on {where}, each in the 95 % band that the filter expects, before and after. {AXES}"
         )
-        picture = book.picture(
-            draw_innovations(filters, data, 0, dt), caption, of_estimates(filters, without, 0, dt)
-        )
+        alt = of_estimates(filters, without, 0, dt)
+        picture = book.picture(draw_innovations(filters, data, 0, dt), caption, alt)
         sections.append(Section("Innovations", [picture]))
     if not is_array(model.n, model.m):
         sections.append(_gain_section(book, filters, data, dt, scored, where))
@@ -577,7 +570,6 @@ def _gain_section(book: Sketchbook, pair, data, dt, scored, where: str) -> Secti
         "is computed from the covariance after the update, K = P H' inv(R), with H at the estimate. Each "
         "panel has its own axis."
     )
-    picture = book.picture(
-        draw_gains(pair, data, 0, dt, scored), caption, f"Gain over time. {'. '.join(described)}."
-    )
+    alt = f"Gain over time. {'. '.join(described)}."
+    picture = book.picture(draw_gains(pair, data, 0, dt, scored), caption, alt)
     return Section("Gain over time", [picture])
