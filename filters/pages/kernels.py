@@ -215,11 +215,14 @@ def programs_of(
 
 @uncollected()
 def works_of(*stages: Stage) -> list[Callable]:
-    """Stages without a model as functions (rows, given, numbers): programs, or calls where these are too long."""
-    try:
-        return [callable_of(as_programs(stage, 0, MOST).values, 1, OF_STEPS) for stage in stages]
-    except TypeError:
-        return [as_calls(stage, 0, {}, {}, OF_STEPS).values for stage in stages]
+    """Stages without a model as functions (rows, given, numbers): a program each, or calls if that is too long."""
+    works = []
+    for stage in stages:
+        try:
+            works.append(callable_of(as_programs(stage, 0, MOST).values, 1, OF_STEPS))
+        except TypeError:  # `TooLarge`
+            works.append(as_calls(stage, 0, {}, {}, OF_STEPS).values)
+    return works
 
 
 def _memory_and_model(

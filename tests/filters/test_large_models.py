@@ -165,6 +165,16 @@ def test_an_ensemble_of_a_large_model_is_updated_by_the_moments_of_its_members(n
     np.testing.assert_allclose(after.cov, expected, rtol=1e-6, atol=1e-7)
 
 
+def test_rules_of_a_large_affine_model_are_all_its_kalman_filter():
+    model, z = linear(40, 40), np.linspace(-1.0, 1.0, 40)
+    fuzzy, kf = make_filter("fuzzy", model, premises=[0, 5]), make_filter("kf", model)
+    after, innovation = fuzzy.update(fuzzy.predict(fuzzy.init(), [0.3, -0.2]), z)
+    expected, of_kf = kf.update(kf.predict(kf.init(), [0.3, -0.2]), z)
+    np.testing.assert_allclose(after.mean, expected.mean, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(after.cov, expected.cov, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(innovation.log_likelihood, of_kf.log_likelihood, rtol=1e-9)
+
+
 def headings(x, u, c):
     """Forty directions, each of which goes on by a constant, as numbers between -pi and pi."""
     return tuple(turned(direction + c[0]) for direction in x)
