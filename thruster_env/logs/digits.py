@@ -52,12 +52,11 @@ def refuse_clock_digits(stamps: np.ndarray, where: str) -> None:
     if (known % 100.0 >= 60.0).any() or (known // 100.0 % 100.0 >= 60.0).any():
         return
     seconds = known // 1e4 * 3600.0 + known // 100.0 % 100.0 * 60.0 + known % 100.0
-    crossing = np.flatnonzero(np.diff(known // 100.0))
     steps, as_written = np.diff(seconds), np.diff(known)
-    usual = float(np.median(steps))
-    regular = np.isclose(steps[crossing], usual) & ~np.isclose(as_written[crossing], usual)
-    if len(crossing) > 1 and regular.mean() > 0.5:
-        row = int(crossing[regular][0])
+    longer = np.flatnonzero(~np.isclose(as_written, np.median(as_written)))
+    regular = np.isclose(steps[longer], np.median(steps))
+    if len(longer) > 1 and regular.mean() > 0.5:
+        row = int(longer[regular][0])
         rule = "times must be numbers of one unit, or dates"
         pair = f"{known[row]:.10g} is followed by {known[row + 1]:.10g}"
         raise ValueError(

@@ -7,10 +7,9 @@ import io
 import math
 import os
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
 from errno import EACCES, EISDIR, ENOENT
 from importlib.util import find_spec
 from os import PathLike, strerror
@@ -23,55 +22,16 @@ import numpy as np
 from thruster_env.core.checks import as_floats, listed, short_repr
 from thruster_env.core.modules import to_install
 from thruster_env.logs.columns import DATE_NAMES, TIME_NAMES, parted, simple
+from thruster_env.logs.dates import DATES, MISSING_TEXT, is_clock, is_day, joined, seconds_of, since_first
 from thruster_env.logs.findings import Remark
 from thruster_env.logs.recorders.topics import Refused, check_bytes, opened
 
 # What stands for a missing number, in any case of letters.
-MISSING_TEXT = "nan"
 MISSING = ("", "nan", "na", "n/a", "null", "none", "<na>", "nat")
-DATES = "times must be dates as of ISO 8601, such as 2026-05-01T12:00:00.01"
 DELIMITERS = ",;\t"
 ZIP_END, ZIP_COUNT = 22, 10  # bytes of a zip's last record, and where in it the number of its files stands
 TIME_HEADER = "time_s"  # of an index of times
 SUFFIXES = (".csv", ".parquet", ".npz")
-
-
-def since_first(dates: np.ndarray) -> np.ndarray:
-    """Seconds since the first of some datetime64 or timedelta64, (rows,), NaN where there is none."""
-    known = dates[~np.isnat(dates)]
-    if not len(known):
-        return np.full(len(dates), np.nan)
-    return (dates - known[0]) / np.timedelta64(1, "s")  # whole ticks are subtracted, so that no digit is lost
-
-
-def date_of(text: str) -> datetime | None:
-    """The date of a text in ISO 8601, None for other text."""
-    try:
-        return datetime.fromisoformat(text)
-    except ValueError:
-        return None
-
-
-def seconds_of(cells: Sequence[str]) -> np.ndarray | None:
-    """Seconds since the first date of some texts, (rows,), NaN where one is none; None where no cell is a date.
-
-    Dates with a time zone are compared in UTC, dates without one as they stand, to the microsecond.
-
-    Args:
-        cells: texts, "nan" where one is missing.
-
-    Raises:
-        ValueError: if only some dates have a time zone.
-    """
-    dates = [None if cell == MISSING_TEXT else date_of(cell) for cell in cells]
-    known = [date for date in dates if date is not None]
-    if not known:
-        return None
-    if len({date.tzinfo is None for date in known}) > 1:
-        raise ValueError("times must all have a time zone, or none, but got both")
-    known = [date if date.tzinfo is None else date.astimezone(UTC) for date in known]
-    seconds = iter([(date - known[0]) / timedelta(seconds=1) for date in known])
-    return np.array([np.nan if date is None else next(seconds) for date in dates])
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +81,7 @@ class Table:
                 row = next(row for row, text in enumerate(texts) if not _is_number(text))
                 has_comma = texts[row].count(",") == 1 and _is_number(texts[row].replace(",", "."))
                 rule = "columns must hold numbers" + ", with decimal points" * has_comma
+                rule = f"{DATES}, or numbers" if _is_time(column) and not has_comma else rule
                 where = self.location(row, column)
                 raise ValueError(f"{rule}, but got {short_repr(cells[row])} in {where}")
             numbers = parsed.copy()
@@ -130,7 +91,10 @@ class Table:
         return numbers
 
     def dates(self, column: str) -> np.ndarray | None:
-        """Seconds since the first date of a column, (rows,), NaN for a missing one; None where it has no dates."""
+        """Seconds since the first date of a column, (rows,), NaN for a missing one; None where it has no dates.
+
+        Days and clock times in two columns are one.
+        """
         cells = self.cells[column]
         if isinstance(cells, np.ndarray) and cells.dtype.kind not in "mMOU":
             return None
@@ -138,7 +102,7 @@ class Table:
             return since_first(cells)
         if self._parsed(column) is not None:
             return None
-        texts = _texts(cells)
+        texts = self._with_partner(column, _texts(cells))
         try:
             seconds = seconds_of(texts)
         except ValueError as error:
@@ -150,11 +114,31 @@ class Table:
                 raise ValueError(f"{DATES}, but got {short_repr(text)} in {self.location(row, column)}")
         return seconds
 
+    def _with_partner(self, column: str, texts: list[str]) -> list[str]:
+        """The texts of a column of days with the clock times of another one, or of clock times with its days."""
+        is_of_clock = _are_all(texts, is_clock)
+        if not is_of_clock and not (_are_all(texts, is_day) and len(set(texts)) < len(texts)):
+            return texts
+        for other in self.names:
+            if other != column and isinstance(self.cells[other], Sequence | np.ndarray):
+                cells = _texts(self.cells[other][:1])
+                if _are_all(cells, is_day if is_of_clock else is_clock):
+                    cells = _texts(self.cells[other])
+                    if _are_all(cells, is_day if is_of_clock else is_clock):
+                        return joined(cells, texts) if is_of_clock else joined(texts, cells)
+        return texts
+
     def _parsed(self, column: str) -> np.ndarray | None:
         """The texts of a column as numbers, which is done once; None if some are no numbers."""
         if column not in self.parsed:
             self.parsed[column] = _as_numbers(self.cells[column])
         return self.parsed[column]
+
+
+def _are_all(texts: Sequence[str], kind: Callable[[str], bool]) -> bool:
+    """Whether all texts that are not missing are of a kind, and some are."""
+    known = [text for text in texts if text != MISSING_TEXT]
+    return bool(known) and all(map(kind, known))
 
 
 def _as_numbers(cells: Sequence | np.ndarray) -> np.ndarray | None:

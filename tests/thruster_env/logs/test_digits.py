@@ -77,7 +77,7 @@ def test_other_numbers_in_a_column_of_dates_need_a_unit():
     np.testing.assert_array_equal(in_seconds(np.arange(60.0), "d", "date", "date")[0], 86400.0 * np.arange(60.0))
 
 
-@pytest.mark.parametrize(("form", "step"), [("%H%M", 60.0), ("%H%M%S", 1.0), ("%H%M%S", 20.0)])
+@pytest.mark.parametrize(("form", "step"), [("%H%M", 60.0), ("%H%M%S", 1.0), ("%H%M%S", 20.0), ("%H%M%S", 60.0)])
 def test_clock_times_in_digits_are_refused(form, step):
     begin = datetime(2024, 1, 1, 9, 58, 30)
     numbers = np.array([float((begin + timedelta(seconds=k * step)).strftime(form)) for k in range(200)])
@@ -87,6 +87,8 @@ def test_clock_times_in_digits_are_refused(form, step):
         in_seconds(numbers, None, "t", "t")
 
 
-@pytest.mark.parametrize("numbers", [50.0 * np.arange(60.0), 20.0 * np.arange(3.0), 0.5 * np.arange(400.0)])
+@pytest.mark.parametrize(
+    "numbers", [50.0 * np.arange(60.0), 100.0 * np.arange(60.0), 20.0 * np.arange(3.0), 0.5 * np.arange(400.0)]
+)
 def test_seconds_that_look_like_clock_times_stay_seconds(numbers):
     np.testing.assert_array_equal(in_seconds(numbers, None, "t", "t")[0], numbers)
