@@ -39,17 +39,7 @@ TRAININGS: dict[str, dict[str, Any]] = {
     "differentiable-enkf": {"runs": 512, "steps": 200, "window": 20},
 }
 PAPERS = {"runs": 1000, "steps": 600, "batch": 30, "window": 100, "rate": 1e-3}  # of the paper, but for the steps
-ELSEWHERE = (
-    "nominal",
-    "mismatch",
-    "outliers",
-    "dropout",
-    "ambient",
-    "bias",
-    "deadband",
-    "reversal",
-    "medium_noise",
-)
+ELSEWHERE = "nominal mismatch outliers dropout ambient bias deadband reversal medium_noise".split()
 FILTERPY = "filters.estimators.libraries:unscented"
 
 
@@ -178,12 +168,8 @@ def _trained(kind: str, problem: Problem, arguments: dict[str, Any]) -> str:
 
 def _nine_digits(row: Row) -> str:
     evaluation = row.evaluation
-    values = [
-        *(interval.value for interval in evaluation.rmse),
-        evaluation.nees.value,
-        evaluation.nis.value,
-        evaluation.log_likelihood,
-    ]
+    intervals = *evaluation.rmse, evaluation.nees, evaluation.nis
+    values = [*(interval.value for interval in intervals), evaluation.log_likelihood]
     return " | ".join(f"{value:.9g}" for value in values)
 
 

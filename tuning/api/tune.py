@@ -357,19 +357,10 @@ def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) ->
     choice = plan.forgetting(Choice(stored["name"], _tuples(stored["model"]), _tuples(stored["numbers"])))
     choice = plan.forgetting(choice, exact=True)
     value = measured(choice, plan, plan.training_data()).value
-    nothing: dict[str, Any] = {
-        "consistent": None,
-        "nis": (),
-        "validation": None,
-        "sizes": [],
-        "sized": None,
-        "free_value": None,
-        "band_value": None,
-    }
-    return (
-        result._replace(choice=choice, best_value=value, **nothing),
-        MethodAnswer(name, choice, answer["runs"], answer["seconds"], refused and Refused(*refused)),
-    )
+    nothing: dict[str, Any] = dict.fromkeys(("consistent", "validation", "sized", "free_value", "band_value"))
+    alone = result._replace(choice=choice, best_value=value, nis=(), sizes=[], **nothing)
+    cost = answer["runs"], answer["seconds"]
+    return alone, MethodAnswer(name, choice, *cost, refused and Refused(*refused))
 
 
 def _some(choices: Sequence[Choice], count: int) -> list[Choice]:

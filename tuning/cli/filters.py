@@ -53,16 +53,10 @@ def fits_of(problem: Problem, names: tuple[str, ...] = tuple(FILTERS)) -> list[F
 def fit_table(problem: Problem, fits: list[Fit]) -> list[RenderableType]:
     """The table of `fits_of`."""
     model = problem.model()
-    rows = [
-        [
-            fit.name,
-            "no" if fit.reason else "yes",
-            "" if fit.ensemble_size is None else str(fit.ensemble_size),
-            _size(fit.kilobytes),
-            fit.reason,
-        ]
-        for fit in fits
-    ]
+    rows = []
+    for fit in fits:
+        members = "" if fit.ensemble_size is None else str(fit.ensemble_size)
+        rows.append([fit.name, _yes(not fit.reason), members, _size(fit.kilobytes), fit.reason])
     counts = (model.n, "state"), (model.m, "measurement"), (model.inputs, "input")
     sizes = ", ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts)
     title = f"Filters on {problem.name}: {sizes}"

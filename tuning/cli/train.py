@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from rich.console import RenderableType
 from rich.progress import TextColumn
@@ -101,22 +101,12 @@ def command(
     chosen = of_preset(plant.find_scenario(scenario), preset)
     if untuned and tuned is not None:
         raise ValueError(f"give either --tuned FILE or --untuned, but got both, --tuned {tuned}")
-    setup = make_configuration(
-        task,
-        chosen,
-        observe,
-        algo,
-        steps,
-        seed,
-        filter_arguments={name: plain(value) for name, value in chosen.untuned.items()} if untuned else None,
-        tuned=tuned,
-        num_envs=envs,
-        controller=controller,
-    )
-    evaluations, checkpoints = (
-        at_least("evaluations", evaluations, 1, 10_000),
-        at_least("checkpoints", checkpoints, 1, 10_000),
-    )
+    arguments = {name: plain(value) for name, value in chosen.untuned.items()} if untuned else None
+    options: dict[str, Any] = {"tuned": tuned, "num_envs": envs, "controller": controller}
+    setup = make_configuration(task, chosen, observe, algo, steps, seed, filter_arguments=arguments, **options)
+    options = {"tensorboard": not no_tensorboard}
+    for name, count in (("evaluations", evaluations), ("checkpoints", checkpoints)):
+        options[name] = at_least(name, count, 1, 10_000)
     check_installed()
     folder = out or POLICIES / name_of(setup, tuned, untuned)
     if tuned is not None and (meant := read_tuned_file(tuned)["problem"]) != chosen.name:
@@ -126,14 +116,7 @@ def command(
     with progress_console.status("loading torch ..."):
         from tuning.policies.learn import train
     with _bar(f"{algo} on {observe}", setup.steps) as on_progress:
-        trained = train(
-            setup,
-            folder,
-            evaluations=evaluations,
-            checkpoints=checkpoints,
-            tensorboard=not no_tensorboard,
-            on_progress=on_progress,
-        )
+        trained = train(setup, folder, on_progress=on_progress, **options)
     return Printed(report(setup, trained), as_json(setup, trained), INTERRUPTED if trained.interrupted else 0)
 
 

@@ -190,14 +190,9 @@ def rows(trials: Mapping[str, Trial], numbers: Mapping[str, float] = NUMBERS) ->
         return errors.total
 
     best = min(GYROSCOPES, key=total)
-    return [
-        Row.of(f"ekf, gyroscope {GYROSCOPE:g}", trials, dict(numbers)),
-        Row.of(
-            f"ekf, gyroscope {best:g}, chosen on the training trials' reference",
-            trials,
-            {**numbers, "gyroscope": best},
-        ),
-    ]
+    chosen = f"ekf, gyroscope {best:g}, chosen on the training trials' reference"
+    first = Row.of(f"ekf, gyroscope {GYROSCOPE:g}", trials, dict(numbers))
+    return [first, Row.of(chosen, trials, {**numbers, "gyroscope": best})]
 
 
 def tables_of(computed: Sequence[Row]) -> dict[str, Table]:

@@ -213,13 +213,8 @@ def okf_itself(runs: list[Run], seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     np.random.seed(seed)  # its batches are drawn from NumPy's global generator
     model = OptimizedFilter(**model_args(), optimize=True, model_name="OKF")
     with contextlib.redirect_stdout(io.StringIO()):
-        train(
-            model,
-            [target.measurements for target in runs],
-            [target.states for target in runs],
-            to_save=False,
-            verbose=0,
-        )
+        measured, states = zip(*[(target.measurements, target.states) for target in runs], strict=True)
+        train(model, list(measured), list(states), to_save=False, verbose=0)
     return model.get_Q(), model.get_R()
 
 

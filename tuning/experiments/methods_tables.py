@@ -81,15 +81,8 @@ def is_blind(method: str, case: Case) -> bool:
 
 def what_to_use(results: Sequence[Result], protocol: Protocol) -> str:
     """The cheapest method within 0.5 % of the least error, and that within 0.02 nat of the best log score."""
-    heads = [
-        "you have",
-        "least error",
-        "regret, mean and worst case",
-        "NEES / n",
-        "best log score",
-        "regret",
-        "NEES / n",
-    ]
+    of_error, of_log_score = ["least error", "regret, mean and worst case"], ["best log score", "regret"]
+    heads = ["you have", *of_error, "NEES / n", *of_log_score, "NEES / n"]
     rows = []
     for situation in SITUATIONS:
         cases = [case for case in protocol.cases if situation.has(case)]

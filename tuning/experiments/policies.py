@@ -140,16 +140,8 @@ def _run(comparison: Comparison, noise: str, kind: str, observed: str, variant: 
     elif variant.endswith("tuned"):
         arguments = _tuned(observed, noise, variant)
     algo = "ppo" if kind in CLASSICAL else CORRECTING.get(kind, kind)
-    setup = make_configuration(
-        TASK,
-        scenario,
-        observed,
-        algo,
-        steps=comparison.steps,
-        seed=seed,
-        filter_arguments=plain_data(dict(arguments)),
-        controller=BEST if kind in CORRECTING else None,
-    )
+    options = {"filter_arguments": plain_data(dict(arguments)), "controller": BEST if kind in CORRECTING else None}
+    setup = make_configuration(TASK, scenario, observed, algo, steps=comparison.steps, seed=seed, **options)
     return Run(noise, kind, variant, setup)
 
 
@@ -319,9 +311,8 @@ def typical_error(results: Sequence[Result], part: str) -> Figure:
     with np.errstate(invalid="ignore"):
         of_seeds = np.sqrt(squares.sum(axis=0) / steps.sum(axis=0))
         # By rounding a sum of squares that should be zero may be negative.
-        return mean_figure(
-            of_seeds, np.sqrt(np.maximum(_left_out(squares), 0) / _left_out(steps)), _source(results)
-        )
+        without_episode = np.sqrt(np.maximum(_left_out(squares), 0) / _left_out(steps))
+        return mean_figure(of_seeds, without_episode, _source(results))
 
 
 def as_interval(figure: Figure) -> Interval:

@@ -204,14 +204,8 @@ def pairs() -> Iterator[tuple[str, str, str, str, str, str]]:
         yield f"With the same controller (MPC), {what} is worth {{}}: ", BEST, better, BEST, other, "+.4f"
     for observed in ("true", "ekf"):
         for kind in ("ppo", "sac", "ppo+mpc", "sac+mpc"):
-            yield (
-                f"{name_of(kind, observed)} costs {{}} times as much as MPC: ",
-                kind,
-                observed,
-                BEST,
-                observed,
-                "",
-            )
+            text = f"{name_of(kind, observed)} costs {{}} times as much as MPC: "
+            yield text, kind, observed, BEST, observed, ""
     for label in (f"ekf, {variant}" for variant in WRONG):
         for kind in ("ppo", "ppo+mpc"):
             yield f"{name_of(kind, label)} returns {{}} more than MPC: ", kind, label, BEST, label, "+.3f"
