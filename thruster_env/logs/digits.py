@@ -67,8 +67,7 @@ def refuse_clock_digits(stamps: np.ndarray, where: str) -> None:
 def seconds_of_dates(stamps: np.ndarray, base: str, where: str) -> tuple[np.ndarray, str] | None:
     """Seconds of numbers (rows,) in a column of dates or years, and their unit in words; None in other columns.
 
-    Raises:
-        ValueError: if the numbers are neither years nor days of Excel, MATLAB or Julius Scaliger.
+    They are years, days of Excel, MATLAB or Julius Scaliger, or else seconds, which is said.
     """
     known = stamps[np.isfinite(stamps)]
     if base.lower() not in DATES or not len(known) or known.max() > max(high for _, high in DAYS):
@@ -79,6 +78,4 @@ def seconds_of_dates(stamps: np.ndarray, base: str, where: str) -> tuple[np.ndar
             rounded = np.round(seconds)
             is_rounding = np.nanmax(np.abs(seconds - rounded)) < ROUNDING
             return rounded if is_rounding else seconds, f"times in {where} are taken as {name}"
-    rule = "dates must be as of ISO 8601, years or days, or their column say its unit"
-    way = f"use --column 'time={base}[d]', or [s]"
-    raise ValueError(f"{rule}, but {where} begins with {known[0]:.10g} ({way})")
+    return stamps, f"times in {where} are taken as s; if they are days, use --column 'time={base}[d]'"

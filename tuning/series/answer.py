@@ -308,6 +308,7 @@ class SeriesFit(Result):
             for number in self.numbers
             if not number.determined
         ]
+        sentences += self._rounding_sentences()
         sentences += self._far_sentences()
         apart = self.axes_differ()
         if apart < WHITE:
@@ -315,6 +316,31 @@ class SeriesFit(Result):
         if not self.is_wrong:
             sentences.append(f"The innovations are white (p = {white.p_value:.2g}).")
         return [*sentences, *self.column.remarks]
+
+    def _rounding_sentences(self) -> list[str]:
+        """Rounding that is taken for the signal, because a rounded number stays and so looks exact."""
+        column, sentences = self.column, []
+        high = self.numbers[-1].high if self.numbers else self.r
+        for quantity, axis, step in zip(
+            column.quantities, column.table.T, column.resolutions.tolist(), strict=True
+        ):
+            least, known = step**2 / 12.0, axis[~np.isnan(axis)]
+            if high < least:
+                repeats = f"{float(np.mean(np.diff(known) == 0.0)):.0%} of its numbers repeat the one before"
+                sentences.append(
+                    f"{quantity.symbol} changes in steps of {step:.3g}, and {repeats}: if it is rounded, R is at "
+                    f"least {step:.3g}^2/12 = {least:.3g}, as an error of rounding that stays looks like signal. "
+                    "Log more digits, or fit means of many rows."
+                )
+        return sentences
+
+    @property
+    def _real_jumps(self) -> list[tuple[int, float]]:
+        """Jumps by more than the resolution of the numbers."""
+        table, steps = self.column.table, 1.5 * self.column.resolutions
+        return [
+            (row, height) for row, height in self.jumps if not (np.abs(table[row] - table[row - 1]) <= steps).all()
+        ]
 
     def _far_sentences(self) -> list[str]:
         """Outliers, what a filter has to do with them, and jumps."""
@@ -331,9 +357,10 @@ class SeriesFit(Result):
                 "A filter must leave out outliers, too: use the lines of --code, fit.filter.session("
                 f"gate={self.gate:g}, most={BURST}) or --filter ekf-robust.",
             ]
-        if self.jumps:
-            row, height = max(self.jumps, key=lambda jump: abs(jump[1]))
-            count = f" {len(self.jumps)} times, the highest" if len(self.jumps) > 1 else ""
+        jumps = self._real_jumps
+        if jumps:
+            row, height = max(jumps, key=lambda jump: abs(jump[1]))
+            count = f" {len(jumps)} times, the highest" if len(jumps) > 1 else ""
             sentences.append(
                 f"The record jumps{count} at row {row} ({times[row]:.4g} s), by {abs(height):.0f} standard "
                 "deviations of the prediction, and Q makes up for it: fit the rows before and after it alone."
@@ -355,7 +382,7 @@ class SeriesFit(Result):
             "measured": int(self.column.measured.any(axis=1).sum()),
             "outliers": 0 if self.left_out is None else int((~np.isnan(self.left_out)).sum()),
             "gate": self.gate,
-            "jumps": [row for row, _ in self.jumps],
+            "jumps": [row for row, _ in self._real_jumps],
             "dt": self.column.dt,
             "numbers": {number.name: number._asdict() for number in self.numbers},
             "F": f,

@@ -29,6 +29,7 @@ from thruster_env.logs.findings import (
     STUCK,
     WRAPPED,
     Remark,
+    resolution_of_values,
     sentences,
 )
 from thruster_env.logs.grid import resolution_of_digits
@@ -112,6 +113,12 @@ class Column:
         peaks = _peaks(times, self.table[:, int(spreads.argmax())], self.dt)
         noise = max(_root_mean_square(roughness), self.rounding)
         return Scales(_root_mean_square(spreads), noise, self.dt, duration, peaks)
+
+    @cached_property
+    def resolutions(self) -> np.ndarray:
+        """The step in which the numbers of each axis are rounded, (axes,), 0 if they are not."""
+        axes = zip(self.table.T, self.measured.T, strict=True)
+        return np.array([resolution_of_values(axis[measured]) for axis, measured in axes])
 
     @property
     def rounding(self) -> float:

@@ -69,11 +69,10 @@ def test_numbers_in_a_column_of_dates_are_days_or_years(header, numbers, step, n
     assert words == f"times in column {header!r} are taken as {name}"
 
 
-def test_other_numbers_in_a_column_of_dates_need_a_unit():
-    with pytest.raises(
-        ValueError, match=r"dates must be .*, but date begins with 0 \(use --column 'time=date\[d\]'"
-    ):
-        in_seconds(np.arange(60.0), None, "date", "date")
+def test_other_numbers_in_a_column_of_dates_are_seconds_and_that_is_said():
+    seconds, words = in_seconds(np.arange(60.0), None, "date", "column 'date'")
+    np.testing.assert_array_equal(seconds, np.arange(60.0))
+    assert words == "times in column 'date' are taken as s; if they are days, use --column 'time=date[d]'"
     np.testing.assert_array_equal(in_seconds(np.arange(60.0), "d", "date", "date")[0], 86400.0 * np.arange(60.0))
 
 
