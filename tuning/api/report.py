@@ -337,22 +337,12 @@ def _plan(identity, where: str | Path, find: Callable[[str], Problem]) -> Plan:
     """The plan of an identity, its scenarios found by name."""
     try:
         scenarios = tuple(find(name) for name in identity["scenarios"])
-        objectives, seed = tuple(identity["objectives"]), at_least("seed", identity["seed"], 0)
-        plan = Plan(
-            identity["filter"],
-            scenarios,
-            seed,
-            objectives,
-            identity["consistent"],
-            identity["sampler"],
-            identity["hold_r"],
-            budget=identity["budget"],
-            full_q=identity["full_q"],
-            full_r=identity.get("full_r", False),
-            where=tuple(identity.get("where", ())),
-            worst=identity.get("worst", False),
-            forget=identity.get("forget"),
-        )
+        options = {
+            name: identity[name] for name in ("filter", "consistent", "sampler", "hold_r", "budget", "full_q")
+        }
+        options |= {name: identity[name] for name in ("full_r", "worst", "forget") if name in identity}
+        options |= {"objectives": tuple(identity["objectives"]), "where": tuple(identity.get("where", ()))}
+        plan = Plan(scenarios=scenarios, seed=at_least("seed", identity["seed"], 0), **options)
     except (KeyError, TypeError):
         raise ValueError(f"a report needs the plan of the study, but {where} has {short_repr(identity)}") from None
     return plan.checked()

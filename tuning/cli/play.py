@@ -23,18 +23,7 @@ from thruster_env.render.renderer import OnStep, Played, check_drawing, steps_a_
 from thruster_env.thruster.controllers import PIController
 from thruster_env.thruster.env import renderer_of
 from thruster_env.thruster.rendering import ChartEntry, Overlay
-from tuning.api.markers import (
-    FILTER,
-    INPUT,
-    OUTPUT,
-    READ,
-    RUNS,
-    WRITTEN,
-    Argument,
-    FilterOption,
-    Option,
-    Preset,
-)
+from tuning.api.markers import FILTER, INPUT, OUTPUT, READ, RUNS, WRITTEN, Argument, FilterOption, Option, Preset
 from tuning.api.progress import bar
 from tuning.api.result import Printed
 from tuning.cli.output import check_targets, progress_console, warn_beyond

@@ -410,21 +410,12 @@ def regrets(
         if not len(values):
             continue
         valid = [scored for scored in scores.values() if scored is not None]
-        regrets_.append(
-            Regret(
-                method,
-                _exp(student(values)),
-                math.exp(float(np.median(values))),
-                math.exp(float(values.max())),
-                float(np.median([scored.nees for scored in valid])),
-                float(np.median([scored.nis for scored in valid])),
-                reference.log_score - float(np.mean([scored.log_score for scored in valid])),
-                sum(bool(result.error) for result in of_method),
-                len(values),
-                float(np.median([result.taken_runs for result in of_method])),
-                float(np.median([result.taken_seconds for result in of_method])),
-            )
-        )
+        ratios = _exp(student(values)), math.exp(float(np.median(values))), math.exp(float(values.max()))
+        nees, nis = np.median([(scored.nees, scored.nis) for scored in valid], axis=0).tolist()
+        loss = reference.log_score - float(np.mean([scored.log_score for scored in valid]))
+        counts = sum(bool(result.error) for result in of_method), len(values)
+        cost = np.median([(result.taken_runs, result.taken_seconds) for result in of_method], axis=0).tolist()
+        regrets_.append(Regret(method, *ratios, nees, nis, loss, *counts, cost[0], cost[1]))
     regrets_.sort(key=lambda regret: regret.ratio.value)
     worse = holm([chance(logs[regret.method], logs[regrets_[0].method]) for regret in regrets_], LEVEL)
     return [regret._replace(worse=is_worse) for regret, is_worse in zip(regrets_, worse, strict=True)]

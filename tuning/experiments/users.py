@@ -420,19 +420,13 @@ def reproduce(
         cases = run_panel(panel, out, progress)
     conclusions = sentences(cases)
     heads, rows = header(cases), rows_of(cases)
-    data = {
-        "cases": [
-            {
-                **case._asdict(),
-                "baselines": {
-                    name: {**paired.ratio._asdict(), "chance": paired.chance}
-                    for name, paired in case.baselines.items()
-                },
-            }
-            for case in cases
-        ],
-        "answers": conclusions,
-    }
+
+    def plain(case: Case) -> dict[str, Any]:
+        pairs = case.baselines.items()
+        baselines = {name: {**paired.ratio._asdict(), "chance": paired.chance} for name, paired in pairs}
+        return {**case._asdict(), "baselines": baselines}
+
+    data = {"cases": [plain(case) for case in cases], "answers": conclusions}
     title = f"scores of tuned filters over those of baselines, held out; {panel.trials} trials"
     return Printed([Table(title, heads, rows), *conclusions], data)
 
