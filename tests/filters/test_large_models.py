@@ -175,6 +175,19 @@ def test_rules_of_a_large_affine_model_are_all_its_kalman_filter():
     np.testing.assert_allclose(innovation.log_likelihood, of_kf.log_likelihood, rtol=1e-9)
 
 
+def test_loops_over_particles_that_are_cut_know_which_channels_are_measured():
+    model, z = linear(14, 14), np.linspace(-1.0, 1.0, 14)
+    z[5] = np.nan
+
+    def estimate():
+        filter_ = make_filter("pf", model, ensemble_size=10)
+        return filter_.update(filter_.predict(filter_.init((1, 2)), [0.3, -0.2]), z)
+
+    (after, innovation), (expected, of_text) = estimate(), interpreted()(estimate)()
+    np.testing.assert_allclose(after.mean, expected.mean, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(innovation.log_likelihood, of_text.log_likelihood, rtol=1e-9)
+
+
 def headings(x, u, c):
     """Forty directions, each of which goes on by a constant, as numbers between -pi and pi."""
     return tuple(turned(direction + c[0]) for direction in x)

@@ -102,15 +102,19 @@ def common_code_of(*entries: Entry, unrolled: bool = True) -> Code | None:
         reason = str(error)
     except (TypeError, NameError, AttributeError) as error:
         fault = "this is a fault of the package and not of the model: please report it"
-        code = functions.innermost.__code__
-        where = (
-            code.co_filename.strip("<>") if code.co_filename.startswith("<") else functions.innermost.__module__
-        )
-        reason = f"{error_line(error)} in {code.co_name} of {where}; {fault}"
+        where = "" if functions.innermost is None else f" in {_name_of(functions.innermost)}"
+        reason = f"{error_line(error)}{where}; {fault}"
     except (NotLinked, OSError, MemoryError) as error:
         reason = f"machine code of it could not be made: {error}"
     warnings.warn(f"{IN_PYTHON}: {reason}", stacklevel=3)
     return None
+
+
+def _name_of(function: Callable) -> str:
+    """A function's name with the file of its text, or its module."""
+    code = function.__code__
+    file = code.co_filename
+    return f"{code.co_name} of {file.strip('<>') if file.startswith('<') else function.__module__}"
 
 
 @cache

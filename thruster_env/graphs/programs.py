@@ -409,8 +409,8 @@ class _Cutter:
                     return True
                 if index in wanted_indices or cutter._made.get(index, loop) >= loop:
                     return False
-                if all(not a.member or cutter._place_of(a, loop) for a in number.of):
-                    return False  # one operation, done again
+                if number.is_condition or all(not a.member or cutter._place_of(a, loop) for a in number.of):
+                    return False  # done again: it is one operation, or the table, of floats, cannot hold it
                 cutter._keep(number)
                 return True
 
