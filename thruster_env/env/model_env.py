@@ -40,7 +40,7 @@ from thruster_env.env.env import PlantEnv, PlantVectorEnv
 from thruster_env.env.plant_data import some_numbers
 from thruster_env.graphs.tracing import traced
 from thruster_env.graphs.values import traceable
-from thruster_env.logs.log import Log, seen_by
+from thruster_env.logs.log import Log, sample_time_of, seen_by
 from thruster_env.logs.read import read_log
 from thruster_env.model.continuous import ContinuousModel, continuous_of, in_discrete_time
 from thruster_env.model.quantities import Quantity
@@ -406,6 +406,7 @@ def split(model: StateSpaceModel, actions: int, channels: Sequence[str]) -> Spli
 
 
 ANY_DT = 0.01  # [s], of a model that is asked for its quantities before the sample time of the log is known
+OTHER_DT = 0.01  # of a log's sample time, by which that of its model may differ
 
 
 class ReplayEnv(gym.Env):
@@ -486,10 +487,10 @@ class ReplayEnv(gym.Env):
         return self._last.copy(), info
 
 
-def read_for(log: Any, model, **options) -> tuple[Log, Callable[..., StateSpaceModel]]:
+def read_for(log: Any, model, *, of_any_dt: bool = False, **options) -> tuple[Log, Callable[..., StateSpaceModel]]:
     """A log, read if it is a path or a table, and the function of changes that makes the model at its sample time.
 
-    Arguments and errors are those of `ReplayEnv`.
+    Arguments and errors are those of `ReplayEnv`; a model `of_any_dt` has no sample time yet.
     """
     offer = object_named(model, "model") if isinstance(model, str) else model
     if not isinstance(log, Log):
@@ -509,7 +510,21 @@ def read_for(log: Any, model, **options) -> tuple[Log, Callable[..., StateSpaceM
                 for quantities in (logged, modelled)
             ]
             raise ValueError(f"{what} of log {log.name} must be the model's, {listed[1]}, but it has {listed[0]}")
+    if log.stamps is None and not of_any_dt:
+        _check_sample_time(made_model, log)
     return replace(log, measurements=seen_by(made_model, log.measurements)), maker
+
+
+def _check_sample_time(model: StateSpaceModel, log: Log) -> None:
+    """Raise ValueError for a model of another sample time than the log's, where it tells its own."""
+    try:
+        dt = sample_time_of(model, "")
+    except ValueError:  # it tells none by its constants
+        dt = getattr(model, "dt", None)
+    if dt is not None and abs(dt - log.dt) > OTHER_DT * log.dt:
+        rule = f"the sample time of the model must be that of log {log.name}, {log.dt:.6g} s"
+        way = f"give a function of dt, def model(dt): ..., or put the log on its steps (--dt {dt:.6g}, dt=)"
+        raise ValueError(f"{rule}, but is {dt:.6g} s: {way}")
 
 
 def _maker(offer: Any, dt: float) -> Callable[..., StateSpaceModel]:
