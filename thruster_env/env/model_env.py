@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -448,7 +449,7 @@ class ReplayEnv(gym.Env):
     ):
         """Read the log and make spaces; see the class for the arguments."""
         options = {"columns": columns, "clock_offset": clock_offset, "dt": dt, "grid": grid, "stamps": stamps}
-        self.log, maker = read_for(log, model, **options)
+        self.log, maker = read_for(log, model, of_any_dt=False, **options)
         offer = object_named(model, "model") if isinstance(model, str) else model
         self.continuous = None if self.log.stamps is None else continuous_of(offer)
         self.dt, self.state_space_model = self.log.dt, maker
@@ -517,10 +518,9 @@ def read_for(log: Any, model, *, of_any_dt: bool = False, **options) -> tuple[Lo
 
 def _check_sample_time(model: StateSpaceModel, log: Log) -> None:
     """Raise ValueError for a model of another sample time than the log's, where it tells its own."""
-    try:
+    dt: float | None = getattr(model, "dt", None)
+    with suppress(ValueError):  # which it raises if no constant is the sample time
         dt = sample_time_of(model, "")
-    except ValueError:  # it tells none by its constants
-        dt = getattr(model, "dt", None)
     if dt is not None and abs(dt - log.dt) > OTHER_DT * log.dt:
         rule = f"the sample time of the model must be that of log {log.name}, {log.dt:.6g} s"
         way = f"give a function of dt, def model(dt): ..., or put the log on its steps (--dt {dt:.6g}, dt=)"

@@ -399,7 +399,14 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid
     if len(back):
         row = int(back[0]) + 1
         order, where = follows(clocked[row - 1], clocked[row]), table.location(row, column.header)
-        raise ValueError(f"times must increase from row to row, but {order} in {where}")
+        way = ""
+        if (steps < 0).all():
+            way = ": the newest row is the first one, reverse the rows"
+        elif doubled and (steps >= 0).all():
+            about = (clocked[-1] - clocked[0]) / len(steps)
+            way = f": {int((steps == 0).sum())} rows have the time of the row before, delete the column and give "
+            way += f"--dt (about {about:.3g})" if about > 0.0 else "--dt"
+        raise ValueError(f"times must increase from row to row, but {order} in {where}{way}")
     count = (clocked[-1] - clocked[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)
     if count > MOST_STEPS:
         rule = f"a log must be at most {MOST_STEPS} steps long"

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import os
+import re
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -79,9 +80,9 @@ class Table:
             if parsed is None:
                 texts = _texts(cells)
                 row = next(row for row, text in enumerate(texts) if not _is_number(text))
-                has_comma = texts[row].count(",") == 1 and _is_number(texts[row].replace(",", "."))
-                rule = "columns must hold numbers" + ", with decimal points" * has_comma
-                rule = f"{DATES}, or numbers" if _is_time(column) and not has_comma else rule
+                hint = _hint(texts, row, column)
+                is_date = _is_time(column) and not hint.startswith((", with", " below"))
+                rule = f"{DATES}, or numbers" if is_date else f"columns must hold numbers{hint}"
                 where = self.location(row, column)
                 raise ValueError(f"{rule}, but got {short_repr(cells[row])} in {where}")
             numbers = parsed.copy()
@@ -89,6 +90,13 @@ class Table:
             row = int(np.argmax(np.isinf(numbers)))
             raise ValueError(f"numbers must be finite, but got {numbers[row]} in {self.location(row, column)}")
         return numbers
+
+    def is_text(self, column: str) -> bool:
+        """Whether no cell of a column has a digit."""
+        cells = self.cells[column]
+        if isinstance(cells, np.ndarray) and cells.dtype.kind not in "OU" or self._parsed(column) is not None:
+            return False
+        return not any(character.isdigit() for character in "".join(_texts(cells)))
 
     def dates(self, column: str) -> np.ndarray | None:
         """Seconds since the first date of a column, (rows,), NaN for a missing one; None where it has no dates.
@@ -161,9 +169,9 @@ def _texts(cells: Sequence | np.ndarray) -> list[str]:
 def read_table(path: str | Path) -> Table:
     """The table in a file that ends in .csv, .parquet or .npz.
 
-    A CSV file is UTF-8 and begins with a line of names; commas, semicolons, tabs or else spaces part the cells. An
-    empty cell, "nan", "NA" or "null" is a missing number. A column without a name, such as an index that pandas
-    writes, is left out. Parquet needs the package pyarrow.
+    A CSV file is UTF-8 and begins with a line of names, below comments (#, %) if there are some; commas,
+    semicolons, tabs or else spaces part the cells. An empty cell, "nan", "NA" or "null" is a missing number. A
+    column without a name, such as an index that pandas writes, is left out. Parquet needs the package pyarrow.
 
     Args:
         path: of the file.
@@ -199,6 +207,7 @@ def _read_csv(path: Path) -> Table:
         raise ValueError(f"a CSV file must be text in UTF-8, but {path} is not: a zero byte in line {line}")
     if not text.strip():
         raise ValueError(f"a log must have a header and rows, but {path} is empty")
+    text = _without_comments(text)
     first = text.lstrip().splitlines()[0]
     delimiter = max(DELIMITERS, key=first.count)
     plain = _plain_columns(text, delimiter)
@@ -227,6 +236,22 @@ def _read_csv(path: Path) -> Table:
         raise ValueError(f"a log must have a header and rows, but {path} has only a header")
     columns = [list(column) for column in zip(*(row for _, row in rows), strict=True)]
     return _of_texts(path, text, header, columns, [line for line, _ in rows])
+
+
+def _without_comments(text: str) -> str:
+    """The text with blank lines for comments before the header; the last one is the header if numbers follow."""
+    if not text.lstrip().startswith(("#", "%")):
+        return text
+    lines = text.split("\n")
+    for index, line in enumerate(lines[:-1]):
+        follower = next((after for after in lines[index + 1 :] if after.strip()), "")
+        cells = [cell.strip() for cell in re.split(r"[,;\t ]+", follower.strip()) if cell.strip()]
+        is_comment = not line.strip() or line.lstrip().startswith(("#", "%"))
+        is_header = not follower.lstrip().startswith(("#", "%")) and any(map(_is_number, cells))
+        if not is_comment or is_header or not cells:
+            break
+        lines[index] = ""
+    return "\n".join(lines)
 
 
 def _plain_columns(text: str, delimiter: str) -> tuple[list[str], list[list[str]]] | None:
@@ -450,6 +475,22 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return _is_written(text)
+
+
+def _hint(texts: Sequence[str], row: int, column: str) -> str:
+    """What would make a number of a text in a column, behind "columns must hold numbers"; empty if unknown."""
+    text = texts[row]
+    if text.count(",") == 1 and _is_number(text.replace(",", ".")):
+        return ", with decimal points"
+    if _is_number(text.replace(",", "")) or _is_number(text.replace(".", "").replace(",", ".")):
+        return " without separators of thousands"
+    number = text.strip("".join(set(text) - set("+-.0123456789")))
+    if _is_number(number):
+        unit = text.replace(number, "").strip()
+        return f" alone, with their unit in the header, as {parted(column)[0]} [{unit}]"
+    if row == 0 and len(texts) > 1 and _is_number(texts[1]):
+        return f" below the header, which has their unit, as {parted(column)[0]} [{text}]"
+    return ""
 
 
 def _is_written(text: str) -> bool:

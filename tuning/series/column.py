@@ -370,7 +370,7 @@ def as_columns(z: Any, times: Any = None) -> Mapping[str, Any]:
 def _headers(table: Table, named: Sequence[str] | None, axes: int = 1) -> tuple[list[str], str | None]:
     """The headers of the numbers and that of the times; ValueError for other columns than axes without names."""
     times = _times(table, named or ())
-    numbers = [name for name in table.names if name not in times]
+    numbers = [name for name in table.names if name not in times and not table.is_text(name)]
     time = next((name for name in times if _increases(table, name)), times[0] if times else None)
     unit = COUNTERS.get((time or "").strip().lower())
     time = f"{time}[{unit}]" if unit else time
