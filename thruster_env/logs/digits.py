@@ -79,3 +79,17 @@ def seconds_of_dates(stamps: np.ndarray, base: str, where: str) -> tuple[np.ndar
             is_rounding = np.nanmax(np.abs(seconds - rounded)) < ROUNDING
             return rounded if is_rounding else seconds, f"times in {where} are taken as {name}"
     return stamps, f"times in {where} are taken as s; if they are days, use --column 'time={base}[d]'"
+
+
+def doubt_of_days(stamps: np.ndarray, base: str, where: str) -> str:
+    """What to say of stamps taken as seconds that may be days, with steps of whole seconds; empty for others."""
+    known = stamps[np.isfinite(stamps)]
+    if len(known) < LEAST_DATES or not any(low <= known.min() and known.max() <= high for low, high in DAYS):
+        return ""
+    step = float(np.median(np.diff(known)))
+    seconds, thousandths = DAY * step, 1e3 * step
+    is_decimal = abs(thousandths - round(thousandths)) < 1e-3
+    if is_decimal or seconds < 1.0 or abs(seconds - round(seconds)) > ROUNDING:
+        return ""
+    as_days = f"if they are days, as of Excel and MATLAB, it is {round(seconds)} s: use --column 'time={base}[d]'"
+    return f"times in {where} are taken as s: the sample time is {step:.4g} s; {as_days}"

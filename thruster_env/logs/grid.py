@@ -30,7 +30,7 @@ import numpy as np
 
 from thruster_env.core.angles import wrapped
 from thruster_env.logs.columns import converted, parted
-from thruster_env.logs.digits import refuse_clock_digits, seconds_in_digits, seconds_of_dates
+from thruster_env.logs.digits import doubt_of_days, refuse_clock_digits, seconds_in_digits, seconds_of_dates
 
 SAME_STAMP = 1e-9  # of a sample time: two stamps that are no further apart are one
 ROUNDING = 1e-6  # of a sample time: so much longer it is still one step
@@ -337,4 +337,6 @@ def in_seconds(stamps: np.ndarray, unit: str | None, header: str, where: str) ->
         if of_dates is not None:
             return of_dates
         unit, assumption = unit_of(stamps, base, where)
+        if unit == SECOND:
+            assumption = assumption or doubt_of_days(stamps, base, where)
     return converted(stamps, unit, SECOND, where), assumption

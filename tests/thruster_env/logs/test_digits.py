@@ -91,3 +91,16 @@ def test_clock_times_in_digits_are_refused(form, step):
 )
 def test_seconds_that_look_like_clock_times_stay_seconds(numbers):
     np.testing.assert_array_equal(in_seconds(numbers, None, "t", "t")[0], numbers)
+
+
+@pytest.mark.parametrize(("first", "step", "said"), [(45292.0, 1 / 24, "3600"), (739252.0, 1 / 96, "900")])
+def test_seconds_that_may_be_days_are_said(first, step, said):
+    numbers = np.round(first + step * np.arange(60.0), 6)
+    seconds, words = in_seconds(numbers, None, "time", "column 'time'")
+    np.testing.assert_array_equal(seconds, numbers)
+    assert words.endswith(f"it is {said} s: use --column 'time=time[d]'")
+
+
+@pytest.mark.parametrize(("first", "step"), [(45292.0, 0.02), (45292.0, 0.05), (0.0, 1 / 24), (45292.0, 0.0333)])
+def test_seconds_beyond_doubt_are_not(first, step):
+    assert in_seconds(np.round(first + step * np.arange(60.0), 6), None, "time", "time")[1] == ""
