@@ -42,10 +42,10 @@ def sizes():
     }
 
 
-def test_two_hundred_models_that_were_dropped_leave_no_more_than_the_caches_keep(as_python):
-    alive = [one for number in range(140) for one in used(0.1 + 1e-3 * number)]
+def test_a_hundred_models_that_were_dropped_leave_no_more_than_the_caches_keep(as_python):
+    alive = [one for number in range(80) for one in used(0.1 + 1e-3 * number)]
     before = sizes()
-    alive += [one for number in range(140, 200) for one in used(0.1 + 1e-3 * number)]
+    alive += [one for number in range(80, 110) for one in used(0.1 + 1e-3 * number)]
     after = sizes()
     models, *functions = ([one() for one in alive[place::3]] for place in range(3))
     assert sum(one is not None for one in models) <= 1

@@ -11,7 +11,6 @@ from filters import affine_model, make_filter, run
 from filters.augmented import Unknown
 from filters.consistency.nees import Interval
 from tests.linear_problem import LinearProblem
-from thruster_env.core.compiled import interpreted
 from thruster_env.core.text_tables import plain_text
 from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.report import _plan
@@ -117,14 +116,13 @@ def test_a_constant_without_a_random_walk_is_not_asked_to_forget():
         states=["speed"],
     )
     push = np.sin(np.arange(STEPS) / 7.0)[:, None]
-    with interpreted():
-        inner = ModelProblem(model, inputs=push, scale=[0.01], dt=DT, name="drag")
-        for walk, sleeps in ((0.0, False), (1e-5, True)):
-            constant = augmented(inner, {"drag": Unknown(std=0.1, walk_std=walk)})
-            choice = untuned_choice("ekf", constant)
-            assert time_constants_on(choice.filter(constant), constant).is_slow == sleeps
-            cov = np.array(forgetting(choice, [constant], 0, 1.0).model["process_noise_cov"])
-            assert (cov.T[-1] > walk**2).any() == sleeps
+    inner = ModelProblem(model, inputs=push, scale=[0.01], dt=DT, name="drag")
+    for walk, sleeps in ((0.0, False), (1e-5, True)):
+        constant = augmented(inner, {"drag": Unknown(std=0.1, walk_std=walk)})
+        choice = untuned_choice("ekf", constant)
+        assert time_constants_on(choice.filter(constant), constant).is_slow == sleeps
+        cov = np.array(forgetting(choice, [constant], 0, 1.0).model["process_noise_cov"])
+        assert (cov.T[-1] > walk**2).any() == sleeps
 
 
 def test_a_filter_that_sleeps_more_than_the_oracle_is_warned_of_with_an_advice_that_holds(studies, problem):
@@ -176,27 +174,25 @@ def spring(observe, r=1e-4):
 
 
 def test_the_floor_holds_for_the_gain_that_a_nonlinear_filter_has():
-    with interpreted():
-        problem = spring(lambda x, c: (x[0] ** 2,))
-        choice = rule_of_thumb("ekf", problem)
-        roughly, exactly = (
-            time_constants_on(forgetting(choice, [problem], 0, 0.1, exact=exact).filter(problem), problem)
-            for exact in (False, True)
-        )
+    problem = spring(lambda x, c: (x[0] ** 2,))
+    choice = rule_of_thumb("ekf", problem)
+    roughly, exactly = (
+        time_constants_on(forgetting(choice, [problem], 0, 0.1, exact=exact).filter(problem), problem)
+        for exact in (False, True)
+    )
     assert DT * roughly.steps[0] > 0.101 and 0.099 < DT * exactly.steps[0] <= 0.1
 
 
 def test_an_advice_is_accepted_where_a_fifth_of_a_run_is_more_than_a_larger_q_reaches():
-    with interpreted():
-        problem = spring(lambda x, c: (x[0] ** 3,))
-        with pytest.raises(ValueError, match=r"on spring none reaches 0\.1 s: allow .*, such as 0\.2\d s"):
-            Plan("ekf", (problem,), forget=0.1).checked()
-        choice = rule_of_thumb("ekf", problem)
-        found = time_constants_on(choice.filter(problem), problem)._replace(length=10)
-        found = with_oracle_and_advice(found, choice, problem, 0)
-        assert 0.2 < found.advised < 0.3 and Plan("ekf", (problem,), forget=found.advised).checked()
-        raised = forgetting(choice, [problem], 0, found.advised, exact=True)
-        assert DT * time_constants_on(raised.filter(problem), problem).steps[0] <= found.advised
+    problem = spring(lambda x, c: (x[0] ** 3,))
+    with pytest.raises(ValueError, match=r"on spring none reaches 0\.1 s: allow .*, such as 0\.2\d s"):
+        Plan("ekf", (problem,), forget=0.1).checked()
+    choice = rule_of_thumb("ekf", problem)
+    found = time_constants_on(choice.filter(problem), problem)._replace(length=10)
+    found = with_oracle_and_advice(found, choice, problem, 0)
+    assert 0.2 < found.advised < 0.3 and Plan("ekf", (problem,), forget=found.advised).checked()
+    raised = forgetting(choice, [problem], 0, found.advised, exact=True)
+    assert DT * time_constants_on(raised.filter(problem), problem).steps[0] <= found.advised
 
 
 def test_all_that_is_chosen_among_forgets_in_time_and_the_plan_is_kept(studies, problem, tmp_path):
@@ -215,19 +211,18 @@ def test_all_that_is_chosen_among_forgets_in_time_and_the_plan_is_kept(studies, 
 
 
 def test_the_numbers_on_validation_seeds_are_those_of_the_filter_that_is_handed_out():
-    with interpreted():
-        problem = spring(lambda x, c: (x[0] ** 2,))
-        plan = Plan("ekf", (problem,), full_q=True, forget=0.1)
-        result = run_study(open_study("forgets", plan), plan, 3)
-        met, data = result.validation, plan.validation_data()
-        chosen, baseline = met.named(met.chosen), met.named(met.baseline)
-        assert chosen.choice == result.choice
-        exact = {entry.name: measured(entry.choice, plan, data) for entry in (chosen, baseline)}
-        for entry in (chosen, baseline):
-            assert DT * time_constants_on(entry.choice.filter(problem), problem).steps[0] <= 0.1
-            assert entry.value == exact[entry.name].value
-        assert chosen.over == over(exact[chosen.name], exact[baseline.name], ratio=True)
-        assert baseline.raised and not same_filter(baseline.choice, baselines("ekf", problem)[baseline.name])
+    problem = spring(lambda x, c: (x[0] ** 2,))
+    plan = Plan("ekf", (problem,), full_q=True, forget=0.1)
+    result = run_study(open_study("forgets", plan), plan, 3)
+    met, data = result.validation, plan.validation_data()
+    chosen, baseline = met.named(met.chosen), met.named(met.baseline)
+    assert chosen.choice == result.choice
+    exact = {entry.name: measured(entry.choice, plan, data) for entry in (chosen, baseline)}
+    for entry in (chosen, baseline):
+        assert DT * time_constants_on(entry.choice.filter(problem), problem).steps[0] <= 0.1
+        assert entry.value == exact[entry.name].value
+    assert chosen.over == over(exact[chosen.name], exact[baseline.name], ratio=True)
+    assert baseline.raised and not same_filter(baseline.choice, baselines("ekf", problem)[baseline.name])
     said = " ".join(choice_sentences(as_data_of_choice(met), plan))
     names = " and ".join(dict.fromkeys((baseline.name, chosen.name)))
     assert f"Here the {names} have a larger Q, to forget within 0.1 s (--forget); those of the tables may " in said

@@ -242,8 +242,8 @@ def test_memory_does_not_grow(single):
 
     tracemalloc.start()
     try:
-        before = used_after(400)
-        assert used_after(2000) - before < 10_000  # bytes
+        before = used_after(200)
+        assert used_after(800) - before < 4_000  # bytes
     finally:
         tracemalloc.stop()
 
