@@ -16,7 +16,7 @@ from filters import (
 from filters.adaptive import bounded_step
 from filters.engine.session import Session
 from tests.models import plane_model, simulated
-from tests.oracles import kalman_update
+from tests.oracles import each_close, kalman_update
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
@@ -59,8 +59,7 @@ def test_sage_husa_is_the_textbook_recursion_with_bounded_steps(measured):
                 d = length(0.2, q, old_p - p)
                 q = (1 - d) * q + d * (np.outer(x - before, x - before) + p - moved)
             belief, _ = filter_.update(belief, z)
-            np.testing.assert_allclose(belief.mean, x, rtol=1e-9, atol=1e-12)
-            np.testing.assert_allclose(belief.cov, p, rtol=1e-9, atol=1e-12)
+            each_close((belief.mean, belief.cov), (x, p), rtol=1e-9, atol=1e-12)
             np.testing.assert_allclose(filter_.estimated_noise(belief), r, rtol=1e-9, atol=1e-12)
             np.testing.assert_allclose(filter_.estimated_process_noise(belief), q, rtol=1e-8, atol=1e-12)
 
@@ -103,8 +102,7 @@ def test_variational_bayes_is_the_naive_recursion():
                 r = new_scale / weight
             scale = new_scale
             x, p, _ = kalman_update(x, p, expected, h, r)
-            np.testing.assert_allclose(belief.mean, x, rtol=1e-9, atol=1e-12)
-            np.testing.assert_allclose(belief.cov, p, rtol=1e-9, atol=1e-12)
+            each_close((belief.mean, belief.cov), (x, p), rtol=1e-9, atol=1e-12)
             np.testing.assert_allclose(filter_.estimated_noise(belief), r, rtol=1e-9)
             assert belief.extras[-1] == pytest.approx(weight)
 
@@ -138,7 +136,6 @@ def many_long(model):
 
 
 def last_beliefs(filter_, inputs, measurements):
-    """The belief at the end of every run."""
     session = Session(filter_)
     for u, z in zip(inputs, measurements, strict=True):
         session.start(KEY, z[0])

@@ -11,6 +11,8 @@ from filters.ensembles.ensemble import relative_move, width_of
 from tests.filters.test_localised import ring
 from tests.models import KEY, plane_model, random_affine, simulated, state_space
 
+pytestmark = pytest.mark.usefixtures("as_python")
+
 DEVIATION = 0.3
 OWN = {"ensemble_size": 8, "adaptive_inflation": DEVIATION}
 
@@ -50,7 +52,6 @@ OF_ALL = ["enkf", "etkf", "ensrf", "ienkf", "enkf-n", "rhf", "letkf 2"]
 OF_EACH = ["enkf", "etkf", "letkf 2", "denkf 2"]
 
 
-@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize(("name", "by_state"), [*((name, 0) for name in OF_ALL), *((name, 1) for name in OF_EACH)])
 def test_each_step_stretches_and_each_update_adapts(name, by_state):
     kind, _, radius = name.partition(" ")
@@ -94,7 +95,6 @@ def drifting(noise):
     return state_space(walk, place, q=[1e-4, noise], r=[0.04], mean=[0.0, 0.0], cov=[0.04, 0.1], inputs=0)
 
 
-@pytest.mark.usefixtures("as_python")
 def test_it_makes_up_for_a_q_that_is_too_small_and_leaves_a_right_one():
     _, z = simulated(drifting(0.1), 150, count=6)
 
@@ -108,7 +108,6 @@ def test_it_makes_up_for_a_q_that_is_too_small_and_leaves_a_right_one():
     assert abs(squares(0.1, 0.1) - 1.0) < 0.2
 
 
-@pytest.mark.usefixtures("as_python")
 def test_of_one_state_it_is_the_factor_of_all_however_many_channels_see_it():
     model = random_affine(1, 3, 1, seed=2)
     inputs, z = simulated(model.replace(process_noise_cov=9.0 * model.process_noise_cov), 20)
@@ -118,7 +117,6 @@ def test_of_one_state_it_is_the_factor_of_all_however_many_channels_see_it():
     assert abs(none / one - 1.0).max() > 0.1
 
 
-@pytest.mark.usefixtures("as_python")
 def test_the_factor_grows_of_the_state_whose_q_is_too_small():
     """Two bodies that do not touch: the noise of the second is a hundred times what the filter believes."""
 
@@ -188,7 +186,6 @@ def test_mode_and_deviation_are_those_of_the_posterior_by_quadrature(slope):
     assert prior(found, new_width).std() == pytest.approx(deviation, rel=0.05)
 
 
-@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("by_state", [0, 1])
 def test_each_update_takes_factors_and_widths_to_the_posterior(by_state):
     model = plane_model()
@@ -212,7 +209,6 @@ def test_each_update_takes_factors_and_widths_to_the_posterior(by_state):
     assert (belief.extras[count:] != widest).any()
 
 
-@pytest.mark.usefixtures("as_python")
 def test_where_the_model_s_error_is_steady_the_deviation_shrinks_and_the_factor_comes_to_rest():
     _, z = simulated(drifting(0.1), 300, count=1)
     seen = {}

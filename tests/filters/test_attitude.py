@@ -20,6 +20,8 @@ from filters.named import model_named
 from filters.registry import FILTERS
 from filters.sensitivity import ModelSlopes, sensitivity, state_score
 from filters.starts import begun_at
+from tests.filters.checks import refused
+from tests.oracles import each_close, each_equal
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 from thruster_env.model import rotations
@@ -104,7 +106,6 @@ def nees_of(truth, estimates):
 
 
 def skew(v):
-    """[v]x."""
     return np.cross(np.eye(3), v)
 
 
@@ -135,6 +136,25 @@ def naive(gyro, z, degrees):
     return q, bias, P
 
 
+def ran(model, inputs, measurements, name="ekf", **numbers):
+    """Estimates of a filter by its name."""
+    return filters.run(filters.make_filter(name, model, **numbers), inputs=inputs, measurements=measurements)
+
+
+def c_library(filter_, name, folder, *more):
+    """A filter in C, compiled with further files, and memory for its struct; numbers after x, P and S are four."""
+    files = write_filter(c_filter(filter_, name), folder)
+    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-shared", "-fPIC"]
+    subprocess.run(["gcc", *flags, *map(str, (files[1], *more)), "-o", folder / "c.so", "-lm"], check=True)
+    n, e = filter_.model.n, len(filter_.model.prior_cov)
+    m = len(filter_.model.measurement_noise_cov)
+    return ctypes.CDLL(str(folder / "c.so")), np.zeros(n + e * e + m + m * m + 4)
+
+
+def address(array):
+    return array.ctypes.data_as(ctypes.c_void_p)
+
+
 @pytest.fixture(scope="module")
 def data():
     return tuple(simulated(16, 100, 5.0))
@@ -144,10 +164,7 @@ def data():
 def of_side(data):
     """Estimates of all 16 runs by the extended filter, by the side of the error."""
     _, gyro, z = data
-    return {
-        side: filters.run(filters.ExtendedKalmanFilter(model=attitude_model(side)), inputs=gyro, measurements=z)
-        for side in ("body", "world")
-    }
+    return {side: ran(attitude_model(side), gyro, z) for side in ("body", "world")}
 
 
 def test_the_extended_filter_is_the_error_state_filter(data, of_side):
@@ -178,19 +195,15 @@ def test_errors_are_consistent_from_five_degrees(data, of_side):
 
 
 def test_minus_q_is_the_same_rotation(data, of_side):
-    """A filter that starts at -q has the same estimates, to the last bit."""
     _, gyro, z = data
-    start = filters.ExtendedKalmanFilter(model=attitude_model(start=(-1.0, 0.0, 0.0, 0.0)))
-    estimates = filters.run(start, inputs=gyro[0], measurements=z[0])
-    np.testing.assert_array_equal(abs(estimates.means), abs(of_side["body"].means[0]))
-    np.testing.assert_array_equal(estimates.covs, of_side["body"].covs[0])
+    estimates = ran(attitude_model(start=(-1.0, 0.0, 0.0, 0.0)), gyro[0], z[0])
+    each_equal((abs(estimates.means), estimates.covs), (abs(of_side["body"].means[0]), of_side["body"].covs[0]))
 
 
 def test_the_iterated_filter_holds_from_sixty_degrees():
     """Gauss and Newton's steps on the rotation lose no run, and its first errors are consistent, too."""
     truth, gyro, z = simulated(16, 50, 60.0)
-    iterated = filters.IteratedExtendedKalmanFilter(model=attitude_model(degrees=60.0), iterations=8)
-    estimates = filters.run(iterated, inputs=gyro, measurements=z)
+    estimates = ran(attitude_model(degrees=60.0), gyro, z, "iekf", iterations=8)
     nees, errors = nees_of(truth, estimates), errors_of(truth, estimates.means)
     assert 3.0 < nees[:, 0].mean() < 9.6  # the mean of 16 runs, at a level of 1e-4
     assert np.rad2deg(np.linalg.norm(errors[:, -1, :3], axis=-1)).max() < 5.0
@@ -198,14 +211,7 @@ def test_the_iterated_filter_holds_from_sixty_degrees():
 
 def test_the_iterated_filter_does_not_depend_on_the_side(data):
     """Each iteration's Jacobian is brought into the tangent of the prediction."""
-    body, world = (
-        filters.run(
-            filters.IteratedExtendedKalmanFilter(model=attitude_model(side), iterations=2),
-            inputs=data[1],
-            measurements=data[2],
-        )
-        for side in ("body", "world")
-    )
+    body, world = (ran(attitude_model(side), *data[1:], "iekf", iterations=2) for side in ("body", "world"))
     np.testing.assert_allclose(world.means, body.means, atol=1e-12)
 
 
@@ -236,15 +242,13 @@ def naive_unscented(mean, P, gyro, z):
 
 
 def test_the_unscented_filter_is_that_of_points_on_the_rotation(data):
-    """A step from 20 degrees has the naive one's estimate."""
     _, gyro, z = data
     filter_ = filters.UnscentedKalmanFilter(model=attitude_model(degrees=20.0))
     start = filter_.init()
     belief, _ = filter_.update(filter_.predict(start, gyro[0, 0]), z[0, 1])
     q, bias, P = naive_unscented(start.mean, start.cov, gyro[0, 0], z[0, 1])
     assert (q.inv() * Turned.from_quat(belief.mean[[1, 2, 3, 0]])).magnitude() < 1e-14
-    np.testing.assert_allclose(belief.mean[4:], bias, atol=1e-15)
-    np.testing.assert_allclose(belief.cov, P, atol=1e-15)
+    each_close((belief.mean[4:], belief.cov), (bias, P), atol=1e-15)
 
 
 class Sensor(gym.Env):
@@ -254,11 +258,9 @@ class Sensor(gym.Env):
     observation_space = gym.spaces.Box(-2.0, 2.0, (6,))
 
     def reset(self, *, seed=None, options=None):
-        """Begin."""
         return np.array([*GRAVITY, *FIELD], dtype=np.float32), {}
 
     def step(self, action):
-        """Turn nothing."""
         return self.reset()[0], 0.0, False, False, {}
 
 
@@ -304,45 +306,21 @@ def test_smoothed_attitudes_are_better_and_do_not_depend_on_the_side(data, of_si
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
-def test_the_filter_in_c_has_the_same_numbers(data, of_side, tmp_path):
-    """Its struct begins with seven states and a P of six rows; it compiles without a warning."""
-    _, gyro, z = data
-    generated = c_filter(filters.ExtendedKalmanFilter(model=attitude_model()), "attitude")
-    (tmp_path / "attitude.h").write_text(generated.header)
-    (tmp_path / "attitude.c").write_text(generated.source)
-    library = tmp_path / "attitude.so"
-    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-shared", "-fPIC"]
-    subprocess.run(["gcc", *flags, str(tmp_path / "attitude.c"), "-o", str(library), "-lm"], check=True)
-    c, memory = ctypes.CDLL(str(library)), np.zeros(7 + 36 + 6 + 36 + 4)
-    address = lambda array: array.ctypes.data_as(ctypes.c_void_p)  # noqa: E731
-    c.attitude_init(address(memory))
-    for k in range(20):
-        if k:
-            c.attitude_predict(address(memory), address(gyro[0, k - 1].copy()))
-        c.attitude_update(address(memory), address(z[0, k].copy()))
-    np.testing.assert_allclose(memory[:7], of_side["body"].means[0, 19], atol=1e-14)
-    np.testing.assert_allclose(memory[7:43].reshape(6, 6), of_side["body"].covs[0, 19], atol=1e-16)
-
-
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 def test_c_on_the_page_begins_at_the_attitude_of_gravity_and_field(tmp_path):
     page = (Path(__file__).parents[2] / "docs" / "attitude.md").read_text(encoding="utf-8")
-    files = write_filter(c_filter(filters.ExtendedKalmanFilter(model=attitude_model()), "attitude"), tmp_path)
     (tmp_path / "begin.c").write_text(page.split("```c\n")[1].split("```")[0])
-    library, flags = tmp_path / "begin.so", ["-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
-    subprocess.run(["gcc", *flags, *map(str, (files[1], tmp_path / "begin.c")), "-o", library, "-lm"], check=True)
-    c, memory = ctypes.CDLL(str(library)), np.zeros(7 + 36 + 6 + 36 + 4)
+    filter_ = filters.ExtendedKalmanFilter(model=attitude_model())
+    c, memory = c_library(filter_, "attitude", tmp_path, tmp_path / "begin.c")
     half_turns = [[np.pi, 0, 0], [0, np.pi, 0], [0, 0, np.pi], [np.pi / 2**0.5, -np.pi / 2**0.5, 0]]
     for turn in [*half_turns, *np.random.default_rng(2).normal(size=(20, 3)), [0.0, 0.0, 0.0]]:
         world = Turned.from_rotvec(turn)
         z = np.concatenate([9.81 * world.inv().apply(GRAVITY), 48.0 * world.inv().apply(FIELD)])
-        c.begin(*(array.ctypes.data_as(ctypes.c_void_p) for array in (memory, z)))
+        c.begin(address(memory), address(z))
         assert (world.inv() * Turned.from_quat(memory[:4], scalar_first=True)).magnitude() < 1e-7
 
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_every_filter_runs_on_rotations_or_refuses_them(name):
-    """In one line, before it computes anything."""
     extra = {"low": -np.ones(7), "high": np.ones(7)} if name == "fuzzy" else {}
     make = lambda: FILTERS[name](model=attitude_model(), **extra)  # noqa: E731
     if name in {*TAKE_ROTATIONS, *ENSEMBLES, *OTHERS}:
@@ -358,19 +336,14 @@ def test_filters_of_rotations_have_the_estimates_of_their_kin(name, data):
     """Parameters at their limits make one of the other."""
     parameters, other, of_other = TAKE_ROTATIONS[name]
     arguments = {"inputs": data[1][:2, :5], "measurements": data[2][:2, :6]}
-    models = attitude_model(), attitude_model()
-    first, second = (
-        filters.make_filter(kind, model, **more)
-        for kind, model, more in zip((name, other), models, (parameters, of_other), strict=True)
-    )
-    a, b = (filters.run(filter_, **arguments) for filter_ in (first, second))
-    np.testing.assert_allclose(a.means, b.means, atol=1e-12)
-    np.testing.assert_allclose(a.covs, b.covs, atol=1e-12)
+    both = [filters.make_filter(name, attitude_model(), **parameters)]
+    both.append(filters.make_filter(other, attitude_model(), **of_other))
+    a, b = (filters.run(filter_, **arguments) for filter_ in both)
+    each_close((a.means, a.covs), (b.means, b.covs), atol=1e-12)
     np.testing.assert_allclose(a.log_likelihoods, b.log_likelihoods, atol=1e-7)
     if name == "ckf":
-        a, b = (filters.smooth(filter_, **arguments) for filter_ in (first, second))
-        np.testing.assert_allclose(a.means, b.means, atol=1e-12)
-        np.testing.assert_allclose(a.covs, b.covs, atol=1e-12)
+        a, b = (filters.smooth(filter_, **arguments) for filter_ in both)
+        each_close((a.means, a.covs), (b.means, b.covs), atol=1e-12)
 
 
 @pytest.mark.usefixtures("as_python")
@@ -406,13 +379,11 @@ def test_a_considered_rotation_keeps_its_prior(data):
     estimates = filters.run(filter_, inputs=data[1][0, :1], measurements=data[2][0, :2])
     np.testing.assert_array_equal(estimates.means[0, :4], (1.0, 0.0, 0.0, 0.0))
     assert np.all(estimates.means[1, 4:] != 0.0)
-    with pytest.raises(ValueError, match="considered must"):
-        filters.make_filter("schmidt", attitude_model(), considered=(6,))
+    refused("considered must", filters.make_filter, "schmidt", attitude_model(), considered=(6,))
 
 
 @pytest.mark.usefixtures("as_python")
 def test_a_fixed_lag_in_an_env_takes_rotations():
-    """Its estimate of two steps ago is that of `smooth` with this lag."""
     model = attitude_model(degrees=20.0)
     env = filters.EstimateState(Sensor(), model=model, filter="ekf", smoothing_lag=2)
     _, info = env.reset(seed=1)
@@ -422,8 +393,7 @@ def test_a_fixed_lag_in_an_env_takes_rotations():
         z.append(z[0])
     data = {"inputs": np.tile(np.float32([0.3, -0.2, 0.1]).astype(float), (3, 1)), "measurements": np.array(z)}
     smoothed = filters.smooth(filters.ExtendedKalmanFilter(model=model), lag=2, **data)
-    np.testing.assert_allclose(info["smoothed"], smoothed.means[1], atol=1e-12)
-    np.testing.assert_allclose(info["smoothed_cov"], smoothed.covs[1], atol=1e-12)
+    each_close((info["smoothed"], info["smoothed_cov"]), (smoothed.means[1], smoothed.covs[1]), atol=1e-12)
 
 
 @pytest.mark.usefixtures("as_python")
@@ -460,14 +430,12 @@ def test_an_ensemble_is_updated_in_the_tangent_at_its_mean(data):
 def test_ensembles_are_consistent_from_twenty_degrees(name):
     """From there the extended filter's NEES is 10 at the first measurement."""
     truth, gyro, z = simulated(16, 40, 20.0)
-    filter_ = filters.make_filter(name, attitude_model(degrees=20.0), ensemble_size=200)
-    nees = nees_of(truth, filters.run(filter_, inputs=gyro, measurements=z))
+    nees = nees_of(truth, ran(attitude_model(degrees=20.0), gyro, z, name, ensemble_size=200))
     assert 3.0 < nees[:, 0].mean() < 9.6
     assert 3.0 < nees[:, 20:].mean() < 8.6
 
 
 def with_heading(x, u, c):
-    """A heading beside an attitude."""
     return x[0] + u[0], *rotations.product(x[1:], rotations.exponential((0.1, 0.0, 0.0)))
 
 
@@ -527,7 +495,7 @@ def test_a_model_that_is_too_large_or_cannot_be_traced_is_refused_by_a_rule():
 
 def test_tables_and_pictures_of_runs_have_angles_in_degrees(data):
     _, u, z = data
-    estimates = filters.run(filters.ExtendedKalmanFilter(model=attitude_model()), inputs=u[0], measurements=z[0])
+    estimates = ran(attitude_model(), u[0], z[0])
     table, q = estimates.to_frame(), estimates.means[:, :4]
     yaw = Turned.from_quat(q, scalar_first=True).as_euler("ZYX", degrees=True)[:, 0]
     np.testing.assert_allclose(table["yaw_deg"], yaw, atol=1e-9)
@@ -573,19 +541,15 @@ def test_every_other_path_refuses_them():
         lambda: model.replace(bounds={"b_x": (-1.0, 1.0)}),
     )
     for path in refusals:
-        with pytest.raises(ValueError, match="rotations"):
-            path()
+        refused("rotations", path)
 
 
 def test_what_is_no_rotation_is_refused():
     """Quaternions without length 1, other sides, covariances of stored numbers; a copy with other noise is one."""
     model = attitude_model()
-    with pytest.raises(ValueError, match="'attitude' must be a quaternion"):
-        attitude_model(start=(1.0, 1.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="must be 'body' or 'world', but got 'left'"):
-        attitude_model(side="left")
-    with pytest.raises(ValueError, match="prior_cov must be 6 variances"):
-        model.replace(prior_cov=np.ones(7))
+    refused("'attitude' must be a quaternion", attitude_model, start=(1.0, 1.0, 0.0, 0.0))
+    refused("must be 'body' or 'world', but got 'left'", attitude_model, side="left")
+    refused("prior_cov must be 6 variances", model.replace, prior_cov=np.ones(7))
     changed = model.replace(process_noise_cov=np.ones(6)).replace(observe_jacobian=None)
     assert changed.turns == model.turns
     assert changed.digest == model.digest != attitude_model("world").digest
@@ -619,8 +583,7 @@ def test_derivatives_of_the_likelihood():
         )
         x = model.prior_mean + e @ mean
         x[:4] /= np.linalg.norm(x[:4])
-        filter_ = filters.ExtendedKalmanFilter(model=changed.replace(prior_mean=x))
-        return filters.run(filter_, inputs=gyro, measurements=z).log_likelihoods.sum(axis=1)
+        return ran(changed.replace(prior_mean=x), gyro, z).log_likelihoods.sum(axis=1)
 
     computed = sensitivity(model, gyro, z, slopes)
     np.testing.assert_allclose(computed.values, value(np.zeros(4)), rtol=1e-12)
@@ -721,8 +684,7 @@ def test_updates_are_those_of_navlie_and_of_ukfm(data):
     belief, _ = iterated.update(iterated.init(), z)
     q, bias, P = navlie_update(Turned.identity(), np.zeros(3), model.prior_cov, z, 15)
     assert (q.inv() * Turned.from_quat(belief.mean[[1, 2, 3, 0]])).magnitude() < 1e-10
-    np.testing.assert_allclose(belief.mean[4:], bias, atol=1e-10)
-    np.testing.assert_allclose(belief.cov, P, atol=1e-10)
+    each_close((belief.mean[4:], belief.cov), (bias, P), atol=1e-10)
 
     unscented = filters.UnscentedKalmanFilter(model=model)  # beta = 2, whose weights are ukfm's
     belief, _ = unscented.update(unscented.init(), z)

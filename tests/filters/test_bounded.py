@@ -1,6 +1,5 @@
 """Estimates within bounds: truncated normals of SciPy, least squares within a box, coverage, all ways to run."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
@@ -10,9 +9,12 @@ from filters import ExtendedKalmanFilter, augmented_model, linearize, make_filte
 from filters.augmented import Unknown
 from filters.consistency.nees import mean_interval
 from filters.smoothers import WithSmoother
+from tests.filters.checks import refused
 from tests.models import KEY, scalar_model, simulated, wide_model
-from thruster_env.core.compiled import interpreted
+from tests.oracles import each_close
 from thruster_env.core.streams import truncated_normal
+
+pytestmark = pytest.mark.usefixtures("as_python")
 
 INF = np.inf
 PAGES = "kf kf-steady ekf iekf ukf ckf fading h-infinity schmidt ekf-robust sage-husa vb".split()
@@ -64,7 +66,6 @@ def naive_projection(x, p, bounds):
     return lsq_linear(white, white @ x, (low, high), method="bvls", tol=1e-14).x, p
 
 
-@pytest.mark.usefixtures("as_python")
 def test_of_several_states_the_moments_are_those_of_samples_within():
     bounds = {0: (0.0, INF), 1: (-INF, -0.5), 2: (0.0, 1.0)}
     model = wide_model(prior_cov=[[1.0, 0.5, 0.2], [0.5, 0.5, 0.1], [0.2, 0.1, 0.8]])
@@ -84,7 +85,6 @@ def test_of_several_states_the_moments_are_those_of_samples_within():
         ("projection", naive_projection, {0: (0.0, 0.2), 1: (-INF, 0.1), 2: (-0.4, INF)}),
     ],
 )
-@pytest.mark.usefixtures("as_python")
 def test_the_filter_goes_on_as_it_was_and_tells_what_is_within(by, naive, bounds):
     model = wide_model()
     inputs, measurements = simulated(model, 25, level=1.0, missing=0.2)
@@ -107,7 +107,6 @@ def test_the_filter_goes_on_as_it_was_and_tells_what_is_within(by, naive, bounds
 
 @pytest.mark.parametrize("by, naive", [("truncation", naive_truncation), ("projection", naive_projection)])
 @pytest.mark.parametrize("name, lag", [("ekf", None), ("ukf", 3)])
-@pytest.mark.usefixtures("as_python")
 def test_the_smoother_goes_back_as_without_bounds_and_tells_what_is_within(name, lag, by, naive):
     model, bounds = wide_model(), {0: (0.0, INF)}
     inputs, measurements = simulated(model, 25, level=1.0, missing=0.2)
@@ -121,7 +120,6 @@ def test_the_smoother_goes_back_as_without_bounds_and_tells_what_is_within(name,
 
 
 @pytest.mark.parametrize("name", PAGES)
-@pytest.mark.usefixtures("as_python")
 def test_each_filter_with_a_page_keeps_the_bounds_on_all_paths(name):
     model = wide_model().replace(bounds=BY_NAME)
     filter_ = make_filter(name, model)
@@ -139,12 +137,10 @@ def test_each_filter_with_a_page_keeps_the_bounds_on_all_paths(name):
             belief = filter_.predict(belief, inputs[0, k - 1])
             assert belief.mean[0] >= 0.0  # predictions are within, too
         belief, _ = filter_.update(belief, z[0, k])
-        np.testing.assert_allclose(session.mean, found.means[0, k], rtol=1e-10, atol=1e-12)
-        np.testing.assert_allclose(belief.mean, found.means[0, k], rtol=1e-10, atol=1e-12)
+        each_close((session.mean, belief.mean), (found.means[0, k], found.means[0, k]), rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(belief.cov, found.covs[0, k], rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.usefixtures("as_python")
 def test_of_a_constant_that_is_not_negative_the_belief_is_exact():
     """A constant from the positive half of a Gaussian, measured with noise: its posterior is a truncated Gaussian.
 
@@ -177,26 +173,6 @@ def test_of_a_constant_that_is_not_negative_the_belief_is_exact():
     assert np.mean(errors[None][:, -1]) < -0.1  # without bounds it is pulled below the truth
 
 
-@pytest.mark.usefixtures("as_python")
-def test_a_copy_of_a_vector_env_is_the_single_env():
-    from filters import EstimateState, EstimateStates
-    from thruster_env.thruster.model import thruster_model
-
-    model = thruster_model().replace(bounds={"omega_m": (0.0, 30.0), "U_a": (0.0, None)})
-    single = EstimateState(gym.make("BowThruster-v0"), "ekf", model=model)
-    vector = EstimateStates(
-        gym.make_vec("BowThruster-v0", num_envs=2, vectorization_mode="sync"), "ekf", model=model
-    )
-    _, one = single.reset(seed=4)
-    _, many = vector.reset(seed=4)
-    for action in (12.0, 12.0, -12.0, -12.0, -12.0):
-        *_, one = single.step(np.array([action]))
-        *_, many = vector.step(np.full((2, 1), action))
-        np.testing.assert_allclose(many["estimate"][0], one["estimate"], rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(many["estimate_cov"][0], one["estimate_cov"], rtol=1e-9, atol=1e-12)
-        assert 0.0 <= one["estimate"][0] <= 30.0 and one["estimate"][1] >= 0.0
-
-
 def test_other_models_made_of_one_keep_its_bounds():
     model = wide_model().replace(bounds=BY_NAME, bounded_by="projection")
     joint = augmented_model(model, {0: Unknown(0.1)})
@@ -214,8 +190,7 @@ def test_wrong_bounds_and_what_cannot_keep_them_are_refused():
             ValueError, match="bounds of x_2 must be two increasing numbers, of which one may be None"
         ):
             model.replace(bounds={1: pair})
-    with pytest.raises(ValueError, match="bounded_by must be one of truncation, projection"):
-        model.replace(bounded_by="clipping")
+    refused("bounded_by must be one of truncation, projection", model.replace, bounded_by="clipping")
     bounded = ExtendedKalmanFilter(model=model.replace(bounds=BY_NAME))
-    with interpreted(), pytest.raises(ValueError, match="a smoothing_lag needs a model without bounds, but got"):
+    with pytest.raises(ValueError, match="a smoothing_lag needs a model without bounds, but got"):
         WithSmoother(bounded.session(), bounded, 1)

@@ -10,11 +10,13 @@ from filters.c.project import c_filter, sizes_of, write_project
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import alarms_of, columns_of
 from filters.monitoring import TESTS, Monitor
-from tests.filters.test_c import SANITIZERS, WARNINGS, log_of, made
+from tests.filters.test_c import SANITIZERS, compiled, filtered, log_of, log_program, made
 from tests.filters.test_filter_paths import diverging
 from tests.models import lonely_model, simulated, wide_model
 from thruster_env.core.streams import filter_keys
 from thruster_env.env.model_env import ReplayEnv
+
+pytestmark = pytest.mark.usefixtures("as_python")
 
 MAIN = """\
 #include "one.h"
@@ -77,9 +79,7 @@ def told_by_c(filter_, inputs, z, folder, monitor=MONITOR, single=False):
     for name, text in {"one.h": code.header, "one.c": code.source, "main.c": main}.items():
         (folder / name).write_text(text)
     promoted = ["-Wdouble-promotion"] * single
-    command = ["gcc", *WARNINGS, *promoted, *SANITIZERS, "one.c", "main.c", "-lm", "-o", "one"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    compiled(folder, *promoted, *SANITIZERS, "one.c", "main.c", "-lm", "-o", "one")
     rows = np.concatenate([np.concatenate([np.zeros((1, model.inputs)), inputs]), z], axis=1)
     text = "\n".join(" ".join(f"{number:.17g}" for number in row) for row in rows)
     lines = subprocess.run([folder / "one"], input=text, capture_output=True, text=True, check=True).stdout
@@ -127,7 +127,6 @@ def faulty(model, steps=600):
     return inputs, z
 
 
-@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("make", [wide_model, thruster_model, lonely_model])
 @pytest.mark.parametrize("name", ["ekf", "enkf", "sage-husa"])
 def test_alarms_are_those_of_python_step_by_step(name, make, tmp_path):
@@ -139,7 +138,6 @@ def test_alarms_are_those_of_python_step_by_step(name, make, tmp_path):
     assert not all(expected[1]) and any(expected[1])
 
 
-@pytest.mark.usefixtures("as_python")
 def test_every_test_raises_alarms_in_c(tmp_path):
     filter_ = made("ekf", wide_model())
     inputs, z = faulty(filter_.model)
@@ -151,7 +149,6 @@ def test_every_test_raises_alarms_in_c(tmp_path):
     assert not any(healthy[106:130]) and not any(healthy[404:420])  # longer than MONITOR.memory after the alarm
 
 
-@pytest.mark.usefixtures("as_python")
 def test_floats_raise_the_same_alarms_of_a_stuck_sensor(tmp_path):
     filter_ = made("ekf", wide_model())
     inputs, z = faulty(filter_.model)
@@ -162,7 +159,6 @@ def test_floats_raise_the_same_alarms_of_a_stuck_sensor(tmp_path):
     assert len(set(one[:3] for one in found[0]) ^ set(one[:3] for one in expected[0])) <= len(expected[0]) // 10
 
 
-@pytest.mark.usefixtures("as_python")
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python says so when a number overflows
 def test_a_filter_that_is_lost_says_nothing_of_its_sensors(tmp_path):
     filter_, inputs, z = diverging("ekf")
@@ -170,19 +166,13 @@ def test_a_filter_that_is_lost_says_nothing_of_its_sensors(tmp_path):
     assert_same(told_by_c(filter_, inputs, z, tmp_path), told_by_python(filter_, inputs, z))
 
 
-@pytest.mark.usefixtures("as_python")
 def test_a_project_counts_alarms_as_estimate_does(tmp_path):
     model = thruster_model()
     inputs, z = faulty(model)
     filter_ = made("ekf", model)
-    files = write_project(filter_, tmp_path / "c", "one", monitor={"steps_between": 2000.0, "stuck": 5})
-    assert [file.name for file in files] == ["one.h", "one.c", "one.hpp", "main.c", "CMakeLists.txt", "README.md"]
-    command = ["gcc", *WARNINGS, *SANITIZERS, "one.c", "main.c", "-lm", "-o", "one_log"]
-    done = subprocess.run(command, cwd=tmp_path / "c", capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    log = log_of(model, inputs, z)
-    printed = subprocess.run([tmp_path / "c" / "one_log"], input=log, capture_output=True, text=True, check=True)
-    headers, *rows = (line.split(",") for line in printed.stdout.splitlines())
+    monitor, log = {"steps_between": 2000.0, "stuck": 5}, log_of(model, inputs, z)
+    program, _ = log_program(filter_, tmp_path, *SANITIZERS, monitor=monitor)
+    headers, *rows = (line.split(",") for line in filtered(program, log).splitlines())
     (tmp_path / "log.csv").write_text(log)
     found = estimate_with(filter_, ReplayEnv(tmp_path / "log.csv", model).log)
     alarms = alarms_of(found, Monitor(steps_between=2000.0, stuck=5), 50)
@@ -191,7 +181,6 @@ def test_a_project_counts_alarms_as_estimate_does(tmp_path):
     assert [float(row[place]) for row in rows] == expected.tolist() and expected.sum() > 3
 
 
-@pytest.mark.usefixtures("as_python")
 def test_the_readme_has_the_thresholds_and_the_bytes(tmp_path):
     filter_, monitor = made("ekf", wide_model()), Monitor()
     write_project(filter_, tmp_path, "one", monitor=100_000)
@@ -208,7 +197,6 @@ def test_the_readme_has_the_thresholds_and_the_bytes(tmp_path):
     assert "tests" not in c_filter(filter_, "one").header and "1 | `ONE_OUTLIER` |" in readme
 
 
-@pytest.mark.usefixtures("as_python")
 def test_a_class_of_cpp_tells_alarms(tmp_path):
     write_project(made("ekf", lonely_model()), tmp_path, "one", monitor={"stuck": 3})
     (tmp_path / "use.cpp").write_text(
@@ -218,11 +206,7 @@ def test_a_class_of_cpp_tells_alarms(tmp_path):
         '    std::printf("%d ", filter.healthy());\n    filter.test_anew();\n'
         '    std::printf("%d %u\\n", filter.healthy(), filter.alarms(0));\n}\n'
     )
-    for command in (
-        ["gcc", *WARNINGS, "-c", "one.c"],
-        "g++ -std=c++11 -Wall -Wextra -Werror use.cpp one.o -lm -o use".split(),
-    ):
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
+    compiled(tmp_path, "-c", "one.c")
+    compiled(tmp_path, command="g++ -std=c++11 -Wall -Wextra -Werror use.cpp one.o -lm -o use".split())
     printed = subprocess.run([tmp_path / "use"], capture_output=True, text=True, check=True).stdout
     assert printed.split() == ["0", "0", "1", "0", "1", "0"]

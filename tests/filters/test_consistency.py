@@ -1,11 +1,16 @@
-"""Checks of a filter's honesty by its squares and innovations, on data whose honesty is known."""
+"""Checks of squares, innovations, distributions and ranks against closed forms, on data whose truth is known."""
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.stats import chi2, kstest, norm
 
 from filters.consistency.nees import (
     check_whitened,
+    covered,
+    ensemble_crps,
+    ensemble_ranks,
+    gaussian_crps,
     mean_interval,
     rmse_intervals,
     rmse_ratios,
@@ -13,7 +18,20 @@ from filters.consistency.nees import (
     whitened,
     whiteness,
 )
-from filters.consistency.report import whiteness_sentence
+from filters.consistency.report import (
+    HEAVY,
+    STUCK,
+    longest_stretches,
+    ranks_verdict,
+    sentences,
+    whiteness_sentence,
+)
+from tests.filters.checks import refused
+from tests.linear_problem import LinearProblem
+from tuning.evaluation.baselines import noise_estimated
+from tuning.evaluation.evaluate import check_consistency
+from tuning.plants.thruster import find_scenario
+from tuning.search.space import oracle_choice
 
 COV = np.array([[2.0, 0.6], [0.6, 0.5]])
 
@@ -54,8 +72,7 @@ class TestIntervals:
         alone = rmse_intervals(a)[0]
         assert alone.value == pytest.approx(np.sqrt(a[:, 0].mean())) and alone.high / alone.low > 1.15
         assert rmse_ratios(a, a) == ((1.0, 1.0, 1.0),) * 2
-        with pytest.raises(ValueError, match="the same runs and states"):
-            rmse_ratios(a, b[1:])
+        refused("the same runs and states", rmse_ratios, a, b[1:])
 
 
 class TestSquares:
@@ -164,3 +181,105 @@ class TestWhiteness:
         )
         assert "from one step to the next, of channel 1 with channel 1" in said
         assert whiteness_sentence(whiteness(np.zeros((2, 30, 1)), np.zeros((2, 30, 1, 1)))).startswith("No test")
+
+
+@pytest.mark.parametrize(("error", "deviation"), [(0.0, 1.0), (1.3, 0.7), (-4.0, 2.0)])
+def test_the_gaussian_crps_is_its_integral(error, deviation):
+    # forecast N(error, deviation^2), truth 0
+    below, _ = quad(lambda x: norm.cdf(x, error, deviation) ** 2, -30, 0)
+    above, _ = quad(lambda x: norm.sf(x, error, deviation) ** 2, 0, 30)
+    assert gaussian_crps(np.array(error), np.array(deviation)) == pytest.approx(below + above, rel=1e-7)
+
+
+def test_of_a_right_forecast_it_is_the_deviation_over_the_root_of_pi():
+    errors = np.random.default_rng(7).normal(0.0, 1.7, size=200_000)
+    score = gaussian_crps(errors, np.full(errors.shape, 1.7))
+    assert score.mean() == pytest.approx(1.7 / np.sqrt(np.pi), abs=4 * score.std() / np.sqrt(200_000))
+    assert gaussian_crps(np.array(-2.5), np.array(0.0)) == 2.5
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_ensemble_crps_is_the_naive_double_sum(weighted):
+    rng = np.random.default_rng(8)
+    truth_, members = rng.normal(size=6), rng.normal(size=(6, 9))
+    weights = rng.dirichlet(np.ones(9), size=6) if weighted else None
+    w = np.full((6, 9), 1 / 9) if weights is None else weights
+    between = np.abs(members[:, :, None] - members[:, None, :])
+    expected = (w * np.abs(members - truth_[:, None])).sum(1) - 0.5 * np.einsum("bi,bj,bij->b", w, w, between)
+    np.testing.assert_allclose(ensemble_crps(truth_, members, weights), expected, rtol=1e-12)
+    if not weighted:
+        fair = np.abs(members - truth_[:, None]).mean(1) - between.sum((1, 2)) / (2 * 9 * 8)
+        np.testing.assert_allclose(ensemble_crps(truth_, members, fair=True), fair, rtol=1e-12)
+    else:
+        refused("members without weights", ensemble_crps, truth_, members, weights, fair=True)
+
+
+def test_the_fair_score_does_not_depend_on_the_size():
+    rng = np.random.default_rng(9)
+    for size in (3, 30):
+        score = ensemble_crps(rng.normal(size=40_000), rng.normal(size=(40_000, size)), fair=True)
+        assert score.mean() == pytest.approx(1 / np.sqrt(np.pi), abs=4 * score.std() / 200)
+
+
+def test_coverage_is_that_of_the_normal_distribution():
+    errors = np.random.default_rng(10).normal(size=100_000)
+    for level, deviation in ((0.95, 1.0), (0.95, 0.5), (0.5, 1.0)):
+        expected = 2 * norm.cdf(deviation * norm.ppf(0.5 + level / 2)) - 1
+        assert covered(errors, np.full(errors.shape, deviation), level).mean() == pytest.approx(
+            expected, abs=0.007
+        )
+    assert np.isnan(covered(np.ones(1), np.zeros(1))).all()
+
+
+def test_ranks_count_the_members_below():
+    members = np.array([[0.0, 1.0, 2.0], [5.0, 4.0, 6.0]])
+    np.testing.assert_allclose(ensemble_ranks(np.array([1.5, 3.0]), members), [2.5 / 4, 0.5 / 4])
+    equal = np.full((2, 3), 1 / 3)
+    np.testing.assert_allclose(ensemble_ranks(np.array([1.5, 3.0]), members, equal), [2.5 / 4, 0.5 / 4])
+
+
+@pytest.mark.parametrize(
+    ("spread", "shift", "word"),
+    [(1.0, 0.0, "even"), (0.6, 0.0, "too close"), (1.7, 0.0, "too far"), (1.0, 0.7, "too high")],
+)
+def test_rank_histograms_tell_how_members_are_wrong(spread, shift, word):
+    rng = np.random.default_rng(11)
+    ranks = ensemble_ranks(rng.normal(size=(60, 50)), shift + spread * rng.normal(size=(60, 50, 10)))
+    found = uniformity(ranks, steps=11)
+    assert len(found.frequencies) == 11 and word in ranks_verdict(found)
+
+
+def _said(problem, choice, data):
+    return sentences(check_consistency(choice.filter(problem), data))[-1]
+
+
+def test_outliers_name_the_robust_filter_and_no_constant_to_estimate():
+    problem = find_scenario("outliers")
+    said = _said(problem, noise_estimated("ekf", problem), problem.data(range(20)))
+    assert "ekf-robust" in said and "--gate" in said and "--augment" not in said
+
+
+def test_a_stuck_channel_is_named_and_a_normal_one_is_not():
+    problem = LinearProblem(steps=200)
+    data = problem.data(range(4))
+    choice = oracle_choice("kf", problem)
+    fine = check_consistency(choice.filter(problem), data)
+    assert max(fine.repeats) < STUCK and max(fine.tails) < HEAVY
+    stuck = data.measurements.copy()
+    stuck[0, 60:150, 1] = stuck[0, 59, 1] if np.isfinite(stuck[0, 59, 1]) else 0.3
+    said = _said(problem, choice, data._replace(measurements=stuck))
+    assert "look at speed [m/s], which has 9" in said and "equal readings in a row" in said
+
+
+def test_a_stretch_of_equal_readings_is_counted_and_missing_ones_are_not_equal():
+    values = np.array([[[1.0], [1.0], [1.0], [np.nan], [np.nan], [2.0]]])
+    assert longest_stretches(values).tolist() == [[3]]
+
+
+def test_the_sample_time_is_no_constant_to_estimate():
+    problem = find_scenario("nominal").replace(steps=200)
+    report = check_consistency(oracle_choice("ekf", problem).filter(problem), problem.data(range(3)))
+    changed = report._replace(constants=("dt", "lift"), whiteness=report.whiteness._replace(p_value=0.0))
+    nees = changed.nees._replace(mean=changed.nees.mean._replace(value=9.0, low=8.0, high=10.0))
+    said = sentences(changed._replace(nees=nees, tails=()))[-1]
+    assert "it has lift)" in said and "dt" not in said

@@ -147,8 +147,6 @@ def update_in_part(model, x, z, e):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PartlyFilter(EnsembleFilter):
-    """A user's ensemble filter."""
-
     name: ClassVar[str] = "partly"
     page: ClassVar[Page] = Page(propagate, add_process_noise, update_in_part)
     part: float = 0.5

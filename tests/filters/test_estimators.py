@@ -1,7 +1,8 @@
-"""Other people's estimators in the place of a filter: contract, evaluation, comparison, wrappers, command line."""
+"""Other people's estimators in the place of a filter: contract, comparison, wrappers, repeated runs."""
 
 import copy
 import math
+import random
 
 import gymnasium as gym
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from filters import EstimateState, make_filter, run
 from filters.estimators.foreign import Estimator
 from filters.wrappers.envs import EstimateStates
+from tests.filters.checks import refused
 from tests.models import random_affine, simulated
+from tests.oracles import each_close
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import evaluate
@@ -28,13 +31,7 @@ class Textbook(Estimator):
     """The Kalman filter of an affine model as a user may write it, on arrays, channels left out where missing."""
 
     def __init__(self, model):
-        zero, n = (0.0,) * model.inputs, model.n
-        self.f = np.array(model.transition((0.0,) * n, zero, model.constants))
-        columns = [np.array(model.transition(tuple(row), zero, model.constants)) - self.f for row in np.eye(n)]
-        self.a, self.h0 = np.array(columns).T, np.array(model.observe((0.0,) * n, model.constants))
-        inputs = [model.transition((0.0,) * n, tuple(row), model.constants) for row in np.eye(model.inputs)]
-        self.b = (np.array(inputs).reshape(-1, n) - self.f).T
-        self.h = np.array([np.array(model.observe(tuple(row), model.constants)) - self.h0 for row in np.eye(n)]).T
+        self.a, self.b, self.f, self.h, self.h0 = model.matrices()
         self.model = model
 
     def reset(self, key, z):
@@ -135,8 +132,7 @@ def test_a_user_s_kalman_filter_gives_what_ours_gives_missing_channels_and_likel
     model = random_affine(n=3, m=2, p=1, seed=5)
     data = data_of(model, missing)
     ours, theirs = run(make_filter("kf", model), *data), run(make_filter(Textbook, model), *data)
-    for one, other in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-9)
+    each_close(ours, theirs, rtol=1e-8, atol=1e-9)
 
 
 def test_an_estimator_stands_in_evaluation_and_comparison_beside_ours():
@@ -199,9 +195,7 @@ def test_a_covariance_without_an_innovation_has_a_nees_but_no_nis_and_no_likelih
 )  # fmt: skip
 def test_what_an_estimator_gets_wrong_is_one_line_with_the_rule_and_where(estimator, rule):
     data = NOMINAL.data(SEEDS)
-    with pytest.raises(ValueError, match=rule) as error:
-        evaluate(make_filter(estimator, NOMINAL.model()), data, NOMINAL.scale)
-    assert "\n" not in str(error.value)
+    refused(rule, evaluate, make_filter(estimator, NOMINAL.model()), data, NOMINAL.scale)
 
 
 @pytest.mark.parametrize(
@@ -224,8 +218,7 @@ def test_what_is_no_estimator_is_refused(given, rule):
 def test_what_needs_a_filter_of_ours_says_so():
     filter_ = make_filter(AtOnce(), NOMINAL.model())
     for call in (filter_.init, filter_.kernels, lambda: filter_.predict(None, [0.0])):
-        with pytest.raises(ValueError, match="needs a filter of filters.FILTERS, but got the estimator 'AtOnce'"):
-            call()
+        refused("needs a filter of filters.FILTERS, but got the estimator 'AtOnce'", call)
     with pytest.raises(ValueError, match="cannot vary from step to step"):
         run(
             filter_, np.zeros((1, 2)), np.zeros((1, 1, 1)), np.zeros((1, 2, 1)), process_noise_covs=np.eye(2)[None]
@@ -243,8 +236,7 @@ def test_what_it_says_it_is_tuned_by_a_study_may_choose_but_no_file_keeps():
     filter_ = choice.filter(NOMINAL)
     assert filter_.estimator.given[0] == 3.0 and filter_.estimator.model.measurement_noise_cov[0, 0] == 0.5
     assert choice_of(name, {}, NOMINAL).numbers == {"gain": 2.0}
-    with pytest.raises(ValueError, match="a tuned file must be of a filter of filters.FILTERS, but got"):
-        check_keepable(name)
+    refused("a tuned file must be of a filter of filters.FILTERS, but got", check_keepable, name)
 
 
 class Wall(gym.Env):
@@ -330,9 +322,120 @@ def test_an_object_is_kept_in_the_spec_but_not_as_text():
 def test_a_session_refuses_what_an_estimator_cannot_be_set_to(use, rule):
     session = make_filter(Scripted(name="mine"), random_affine(2, 1, 1)).session()
     session.start((1, 2), [0.0])
-    with pytest.raises(ValueError, match=rule) as error:
-        use(session)
-    assert "\n" not in str(error.value)
+    refused(rule, use, session)
     session.set_noise()
     session.scale_process_noise(1.0)
     session.step([0.0], [0.0])  # and nothing has changed
+
+
+KEYS = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+STEPS = 6
+
+
+class Walks(Estimator):
+    """Draws its estimate, and remembers all that it ever drew."""
+
+    has_covariance = False
+
+    def __init__(self, n, draw):
+        self.n, self.draw, self.count = n, draw, 0.0
+
+    def reset(self, key, z):
+        return self.step(None, z)
+
+    def step(self, u, z):
+        self.count += 1.0
+        if u is not None:
+            u[:] = np.nan  # its own copies, to do with what it likes
+        z[:] = np.nan
+        return np.full(self.n, self.draw() + self.count)
+
+
+class DrawnAtOnce(Estimator):
+    """All runs at once, from the global generator, and what it remembers."""
+
+    has_covariance = False
+
+    def __init__(self, n, draw):
+        self.n, self.draw, self.count = n, draw, 0.0
+
+    def run(self, keys, inputs, measurements):
+        self.count += 1.0
+        draws = [[self.draw() + self.count for _ in range(measurements.shape[1])] for _ in keys]
+        return np.repeat(np.array(draws)[..., None], self.n, axis=2)
+
+
+def torchs():
+    return float(pytest.importorskip("torch").randn(()))
+
+
+@pytest.fixture
+def data():
+    model = random_affine(2)
+    rng = np.random.default_rng(2)
+    return model, rng.normal(size=(3, STEPS, model.inputs)), rng.normal(size=(3, STEPS + 1, model.m))
+
+
+def unseeded():
+    """Draws of generators of its own, which nobody seeds."""
+    return np.random.default_rng().normal
+
+
+DRAWS = [np.random.normal, random.random, torchs, unseeded(), lambda: np.random.normal()]
+
+
+@pytest.mark.parametrize("draw", DRAWS)
+def test_a_run_is_a_function_of_its_key_and_data(draw, data):
+    model, inputs, measurements = data
+    inputs.setflags(write=False)
+    draw()
+    before = np.random.get_state()[1].copy(), random.getstate()
+    filter_ = make_filter(Walks(model.n, draw), model)
+    whole = run(filter_, KEYS, inputs, measurements).means
+    np.testing.assert_array_equal(np.random.get_state()[1], before[0])
+    assert random.getstate() == before[1], "what others draw goes on as it would"
+    assert len(np.unique(np.round(whole[..., 0] % 1.0, 12))) == whole[..., 0].size, "each run draws its own"
+    for b in reversed(range(3)):
+        alone = run(filter_, KEYS[b : b + 1], inputs[b : b + 1], measurements[b : b + 1]).means
+        np.testing.assert_array_equal(alone[0], whole[b])
+        session = filter_.session()
+        session.start(KEYS[b], measurements[b, 0])
+        means = [session.mean.copy()]
+        for k in range(STEPS):
+            draw()  # somebody else's
+            session.step(inputs[b, k], measurements[b, k + 1])
+            means.append(session.mean.copy())
+        np.testing.assert_array_equal(means, whole[b])
+
+
+@pytest.mark.parametrize("draw", DRAWS)
+def test_all_runs_at_once_are_the_same_again(draw, data):
+    model, inputs, measurements = data
+    filter_ = make_filter(DrawnAtOnce(model.n, draw), model)
+    first, again = (run(filter_, KEYS, inputs, measurements).means for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    other = run(filter_, KEYS[::-1].copy(), inputs, measurements).means
+    assert not np.array_equal(first, other)
+
+
+def test_sessions_in_turns_keep_their_own_generators(data):
+    model, inputs, measurements = data
+    filter_ = make_filter(Walks(model.n, np.random.normal), model)
+    whole = run(filter_, KEYS, inputs, measurements).means
+    sessions = [filter_.session() for _ in KEYS]
+    for session, key, z in zip(sessions, KEYS, measurements, strict=True):
+        session.start(key, z[0])
+    for k in range(STEPS):
+        for b, session in enumerate(sessions):
+            session.step(inputs[b, k], measurements[b, k + 1])
+            np.testing.assert_array_equal(session.mean, whole[b, k + 1])
+
+
+def test_what_draws_from_a_generator_that_nobody_can_seed_is_refused(data):
+    model, inputs, measurements = data
+    hidden = np.random.default_rng(1)
+    filter_ = make_filter(Walks(model.n, lambda: hidden.normal()), model)
+    rule = (
+        "the estimator 'Walks' must give the same for the same key and data, but when run 0 is repeated, its mean"
+    )
+    refused(rule, run, filter_, KEYS, inputs, measurements)

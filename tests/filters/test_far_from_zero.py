@@ -1,7 +1,4 @@
-"""Models whose functions branch or cannot be traced, far from zero and in any unit: the same numbers.
-
-A body is moved by an input, and ranged from a point beside its way. Far from zero both are moved together.
-"""
+"""Models that branch, cannot be traced, have kinks at rest or lie far from zero, in any unit: the same numbers."""
 
 import math
 
@@ -12,8 +9,10 @@ import torch
 import filters
 from filters import make_filter, run
 from filters.c.project import c_filter
-from filters.sensitivity import ModelSlopes, sensitivity
+from filters.sensitivity import ModelSlopes, likelihood, sensitivity
+from tests.filters.textbooks import extended_filter
 from tests.models import simulated, state_space
+from tests.oracles import each_close
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.derivatives import jacobian, step_growth, step_of
 from thruster_env.model.affine import linearize
@@ -84,27 +83,20 @@ def test_estimates_far_from_zero_are_those_near_zero(name, called):
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def by_hand(inputs, z):
-    """The extended filter of the body, as a textbook has it."""
-    model, means = body(), []
-    x, p = model.prior_mean, model.prior_cov
-    for k, seen in enumerate(z[:, 0]):
-        if k:
-            f = np.array([[1.0, DT], [0.0, 1.0 - DT * 0.4 * abs(x[1])]])
-            x, p = np.array(moved(x, inputs[k - 1], model.constants)), f @ p @ f.T + model.process_noise_cov
-        h = np.array([[1.0 if x[0] > 30.0 else x[0] / math.hypot(x[0], 2.0), 0.0]])
-        gain = p @ h.T / (h @ p @ h.T + 0.01)
-        x, p = x + gain[:, 0] * (seen - ranged(x, model.constants)[0]), p - gain @ h @ p
-        means.append(x)
-    return np.array(means)
+def moved_slopes(x, u, c):
+    return (1.0, DT), (0.0, 1.0 - DT * 0.4 * abs(x[1]))
+
+
+def ranged_slopes(x, c):
+    return ((1.0 if x[0] > 30.0 else x[0] / math.hypot(x[0], 2.0), 0.0),)
 
 
 @pytest.mark.usefixtures("as_python")
 def test_a_branch_has_the_slope_of_its_side():
     inputs, z = data()
     found = run(make_filter("ekf", body()), None, inputs, z).means
-    for k in range(2):
-        np.testing.assert_allclose(found[k], by_hand(inputs[k], z[k]), atol=1e-11)
+    by_hand = body(transition_jacobian=moved_slopes, observe_jacobian=ranged_slopes)
+    each_close(found, [extended_filter(by_hand, *run_)[0] for run_ in zip(inputs, z, strict=True)], atol=1e-11)
 
 
 @pytest.mark.usefixtures("as_python")
@@ -218,8 +210,7 @@ def test_an_approximation_far_from_zero_is_that_near_zero(called):
     )
     for k in (0, 1, 3):  # A, B, C
         np.testing.assert_allclose(far[k], near[k], atol=1e-6)
-    np.testing.assert_allclose(near[0], [[1.0, DT], [0.0, 1.0 - DT * 0.2]], atol=1e-9)
-    np.testing.assert_allclose(near[1], [[0.0], [DT]], atol=1e-9)
+    each_close((near[0], near[1]), ([[1.0, DT], [0.0, 1.0 - DT * 0.2]], [[0.0], [DT]]), atol=1e-9)
 
 
 @pytest.mark.usefixtures("as_python")
@@ -239,3 +230,123 @@ def test_slopes_along_constants_of_called_functions_far_from_zero():
     expected = gradient(0.0, 1.0, called=False)
     for offset, unit, called in ((5e6, 1.0, False), (0.0, 1.0, True), (5e6, 1.0, True), (-5.0, 1e-6, True)):
         np.testing.assert_allclose(gradient(offset, unit, called), expected, rtol=0.01)
+
+
+def drag(x, u, c):
+    """A body in a plane, with a drag that grows with the square of its speed: position, velocity."""
+    speed = math.sqrt(x[2] * x[2] + x[3] * x[3])
+    ahead, abeam = (DT * (u[k] - c[0] * speed * x[2 + k]) for k in range(2))
+    return x[0] + DT * x[2], x[1] + DT * x[3], x[2] + ahead, x[3] + abeam
+
+
+def drag_slopes(x, u, c):
+    """By hand, with the limit at rest."""
+    speed = math.sqrt(x[2] * x[2] + x[3] * x[3])
+    if speed == 0.0:
+        by_velocity = (0.0, 0.0, 0.0)
+    else:
+        by_velocity = speed + x[2] * x[2] / speed, x[2] * x[3] / speed, speed + x[3] * x[3] / speed
+    a, b, d = (DT * c[0] * one for one in by_velocity)
+    return (1.0, 0.0, DT, 0.0), (0.0, 1.0, 0.0, DT), (0.0, 0.0, 1.0 - a, -b), (0.0, 0.0, -b, 1.0 - d)
+
+
+def place(x, c):
+    return x[0], x[1]
+
+
+def at_rest(**changes):
+    noise = {"q": [1e-4, 1e-4, 1e-3, 1e-3], "r": [0.01, 0.01]}
+    prior = {"mean": [0.0] * 4, "cov": [0.01] * 4}
+    return state_space(drag, place, **noise, **prior, **{"inputs": 2, "constants": (0.3,), **changes})
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", LINEARISING)
+def test_a_body_at_rest_is_estimated_as_with_slopes_by_hand(name):
+    inputs, z = simulated(at_rest(), 25, count=2, level=2.0)
+    keys = np.arange(4.0).reshape(2, 2)
+    found, expected = (
+        run(make_filter(name, at_rest(transition_jacobian=one)), keys, inputs, z) for one in (None, drag_slopes)
+    )
+    assert not found.divergences.any() and abs(found.means[:, -1, 2:]).max() > 0.5
+    np.testing.assert_allclose(found.means, expected.means, atol=1e-9)
+
+
+def powered(x, u, c):
+    """A speed, with a drag of any exponent."""
+    return (x[0] + DT * (u[0] - c[0] * np.sign(x[0]) * abs(x[0]) ** c[1]),)
+
+
+def tank(x, u, c):
+    """A level that falls as Torricelli says."""
+    return (x[0] + DT * (u[0] - c[0] * math.sqrt(max(x[0], 0.0))),)
+
+
+def one_state(transition, constants, start=0.0):
+    noise = {"q": [1e-4], "r": [0.01]}
+    prior = {"mean": [start], "cov": [0.04]}
+    return state_space(transition, lambda x, c: (x[0],), **noise, **prior, inputs=1, constants=constants)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_an_exponent_is_identified_from_rest():
+    model = one_state(powered, (0.5, 1.8))
+    inputs, z = simulated(model, 60, count=2, level=2.0)
+    none = np.zeros((2, 1, 1))
+    found = sensitivity(model, inputs, z, ModelSlopes(np.eye(2), none, none, np.zeros((2, 1)), none))
+    assert (np.linalg.eigvalsh(found.information) > 0.0).all()
+    step = 1e-5
+    for k in range(2):
+        sides = []
+        for sign in (1.0, -1.0):
+            c = np.array(model.constants) + sign * step * np.eye(2)[k]
+            sides.append(likelihood(model.replace(constants=tuple(c)), inputs, z, none[:1], none[:1]).values.sum())
+        assert found.gradients.sum(axis=0)[k] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-4)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_tank_that_empties_does_not_restart():
+    model = one_state(tank, (0.5,), start=0.1)
+    z = np.zeros((1, 41, 1))
+    found = run(make_filter("ekf", model), None, np.zeros((1, 40, 1)), z)
+    assert not found.divergences.any() and np.isfinite(found.means).all()
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize(
+    "make", [at_rest, lambda: one_state(tank, (0.5,)), lambda: one_state(powered, (0.5, 1.8))]
+)
+def test_tensors_have_finite_derivatives_at_rest(make):
+    model = make()
+    inputs, z = simulated(model, 8, count=2, level=1.0)
+    inputs[:, :3] = 0.0
+    on_tensors = filters.torch(make_filter("ekf", model))
+    q = torch.tensor(model.process_noise_cov, requires_grad=True)
+    c = torch.tensor(model.constants, dtype=torch.float64, requires_grad=True)
+    means = on_tensors.replace(process_noise_cov=q, constants=c).run(inputs, z).means
+    np.testing.assert_allclose(
+        means.detach(), run(make_filter("ekf", model), None, inputs, z).means, rtol=0, atol=1e-10
+    )
+    (means**2).sum().backward()
+    assert torch.isfinite(q.grad).all() and torch.isfinite(c.grad).all() and c.grad.any()
+
+
+def drag_of_tensors(x, u, c):
+    """The same for torch, whose root at rest has an infinite slope."""
+    speed = torch.sqrt(x[2] * x[2] + x[3] * x[3])
+    low = (x[2] ** 2) ** 0.5 + torch.hypot(x[2], x[3]) + torch.atan2(x[2], x[3]) * torch.acos(1.0 + 0.0 * x[3])
+    ahead, abeam = (DT * (u[k] - (c[0] + 0.0 * low) * speed * x[2 + k]) for k in range(2))
+    return x[0] + DT * x[2], x[1] + DT * x[3], x[2] + ahead, x[3] + abeam
+
+
+def test_functions_of_tensors_have_finite_slopes_at_rest():
+    inputs, z = simulated(at_rest(), 5, count=2, level=2.0)
+    filter_ = make_filter("ekf", at_rest())
+    graph, given = filters.torch(filter_), filters.torch(filter_, transition=drag_of_tensors)
+    found = []
+    for one in (graph, given):
+        c = torch.tensor([0.3], dtype=torch.float64, requires_grad=True)
+        estimates = one.replace(constants=c).run(inputs, z)
+        assert not estimates.divergences.any()
+        found.append((estimates.means.detach(), torch.autograd.grad(estimates.log_likelihoods.sum(), c)[0]))
+    torch.testing.assert_close(*found, rtol=1e-10, atol=1e-12)

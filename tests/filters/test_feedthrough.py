@@ -25,7 +25,9 @@ from filters.c.project import write_project
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import findings, verdict
 from filters.sensitivity import likelihood
+from tests.filters.checks import refused
 from tests.filters.test_c import WARNINGS, built, printed
+from tests.oracles import each_close, each_equal
 from tests.slow import slow_but
 from thruster_env.core.streams import episode_keys, filter_keys
 from thruster_env.env.model_env import ModelEnv, ModelVectorEnv, ReplayEnv
@@ -40,6 +42,8 @@ from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Coordinates, Parameter
 from tuning.reporting.matlab import matlab_function
 from tuning.search.space import untuned_choice
+
+pytestmark = pytest.mark.usefixtures("as_python")
 
 D = -2.0
 NOISE = {
@@ -90,7 +94,6 @@ def own(name):
     return {"inverted": 0} if name == "inversion" else {"ensemble_size": 8} if package in ENSEMBLES else {}
 
 
-@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", slow_but([name for name in FILTERS if name != "low-pass"], QUICK))
 def test_of_every_filter(name):
     inputs, z = data(steps=6)
@@ -105,26 +108,21 @@ def test_of_every_filter(name):
     for u, measured in zip(inputs[0], z[0, 1:], strict=True):
         session.step(u, measured)
         belief, _ = first.update(first.predict(belief, u), measured)
-    np.testing.assert_allclose(session.mean, estimates.means[0, -1], rtol=1e-12)
-    np.testing.assert_allclose(belief.mean, estimates.means[0, -1], rtol=1e-12)
+    each_close((session.mean, belief.mean), (estimates.means[0, -1], estimates.means[0, -1]), rtol=1e-12)
 
 
-@pytest.mark.usefixtures("as_python")
 def test_the_input_of_the_instant_can_be_given():
     first, second = (make_filter("ekf", model(observe)) for observe in (h, g))
     a, b = (filter_.predict(filter_.init(), [0.4]) for filter_ in (first, second))
     np.testing.assert_allclose(first.update(a, [1.0], u=[0.7])[0].mean, second.update(b, [1.0 - D * 0.7])[0].mean)
     np.testing.assert_allclose(first.update(a, [1.0])[0].mean, second.update(b, [1.0 - D * 0.4])[0].mean)
-    with pytest.raises(ValueError, match=r"u of a measurement needs a model with h\(x, u, c\)"):
-        second.update(b, [1.0], u=[0.7])
-    with pytest.raises(ValueError, match="u must be 1 number"):
-        first.update(a, [1.0], u=[0.7, 0.1])
+    refused(r"u of a measurement needs a model with h\(x, u, c\)", second.update, b, [1.0], u=[0.7])
+    refused("u must be 1 number", first.update, a, [1.0], u=[0.7, 0.1])
     inputs, z = data(1)
     with pytest.raises(ValueError, match="inputs of a model with h.* must be one fewer than measurements"):
         run(first, inputs=np.append(inputs[0], [[0.0]], axis=0), measurements=z[0])
 
 
-@pytest.mark.usefixtures("as_python")
 def test_of_smoothers_bounds_and_other_models():
     inputs, z = data()
     less = less_input(inputs, z)
@@ -145,7 +143,6 @@ def test_of_smoothers_bounds_and_other_models():
     assert linearize(model(), [0.1, 0.2], [0.3]).feedthrough == pytest.approx(D)
 
 
-@pytest.mark.usefixtures("as_python")
 def test_the_likelihood_has_the_same_slopes():
     inputs, z = data()
     of_q, of_r = np.array([np.eye(2), np.zeros((2, 2))]), np.array([[[0.0]], [[1.0]]])
@@ -155,7 +152,6 @@ def test_the_likelihood_has_the_same_slopes():
     np.testing.assert_allclose(a.gradients, b.gradients, rtol=1e-8)
 
 
-@pytest.mark.usefixtures("as_python")
 def test_wrappers_live_and_tensors_agree_with_run():
     inputs, z = data(2)
     filter_ = make_filter("ekf", model())
@@ -168,8 +164,7 @@ def test_wrappers_live_and_tensors_agree_with_run():
         np.testing.assert_allclose(info["measurement"], z[0, k], rtol=1e-12)
         _, _, _, _, info = env.step(u)
         *_, infos = copies.step(inputs[:, k])
-    np.testing.assert_allclose(info["estimate"], expected.means[0, -1], rtol=1e-9)
-    np.testing.assert_allclose(infos["estimate"], expected.means[:, -1], rtol=1e-9)
+    each_close((info["estimate"], infos["estimate"]), (expected.means[0, -1], expected.means[:, -1]), rtol=1e-9)
     live = filter_.live(late=10.0)
     live.start(0.0, z[0, 0])
     for k, u in enumerate(inputs[0]):
@@ -184,7 +179,6 @@ def test_wrappers_live_and_tensors_agree_with_run():
         np.testing.assert_allclose(found.means.numpy(), run(kept, None, inputs, z).means, rtol=1e-9)
 
 
-@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", ["ekf", pytest.param("ukf", marks=pytest.mark.slow), "enkf"])
 def test_code_in_c_agrees_with_run(name, tmp_path):
     inputs, z = data(1)
@@ -193,7 +187,6 @@ def test_code_in_c_agrees_with_run(name, tmp_path):
     np.testing.assert_allclose(found[:, :2], run(filter_, None, inputs, z).means[0], rtol=1e-9)
 
 
-@pytest.mark.usefixtures("as_python")
 def test_a_program_in_c_reads_a_log_as_estimate_does(tmp_path):
     """With a gap, before which the input of the row after it acts, and a missing sample."""
     present = ~np.isin(np.arange(60), [20, 21])
@@ -259,7 +252,6 @@ def cycled(rows=600, seed=0):
     return {"t_s": np.arange(rows) * c.dt, "i_A": currents, "v_V": np.array(volts)}, np.array(charges)
 
 
-@pytest.mark.usefixtures("as_python")
 def test_the_charge_of_a_cell_is_found_from_a_log_as_it_is():
     """Within 0.04 % of capacity, where the current of the step before, as a state, has three times the error."""
     table, charges = cycled()
@@ -277,7 +269,6 @@ def test_the_charge_of_a_cell_is_found_from_a_log_as_it_is():
         np.testing.assert_allclose(info["estimate"], found.means[k], rtol=1e-9)
 
 
-@pytest.mark.usefixtures("as_python")
 def test_innovations_that_follow_the_input_of_their_row_name_the_cause():
     table, _ = cycled()
     for model_, inputs_act, remedy in (
@@ -291,7 +282,6 @@ def test_innovations_that_follow_the_input_of_their_row_name_the_cause():
         assert remedy is None or re.search(remedy, words)
 
 
-@pytest.mark.usefixtures("as_python")
 def test_blocks_of_logs_and_steps_of_any_length():
     logs = [read_log(cycled(240, seed)[0], cell(), name=f"cell {seed}") for seed in range(3)]
     data_of_blocks = LogProblem(logs, cell()).data((0, 1))
@@ -313,10 +303,8 @@ def test_logs_are_written_as_they_are_read(tmp_path):
     log = read_log(cycled(48)[0], cell())
     write_log(tmp_path / "log.csv", log)
     again = read_log(tmp_path / "log.csv", cell())
-    np.testing.assert_array_equal(again.inputs, log.inputs)
-    np.testing.assert_array_equal(again.measurements, log.measurements)
-    with pytest.raises(ValueError, match="inputs_act must be one of from, until"):
-        read_log(tmp_path / "log.csv", cell(), inputs_act="after")
+    each_equal((again.inputs, again.measurements), (log.inputs, log.measurements))
+    refused("inputs_act must be one of from, until", read_log, tmp_path / "log.csv", cell(), inputs_act="after")
 
 
 def test_lines_of_matlab_take_the_input_before():
@@ -325,7 +313,6 @@ def test_lines_of_matlab_take_the_input_before():
     assert "m.h(x, before)" in text and "measurement(x, u)" in text and "m.h(x)" not in text
 
 
-@pytest.mark.usefixtures("as_python")
 def test_an_affine_model_has_a_matrix_d():
     inputs, matrices = np.random.default_rng(1).normal(size=(2, 30, 2)), MATRICES
     affine = affine_model(**matrices, d=[[1.0, -2.0]], **NOISE)

@@ -1,9 +1,18 @@
-"""One result on every path: compiled or not, batch or loop, by init, predict and update, in a session, wrapped."""
+"""One result on every path: compiled or not, batch, blocks or loop, in steps, in a session, wrapped."""
 
 import numpy as np
 import pytest
 
-from filters import FILTERS, make_filter, run, thruster_model
+from filters import (
+    FILTERS,
+    ExtendedKalmanFilter,
+    SageHusaFilter,
+    UnscentedKalmanFilter,
+    make_filter,
+    run,
+    thruster_model,
+)
+from filters.engine.compile import GROUPS
 from filters.engine.session import Session
 from filters.registry import filter_type
 from tests.filters.checks import refused
@@ -13,7 +22,9 @@ from tests.oracles import each_close, equal
 from tests.slow import SLOW
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys, filter_keys
-from thruster_env.thruster.equations import simulate
+from thruster_env.model import simulate
+from thruster_env.model.shape import LANES
+from thruster_env.thruster.equations import simulate as simulate_plant
 from thruster_env.thruster.plant import make_plant
 
 
@@ -141,16 +152,25 @@ SELDOM = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("name", "kind", "numbers"), [*WITH_PARAMETERS, *(pytest.param(*case, marks=SLOW) for case in SELDOM)]
-)
-def test_compiled_and_interpreted_agree_with_parameters(name, kind, numbers):
+def with_parameters(name, kind, numbers):
     size = {"ensemble_size": 10} if filter_type(name).has_ensemble else {}
-    filter_ = make_filter(name, MODELS[kind](), **size, **numbers)
-    inputs, measurements = simulated(filter_.model, 12, count=3)
-    measurements[0, 3] = measurements[0, 6, 0] = np.nan
-    noise = varying_noise(filter_.model, 12) if "window" in numbers else {}
+    return make_filter(name, MODELS[kind](), **size, **numbers)
+
+
+@pytest.mark.parametrize("case", [*WITH_PARAMETERS, *(pytest.param(case, marks=SLOW) for case in SELDOM)])
+def test_compiled_and_interpreted_agree_with_parameters(case):
+    filter_ = with_parameters(*case)
+    inputs, measurements = simulated(filter_.model, 12, count=3, missing=0.2)
+    noise = varying_noise(filter_.model, 12) if "window" in case[2] else {}
     assert_compiled_as_python(filter_, filter_keys(range(3)), inputs, measurements, **noise)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("case", [*WITH_PARAMETERS, *SELDOM])
+def test_batch_loop_and_session_agree_with_parameters(case):
+    filter_ = with_parameters(*case)
+    inputs, measurements = simulated(filter_.model, 20, missing=0.2)
+    assert_paths_agree(filter_, KEY, inputs, measurements)
 
 
 @compiled_names
@@ -166,7 +186,7 @@ def test_a_wrapped_run_is_the_batch_run(name):
     seed, actions = 11, voltages(500)
     env = wrapped(name)
     _, _, infos = played(env, actions, seed)
-    drawn = simulate(make_plant(), episode_keys([seed]), actions.T.astype(np.float64))
+    drawn = simulate_plant(make_plant(), episode_keys([seed]), actions.T.astype(np.float64))
     np.testing.assert_allclose(infos_of("measurement", infos), drawn.measurements[0], rtol=1e-12, atol=1e-12)
     numbers = {"ensemble_size": 20} if name == "enkf" else {}
     inputs = actions[None].astype(np.float64)
@@ -228,3 +248,59 @@ def test_a_batch_of_no_trajectories_gives_no_estimates(name):
     estimates = run(small(name, thruster_model()), np.zeros((0, 2)), np.zeros((0, 5, 1)), np.zeros((0, 6, 1)))
     assert estimates.means.shape == (0, 6, 2)
     assert estimates.divergences.shape == (0,)
+
+
+BLOCK = GROUPS * LANES
+COUNTS = [1, LANES - 1, LANES, LANES + 1, BLOCK, BLOCK + 1, 3 * BLOCK + 5]
+
+
+def simulated_thruster(count, steps=12):
+    model = thruster_model()
+    inputs = np.random.default_rng(4).uniform(-12, 12, size=(count, steps, 1))
+    with interpreted():
+        drawn = simulate.simulate(model, episode_keys(range(count)), inputs)
+    return model, (np.zeros((count, 2)), inputs, drawn.measurements)
+
+
+@pytest.mark.parametrize("kind", [ExtendedKalmanFilter, UnscentedKalmanFilter, SageHusaFilter])
+def test_blocks_that_are_full_or_not_hold_the_same_estimates(kind):
+    model, data = simulated_thruster(max(COUNTS))
+    data[2][3, 5] = np.nan
+    together = run(kind(model=model), *data)
+    for count in COUNTS:
+        for part, of_all in zip(run(kind(model=model), *(array[:count] for array in data)), together, strict=True):
+            np.testing.assert_array_equal(part, of_all[:count])
+    with interpreted():
+        one_by_one = run(kind(model=model), *(array[:5] for array in data))
+    for part, of_all in zip(one_by_one, together, strict=True):
+        np.testing.assert_allclose(part, of_all[:5], rtol=1e-12, atol=1e-12)
+
+
+def test_what_one_trajectory_loses_no_other_misses():
+    model, (keys, inputs, z) = simulated_thruster(BLOCK)
+    before = run(ExtendedKalmanFilter(model=model), keys, inputs, z)
+    z[7, 4] = 1e200  # its innovation is as large, and the estimate overflows in the next step
+    after = run(ExtendedKalmanFilter(model=model), keys, inputs, z)
+    others = np.arange(BLOCK) != 7
+    assert after.divergences[7] >= 1 and np.isfinite(after.means).all()
+    for one, other in zip(before, after, strict=True):
+        np.testing.assert_array_equal(one[others], other[others])
+
+
+def test_noise_of_single_steps_is_that_of_every_trajectory():
+    model, (keys, inputs, z) = simulated_thruster(BLOCK + 3)
+    factors = np.random.default_rng(2).uniform(0.1, 10.0, size=(z.shape[1], 1, 1))
+    noise = {
+        "process_noise_covs": factors[1:] * model.process_noise_cov,
+        "measurement_noise_covs": factors * model.measurement_noise_cov,
+    }
+    filter_ = ExtendedKalmanFilter(model=model)
+    estimates = run(filter_, keys, inputs, z, **noise)
+    r = noise["measurement_noise_covs"]
+    for b in (0, BLOCK - 1, BLOCK + 2):
+        belief, _ = filter_.update(filter_.init(), z[b, 0], measurement_noise_cov=r[0])
+        for k, u in enumerate(inputs[b]):
+            belief = filter_.predict(belief, u, process_noise_cov=noise["process_noise_covs"][k])
+            belief, _ = filter_.update(belief, z[b, k + 1], measurement_noise_cov=r[k + 1])
+        np.testing.assert_allclose(belief.mean, estimates.means[b, -1], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(belief.cov, estimates.covs[b, -1], rtol=1e-12, atol=1e-12)

@@ -11,7 +11,6 @@ from filters import (
     CubatureKalmanFilter,
     EnsembleKalmanFilter,
     EstimateState,
-    EstimateStates,
     ExtendedKalmanFilter,
     IteratedExtendedKalmanFilter,
     KalmanFilter,
@@ -20,7 +19,9 @@ from filters import (
     smooth,
 )
 from filters.smoothers import WithSmoother
-from tests.models import KEY, affine, pendulum, scalar_model, simulated, wide_model
+from tests.filters.checks import refused
+from tests.models import KEY, affine, pendulum, simulated, wide_model
+from tests.oracles import each_close
 from thruster_env.core.compiled import interpreted
 
 KINDS = {
@@ -43,41 +44,6 @@ def lagged(filter_, inputs, measurements, lag):
     return [np.array(part) for part in zip(*told, strict=True)]
 
 
-def as_augmented_state(model, inputs, measurements, lag):
-    """The oldest of x_k, ..., x_{k-lag} by a plain Kalman filter whose state they are, at each step."""
-    a, b, offset, c, shift = model.matrices()
-    n, size = model.n, (lag + 1) * model.n
-    big_a, big_c, q = np.zeros((size, size)), np.zeros((model.m, size)), np.zeros((size, size))
-    big_a[:n, :n], big_c[:, :n], q[:n, :n] = a, c, model.process_noise_cov
-    big_a[n:, :-n] = np.eye(size - n)
-    x = np.tile(model.prior_mean, lag + 1)  # all are the state at the start
-    p = np.kron(np.ones((lag + 1, lag + 1)), model.prior_cov)
-    means, covs = [], []
-    for k, z in enumerate(measurements):
-        if k:
-            moved = big_a @ x
-            moved[:n] += b @ inputs[k - 1] + offset
-            x, p = moved, big_a @ p @ big_a.T + q
-        seen = ~np.isnan(z)
-        h, r = big_c[seen], model.measurement_noise_cov[np.ix_(seen, seen)]
-        gain = np.linalg.solve(h @ p @ h.T + r, h @ p).T
-        x, p = x + gain @ (z - shift - c @ x[:n])[seen], p - gain @ h @ p
-        means.append(x[-n:])
-        covs.append(p[-n:, -n:])
-    return np.array(means), np.array(covs)
-
-
-@pytest.mark.parametrize("kind", [KalmanFilter, ExtendedKalmanFilter, UnscentedKalmanFilter])
-@pytest.mark.parametrize("lag", [0, 1, 6])
-@pytest.mark.usefixtures("as_python")
-def test_on_an_affine_model_it_is_the_filter_of_the_augmented_state(kind, lag):
-    model = wide_model()
-    inputs, measurements = simulated(model, 20, level=1.0, missing=0.25)
-    found = lagged(kind(model=model), inputs[0], measurements[0], lag)
-    for one, other in zip(found, as_augmented_state(model, inputs[0], measurements[0], lag), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.usefixtures("as_python")
 def test_step_by_step_it_is_the_smoother_of_the_batch(kind):
@@ -92,8 +58,7 @@ def test_step_by_step_it_is_the_smoother_of_the_batch(kind):
     full = smooth(filter_, np.array([KEY]), inputs, measurements)
     for lag in (15, 40):  # the state at the start, given all that was measured up to each step
         means, covs = lagged(filter_, inputs[0], measurements[0], lag)
-        np.testing.assert_allclose(means[-1], full.means[0, 0], rtol=1e-10, atol=1e-12)
-        np.testing.assert_allclose(covs[-1], full.covs[0, 0], rtol=1e-10, atol=1e-12)
+        each_close((means[-1], covs[-1]), (full.means[0, 0], full.covs[0, 0]), rtol=1e-10, atol=1e-12)
 
 
 def moving_target():
@@ -170,17 +135,6 @@ def test_it_is_nearer_to_the_truth_than_filterpy_s():
     assert (np.mean(our_errors**2, axis=0) < np.mean(their_errors**2, axis=0)).all()
 
 
-@pytest.mark.usefixtures("as_python")
-def test_nothing_is_carried_back_over_a_restart():
-    filter_ = KalmanFilter(model=scalar_model(b=[[1e200]]))
-    inputs = np.zeros((9, 1))
-    inputs[4] = 1e150  # makes the state infinite, and the filter restarts
-    measurements = np.random.default_rng(3).normal(6.0, 1.0, size=(10, 1))
-    means, _ = lagged(filter_, inputs, measurements, 3)
-    batch = smooth(filter_, np.array([KEY]), inputs[None], measurements[None], 3)
-    np.testing.assert_allclose(means[3:], batch.means[0, :7], rtol=1e-12)
-
-
 def test_a_session_goes_on_after_a_pickle():
     model = pendulum()
     filter_ = ExtendedKalmanFilter(model=model)
@@ -196,51 +150,6 @@ def test_a_session_goes_on_after_a_pickle():
         np.testing.assert_array_equal(session.smoothed()[0], means[-1])
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-def test_each_copy_of_a_vector_env_is_a_single_env_is_the_batch(mode):
-    name, lag, length, copies = "BowThrusterTracking-v0", 3, 7, 3
-    vector = gym.make_vec(name, num_envs=copies, max_episode_steps=length, autoreset_mode=mode)
-    vector = EstimateStates(vector, "ekf", smoothing_lag=lag)
-    singles = [
-        EstimateState(gym.make(name, max_episode_steps=length), "ekf", smoothing_lag=lag) for _ in range(copies)
-    ]
-    _, info = vector.reset(seed=5)
-    told = [single.reset(seed=5 + i)[1] for i, single in enumerate(singles)]
-    seen, actions = (
-        [[one["measurement"]] for one in told],
-        np.random.default_rng(0).uniform(-9, 9, (20, copies, 1)),
-    )
-    ended, first = np.zeros(copies, dtype=bool), []
-    for k, action in enumerate(actions.astype(np.float32)):
-        _, _, terminated, truncated, info = vector.step(action)
-        for i, single in enumerate(singles):
-            if mode == "NextStep" and ended[i]:
-                told[i] = single.reset()[1]
-            else:
-                _, _, *ends, told[i] = single.step(action[i])
-                seen[i].append(told[i]["measurement"])
-                if k < length:
-                    first.append(told[i]["smoothed"])
-                if mode == "SameStep" and any(ends):
-                    last = info["final_info"]["smoothed"][i]
-                    np.testing.assert_allclose(last, told[i]["smoothed"], rtol=1e-9, atol=1e-12)
-                    told[i] = single.reset()[1]
-            if not (mode == "Disabled" and ended[i]):
-                for key in ("smoothed", "smoothed_cov"):
-                    np.testing.assert_allclose(info[key][i], told[i][key], rtol=1e-9, atol=1e-12)
-        ended = terminated | truncated
-        if mode == "Disabled" and ended.any():
-            _, info = vector.reset(options={"reset_mask": ended})
-            for i in np.flatnonzero(ended):
-                told[i] = singles[i].reset()[1]
-                np.testing.assert_allclose(info["smoothed"][i], told[i]["smoothed"], rtol=1e-9, atol=1e-12)
-    measured = np.array([one[: length + 1] for one in seen])
-    inputs = np.swapaxes(actions[:length], 0, 1).astype(np.float32).astype(float)
-    batch = smooth(singles[0].filter, None, inputs, measured, lag)
-    whole = np.array(first).reshape(length, copies, -1)
-    np.testing.assert_allclose(whole[lag - 1 :].swapaxes(0, 1), batch.means[:, : length + 1 - lag], rtol=1e-9)
-
-
 def test_what_it_cannot_smooth_and_wrong_lags_are_refused():
     env = gym.make("BowThruster-v0")
     with pytest.raises(
@@ -250,5 +159,4 @@ def test_what_it_cannot_smooth_and_wrong_lags_are_refused():
     with pytest.raises(ValueError, match="smoothing_lag must be a whole number of at least 0, but got -1"):
         EstimateState(env, "ekf", smoothing_lag=-1)
     filter_ = EnsembleKalmanFilter(model=pendulum())
-    with pytest.raises(ValueError, match="a smoothing_lag needs"):
-        WithSmoother(filter_.session(), filter_, 2)
+    refused("a smoothing_lag needs", WithSmoother, filter_.session(), filter_, 2)

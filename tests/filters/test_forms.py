@@ -30,7 +30,6 @@ FORMS = [*ROOTS, partial(KalmanFilter, form="information")]
 
 
 def plain(filter_):
-    """The same filter in the covariance form."""
     numbers = {name: getattr(filter_, name) for name in ("alpha", "beta", "kappa") if hasattr(filter_, name)}
     return type(filter_)(model=filter_.model, **numbers)
 

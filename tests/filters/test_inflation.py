@@ -99,7 +99,6 @@ def some_data(model):
 
 
 def test_next_to_nothing_is_nothing(name):
-    """The kernels that can stretch agree with those that cannot."""
     data = some_data(far_plane())
     plain, controlled = filters_of(name, far_plane(), {}, {"inflation": 1.0, "relaxation": 1e-300})
     assert plain.kernels() is not controlled.kernels() or name == "rhf"  # which has one kind of kernels

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from filters import ExtendedKalmanFilter, KalmanFilter, SteadyStateKalmanFilter, linearize, run, thruster_model
+from filters import KalmanFilter, SteadyStateKalmanFilter, linearize, run, thruster_model
 from filters.bounds import riccati_covariances
 from tests.filters.checks import refused
 from tests.models import held_voltages, random_affine, simulated, wide_model
@@ -48,41 +48,6 @@ def test_it_is_filterpy_s_kalman_filter():
         each_close((estimates.means[0, k], estimates.covs[0, k]), (other.x[:, 0], other.P), rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(estimates.innovations[0, k], other.y[:, 0], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(estimates.innovation_covs[0, k], other.S, rtol=1e-9, atol=1e-9)
-
-
-def test_the_extended_filter_is_filterpy_s_on_the_thruster():
-    peer = pytest.importorskip("filterpy.kalman")
-    model = thruster_model()
-    inputs = held_voltages(1, 8, seed=3)
-    drawn = simulate.simulate(model, episode_keys([3]), inputs)
-    estimates = run(ExtendedKalmanFilter(model=model), KEYS, inputs, drawn.measurements)
-    constants = model.constants
-
-    def advance(x, u):
-        """The state after one step, and the Jacobian of the whole step by the chain rule."""
-        x, chain = tuple(x), np.eye(2)
-        for _ in range(model.substeps):
-            chain = np.array(model.transition_jacobian(x, u, constants)) @ chain
-            x = model.transition(x, u, constants)
-        return np.array(x), chain
-
-    class Extended(peer.ExtendedKalmanFilter):
-        def predict_x(self, u):
-            x, self.F = advance(self.x[:, 0], tuple(u))
-            self.x = x.reshape(2, 1)
-
-    other = Extended(dim_x=2, dim_z=1)
-    other.Q, other.R = model.process_noise_cov, model.measurement_noise_cov
-    other.x, other.P = model.prior_mean.reshape(2, 1), model.prior_cov
-    for k, z in enumerate(drawn.measurements[0]):
-        if k > 0:
-            other.predict(u=inputs[0, k - 1])
-        other.update(
-            z.reshape(1, 1),
-            lambda x: np.array(model.observe_jacobian(tuple(x[:, 0]), constants)),
-            lambda x: np.array(model.observe(tuple(x[:, 0]), constants)).reshape(1, 1),
-        )
-        each_close((estimates.means[0, k], estimates.covs[0, k]), (other.x[:, 0], other.P), rtol=1e-9, atol=1e-9)
 
 
 def test_its_steady_covariance_solves_riccati_s_equation():

@@ -11,6 +11,8 @@ from scipy.linalg import expm
 
 from filters import make_filter, thruster_model
 from filters.starts import FirstRestart
+from tests.filters.checks import refused
+from tests.oracles import each_close
 from tests.slow import slow_but
 from thruster_env.model.continuous import ContinuousModel, noise_for_dt
 from thruster_env.model.state_space import StateSpaceModel
@@ -146,8 +148,7 @@ def test_late_samples_give_what_the_right_order_gives(name):
     order = sorted(range(len(events)), key=lambda place: events[place][0])  # stable: predictions first
     by_arrival = sorted(range(len(events)), key=lambda place: arrival[place])
     early, late = followed(order, 0.0), followed(by_arrival, 0.4)
-    np.testing.assert_allclose(late.mean, early.mean, rtol=1e-9)
-    np.testing.assert_allclose(late.cov, early.cov, rtol=1e-9)
+    each_close((late.mean, late.cov), (early.mean, early.cov), rtol=1e-9)
     assert len(late._events) < 60
 
 
@@ -159,8 +160,7 @@ def test_a_gap_is_gone_through_in_the_models_own_steps():
     live.predict_to(1.0, [12.0])
     for _ in range(100):
         session.step([12.0], [math.nan])
-    np.testing.assert_allclose(live.mean, session.mean, rtol=1e-9)
-    np.testing.assert_allclose(live.cov, session.cov, rtol=1e-9)
+    each_close((live.mean, live.cov), (session.mean, session.cov), rtol=1e-9)
 
 
 def test_a_monitor_watches_what_comes_in():
@@ -192,8 +192,7 @@ def started(**options):
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(call, rule):
-    with pytest.raises(ValueError, match=rule):
-        call(started())
+    refused(rule, call, started())
 
 
 def test_samples_from_before_the_start_nan_and_models_without_a_dt_are_refused():
@@ -304,8 +303,7 @@ def test_late_samples_of_one_stamp_come_in_the_order_of_arrival_with_the_length_
     late.update(0.2, "position", 0.1)
     late.update(0.03, "rate", 0.3)
     late.update(0.03, "position", 0.7)
-    np.testing.assert_allclose(late.mean, early.mean, rtol=1e-12)
-    np.testing.assert_allclose(late.cov, early.cov, rtol=1e-12)
+    each_close((late.mean, late.cov), (early.mean, early.cov), rtol=1e-12)
 
 
 @pytest.mark.usefixtures("as_python")
@@ -373,11 +371,7 @@ def test_a_clock_that_jumps_is_an_error_of_one_line_and_nothing_changes():
     live.predict_to(0.02, [1.0])
     before = live.mean.copy()
     for use in (lambda: live.predict_to(1.7e9, [1.0]), lambda: live.update(1.7e9, "thrust", 0.1)):
-        with pytest.raises(
-            ValueError, match="at most 1000000 steps of 0.01 s apart, but are .*start anew"
-        ) as error:
-            use()
-        assert "\n" not in str(error.value)
+        refused("at most 1000000 steps of 0.01 s apart, but are .*start anew", use)
     np.testing.assert_array_equal(live.mean, before)
     live.update(0.02, "thrust", 0.1)  # goes on
     live.start(1.7e9)

@@ -1,8 +1,6 @@
 """Measurements that turn: quaternions of a star tracker, directions and poses, against naive filters."""
 
-import ctypes
 import shutil
-import subprocess
 
 import gymnasium as gym
 import numpy as np
@@ -10,14 +8,26 @@ import pytest
 from scipy.spatial.transform import Rotation as Turned
 
 import filters
-from filters.c.project import c_filter
 from filters.logs.estimate import estimate
 from filters.logs.findings import alarms_of, findings, verdict
 from filters.monitoring import Monitor, watch_of
 from filters.registry import FILTERS
 from filters.sensitivity import likelihood
 from filters.starts import begun_at
-from tests.filters.test_attitude import BIAS, DT, ENSEMBLES, GYRO, OTHERS, TAKE_ROTATIONS, WALK, advance
+from tests.filters.test_attitude import (
+    BIAS,
+    DT,
+    ENSEMBLES,
+    GYRO,
+    OTHERS,
+    TAKE_ROTATIONS,
+    WALK,
+    address,
+    advance,
+    c_library,
+    ran,
+)
+from tests.oracles import each_close, each_equal
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.env.model_env import ModelEnv
@@ -66,7 +76,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def extended(data):
-    return filters.run(filters.ExtendedKalmanFilter(model=tracker_model()), inputs=data[0], measurements=data[1])
+    return ran(tracker_model(), *data)
 
 
 def naive(gyro, z, degrees=5.0, iterations=1):
@@ -128,8 +138,7 @@ def test_the_extended_filter_is_the_naive_one(data, extended):
 def test_the_iterated_filter_is_gauss_and_newtons_method_at_the_measurement():
     """From an attitude 60 degrees off; one iteration is the extended filter, also at the measurement."""
     gyro, z = tracked(60.0)
-    filter_ = filters.IteratedExtendedKalmanFilter(model=tracker_model(degrees=60.0), iterations=4)
-    estimates = filters.run(filter_, inputs=gyro[:4], measurements=z[:5])
+    estimates = ran(tracker_model(degrees=60.0), gyro[:4], z[:5], "iekf", iterations=4)
     q, bias, P, level, *_ = naive(gyro[:4], z[:5], 60.0, 4)
     is_at(estimates.means[-1], estimates.covs[-1], q, bias, P)
     assert estimates.log_likelihoods.sum() == pytest.approx(level, abs=1e-8)
@@ -139,15 +148,9 @@ def test_the_iterated_filter_is_gauss_and_newtons_method_at_the_measurement():
 def test_sides_of_both_errors_do_not_matter_if_the_sensor_is_the_same_about_all_axes(data):
     """R = sigma^2 I is the same for a rotation of the world."""
     gyro, z = data[0][:5], data[1][:6]
-    first, *rest = (
-        filters.run(
-            filters.ExtendedKalmanFilter(model=tracker_model(side, measured, sensor=np.full(3, 0.02))),
-            inputs=gyro,
-            measurements=z,
-        )
-        for side in ("body", "world")
-        for measured in ("body", "world")
-    )
+    sensor, sides = np.full(3, 0.02), ("body", "world")
+    models = [tracker_model(side, measured, sensor=sensor) for side in sides for measured in sides]
+    first, *rest = (ran(model, gyro, z) for model in models)
     for other in rest:
         np.testing.assert_allclose(other.means, first.means, atol=1e-12)
         np.testing.assert_allclose(other.log_likelihoods, first.log_likelihoods, atol=1e-9)
@@ -159,16 +162,15 @@ def test_all_filters_of_rotations_measure_them(name, data, extended):
     """Each stays within its own deviations of the extended filter; parameters at limits make one of the other."""
     parameters, kin, of_kin = TAKE_ROTATIONS.get(name, ({"ensemble_size": 60}, "ekf", {}))
     gyro, z = data[0][:4], data[1][:5]
-    estimates = filters.run(filters.make_filter(name, tracker_model(), **parameters), inputs=gyro, measurements=z)
+    estimates = ran(tracker_model(), gyro, z, name, **parameters)
     assert estimates.innovation_covs.shape == (5, 3, 3)
     if name in ENSEMBLES:
         off = difference(estimates.means[-1], extended.means[4], tracker_model().turns)
         assert (np.abs(off) < 1.5 * extended.stds[4]).all()
         assert np.abs(np.log(estimates.stds[-1, :3] / extended.stds[4, :3])).max() < 0.4
         return
-    other = filters.run(filters.make_filter(kin, tracker_model(), **of_kin), inputs=gyro, measurements=z)
-    np.testing.assert_allclose(estimates.means, other.means, atol=1e-12)
-    np.testing.assert_allclose(estimates.covs, other.covs, atol=1e-12)
+    other = ran(tracker_model(), gyro, z, kin, **of_kin)
+    each_close((estimates.means, estimates.covs), (other.means, other.covs), atol=1e-12)
     np.testing.assert_allclose(estimates.log_likelihoods, other.log_likelihoods, atol=1e-7)
 
 
@@ -186,7 +188,7 @@ def test_gradients_are_the_slopes_of_the_likelihood(name, data):
     def level(q, r):
         changed = model.replace(process_noise_cov=model.process_noise_cov + q)
         changed = changed.replace(measurement_noise_cov=model.measurement_noise_cov + r)
-        return filters.run(filters.make_filter(name, changed), inputs=gyro, measurements=z).log_likelihoods.sum()
+        return ran(changed, gyro, z, name).log_likelihoods.sum()
 
     exact = likelihood(model, gyro, z, q_slopes, r_slopes, filter=filters.make_filter(name, model))
     assert exact.values[0] == pytest.approx(level(0.0, 0.0), abs=1e-9)
@@ -200,11 +202,9 @@ class Camera(gym.Env):
     action_space, observation_space = gym.spaces.Box(-1.0, 1.0, (3,)), gym.spaces.Box(-2.0, 2.0, (4,))
 
     def reset(self, *, seed=None, options=None):
-        """Begin."""
         return np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), {}
 
     def step(self, action):
-        """Turn nothing."""
         return self.reset()[0], 0.0, False, False, {}
 
 
@@ -218,8 +218,7 @@ def test_sessions_gates_python_and_wrapped_envs_have_the_numbers_of_a_batch(data
         lost[2, 3], lost[3] = np.nan, np.nan
         in_part = filters.run(filter_, inputs=gyro[:3], measurements=lost)
     np.testing.assert_allclose(in_python.means, extended.means[:4], atol=1e-15)
-    np.testing.assert_array_equal(in_part.innovations[2:], 0.0)
-    np.testing.assert_array_equal(in_part.log_likelihoods[2:], 0.0)
+    each_equal((in_part.innovations[2:], in_part.log_likelihoods[2:]), (0.0, 0.0))
     gated, strange = filter_.session(gate=5.0), rotations.product(z[2], rotations.exponential((0.0, 1.0, 0.0)))
     gated.start(z=z[0])
     for k, measured in enumerate([z[1], strange, lost[3]]):
@@ -239,23 +238,14 @@ def test_sessions_gates_python_and_wrapped_envs_have_the_numbers_of_a_batch(data
 def test_the_filter_in_c_has_the_same_numbers(data, extended, tmp_path):
     """z has four numbers, the innovation three, and a missing one is not counted."""
     gyro, z = data
-    generated = c_filter(filters.ExtendedKalmanFilter(model=tracker_model()), "tracker")
-    (tmp_path / "tracker.h").write_text(generated.header)
-    (tmp_path / "tracker.c").write_text(generated.source)
-    library, flags = (
-        tmp_path / "t.so",
-        ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-shared", "-fPIC"],
-    )
-    subprocess.run(["gcc", *flags, str(tmp_path / "tracker.c"), "-o", library, "-lm"], check=True)
-    c, memory = ctypes.CDLL(str(library)), np.zeros(7 + 36 + 3 + 9 + 4)
-    address = lambda array: array.ctypes.data_as(ctypes.c_void_p)  # noqa: E731
+    c, memory = c_library(filters.ExtendedKalmanFilter(model=tracker_model()), "tracker", tmp_path)
     c.tracker_init(address(memory))
     for k in range(10):
         if k:
             c.tracker_predict(address(memory), address(gyro[k - 1].copy()))
         c.tracker_update(address(memory), address(z[k].copy()))
-    np.testing.assert_allclose(memory[:7], extended.means[9], atol=1e-14)
-    np.testing.assert_allclose(memory[43:46], extended.innovations[9], atol=1e-14)
+    expected = extended.means[9], extended.covs[9].ravel(), extended.innovations[9]
+    each_close((memory[:7], memory[7:43], memory[43:46]), expected, atol=1e-14)
     assert memory[57:].view(np.int32)[0] == 3
     c.tracker_update(address(memory), address(np.array([1.0, 0.0, np.nan, 0.0])))
     assert memory[57:].view(np.int32)[0] == 0
@@ -297,8 +287,7 @@ def test_a_direction_is_measured_of_a_state_of_numbers():
     v = np.arccos(line @ u) * across / np.linalg.norm(across)  # in three dimensions, without a basis
     H = (np.eye(3) - np.outer(line, line)) / r
     K = 0.3**2 * H.T @ np.linalg.pinv(0.3**2 * H @ H.T + 0.01**2 * (np.eye(3) - np.outer(line, line)))
-    np.testing.assert_allclose(belief.mean, x + K @ v, atol=1e-12)
-    np.testing.assert_allclose(belief.cov, (np.eye(3) - K @ H) * 0.3**2, atol=1e-12)
+    each_close((belief.mean, belief.cov), (x + K @ v, (np.eye(3) - K @ H) * 0.3**2), atol=1e-12)
     assert np.linalg.norm(innovation.value) == pytest.approx(np.linalg.norm(v), abs=1e-14)
 
 
@@ -320,8 +309,7 @@ def test_a_pose_is_measured_whole():
     z = np.array(move(model.prior_mean, d, model.turns))
     filter_ = filters.ExtendedKalmanFilter(model=model)
     belief, innovation = filter_.update(filter_.init(), z)
-    np.testing.assert_allclose(innovation.value, d, atol=1e-13)
-    np.testing.assert_allclose(belief.mean, poses.exponential(0.5 * d), atol=1e-13)
+    each_close((innovation.value, belief.mean), (d, poses.exponential(0.5 * d)), atol=1e-13)
 
 
 def test_a_log_has_the_estimates_of_a_batch_for_either_sign(data, extended):
@@ -330,7 +318,7 @@ def test_a_log_has_the_estimates_of_a_batch_for_either_sign(data, extended):
     seen = z.copy()
     seen[7, 2] = np.nan
     model = tracker_model().replace(prior_mean=begun_at(tracker_model(), z[:1])[0])
-    batch = filters.run(filters.ExtendedKalmanFilter(model=model), inputs=gyro, measurements=seen)
+    batch = ran(model, gyro, seen)
     symbols = [quantity.symbol for quantity in model.input_quantities]
     found = []
     for factor in (1.0, -1.3):
@@ -361,7 +349,6 @@ def test_a_log_has_the_estimates_of_a_batch_for_either_sign(data, extended):
 
 
 def test_what_cannot_measure_rotations_says_so():
-    """In a line."""
     model = tracker_model()
     for name in set(FILTERS) - {*TAKE_ROTATIONS, *ENSEMBLES, *OTHERS, "fuzzy", "kf"}:
         with pytest.raises(
@@ -385,14 +372,8 @@ def test_what_cannot_measure_rotations_says_so():
 def test_forms_have_the_same_estimates(name, form):
     """Of states and measurements that turn; the factors follow the reset."""
     gyro, z = tracked(20.0)
-    plain, factored = (
-        filters.run(
-            filters.make_filter(name, tracker_model("body", "world", 20.0), form=kind),
-            inputs=gyro[:5],
-            measurements=z[:6],
-        )
-        for kind in ("covariance", form)
-    )
+    model = tracker_model("body", "world", 20.0)
+    plain, factored = (ran(model, gyro[:5], z[:6], name, form=kind) for kind in ("covariance", form))
     np.testing.assert_allclose(factored.means, plain.means, atol=1e-13)
     np.testing.assert_allclose(factored.covs, plain.covs, atol=1e-14)
     np.testing.assert_allclose(factored.log_likelihoods, plain.log_likelihoods, atol=1e-10)
@@ -406,9 +387,7 @@ def test_a_simulation_and_its_env_draw_errors_of_a_sensor_in_its_axes():
     x, z = (Turned.from_quat(part.reshape(-1, part.shape[-1])[:, :4], scalar_first=True) for part in truth)
     errors = (x.inv() * z).as_rotvec() / SENSOR
     assert (np.abs(np.cov(errors.T) - np.eye(3)) < 0.25).all()
-    estimates = filters.run(
-        filters.ExtendedKalmanFilter(model=model), inputs=inputs, measurements=truth.measurements
-    )
+    estimates = ran(model, inputs, truth.measurements)
     v, S = estimates.innovations, estimates.innovation_covs
     nis = np.einsum("bki,bki->bk", v, np.linalg.solve(S, v[..., None])[..., 0])
     assert 2.6 < nis.mean() < 3.4

@@ -12,6 +12,7 @@ from tests.filters.test_multiple_models import merged as mixture
 from tests.filters.test_multiple_models import moving
 from tests.filters.test_unequal_modes import moving as point
 from tests.models import pendulum, simulated
+from tests.oracles import each_close
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 
@@ -75,8 +76,7 @@ def test_it_is_near_to_what_all_sequences_of_modes_say():
     before, after = (abs(one.means - means)[:, :-1].mean() for one in (filtered, found))
     assert after < 0.3 * before  # what remains is what the filter itself leaves out
     assert abs(found.probabilities - probabilities).mean() < 0.07
-    np.testing.assert_allclose(found.means[:, -1], filtered.means[:, -1], rtol=1e-12)
-    np.testing.assert_allclose(found.probabilities.sum(axis=-1), 1.0, rtol=1e-12)
+    each_close((found.means[:, -1], found.probabilities.sum(axis=-1)), (filtered.means[:, -1], 1.0), rtol=1e-12)
 
 
 @pytest.mark.usefixtures("as_python")

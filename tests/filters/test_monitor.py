@@ -1,4 +1,4 @@
-"""Alarms: thresholds beside published run lengths, tests beside a naive text, and the rate that is stated."""
+"""Alarms: thresholds beside published run lengths, tests beside a naive text, stated rates, a tuned file's."""
 
 import json
 import math
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers its envs
-from filters import EstimateState, EstimateStates
+from filters import EstimateState
 from filters import monitoring as of_monitors
 from filters.logs.estimate import estimate_with
 from filters.logs.findings import alarms_of, columns_of, episodes
@@ -21,13 +21,18 @@ from filters.monitoring import (
     cusum_threshold,
     glr_run_length,
     glr_threshold,
+    monitor_for,
     monitor_of,
+    tuned_monitor,
 )
 from filters.registry import make_filter
+from tests.filters.checks import refused
+from tests.tuned_files import rewrite, write_untuned
 from thruster_env.core.compiled import interpreted, is_interpreting
 from thruster_env.logs.log import Log
 from thruster_env.model.quantities import Quantity
 from tuning.api.estimate import episode_sentence
+from tuning.evaluation.tuned import monitor_data
 from tuning.problems.find import find_problem
 
 
@@ -173,22 +178,15 @@ def test_a_watch_step_by_step_says_the_same():
         watch.restart()
 
 
-def test_wrappers_tell_of_health_and_copies_as_one_env_does():
+def test_wrappers_tell_of_health_and_keep_their_monitor():
+    """Copies tell what one env does: test_vector_wrapper.py."""
     env = EstimateState(gym.make("BowThruster-v0"), "ekf", monitor=200.0)
-    several = EstimateStates(gym.make_vec("BowThruster-v0", 2), "ekf", monitor={"steps_between": 200.0})
     assert json.loads(env.spec.to_json())["additional_wrappers"][-1]["kwargs"]["monitor"]["steps_between"] == 200.0
     env.reset(seed=8)
-    several.reset(seed=[7, 8])
-    action, alarms = np.array([3.0], dtype=np.float32), 0
-    for k in range(300):
-        action[:] = 10.0 * math.sin(0.05 * k)
-        _, _, _, _, info = env.step(action)
-        _, _, _, _, infos = several.step(np.array([-action, action]))
-        assert info["health"] == infos["health"][1] and infos["_health"].all()
-        alarms += len(info["health"].alarms)
-    assert alarms > 0
+    alarms = [env.step(np.float32([10.0 * math.sin(0.05 * k)]))[-1]["health"].alarms for k in range(300)]
+    assert any(alarms)
     env.reset(seed=9)
-    assert env.step(action)[-1]["health"].ok
+    assert env.step(np.float32([1.0]))[-1]["health"].ok
 
 
 @pytest.mark.parametrize(
@@ -201,8 +199,7 @@ def test_wrappers_tell_of_health_and_copies_as_one_env_does():
     ],
 )
 def test_monitors_that_cannot_be(given, rule):
-    with pytest.raises(ValueError, match=rule):
-        monitor_of(given)
+    refused(rule, monitor_of, given)
 
 
 def test_a_filter_without_a_covariance_has_no_innovations_to_test():
@@ -287,3 +284,40 @@ def test_arrays_that_do_not_fit_are_refused():
             Monitor().alarms(*arguments)
     with pytest.raises(ValueError, match="a monitor of 2 channels must get as many innovations"):
         Monitor().watch(2).step(v[0, :1], s[0], z[0])
+
+
+NAN = math.nan
+
+
+def test_counts_are_above_twice_the_longest_run_of_healthy_ones():
+    coarse = np.array([0.0] * 7 + [1.0] * 3 + [2.0] * 9 + [1.0] * 2)
+    slow = np.where(np.arange(21) % 8 == 0, np.arange(21.0), NAN)
+    run = np.column_stack([coarse, slow])
+    over = np.full((9, 2), NAN)  # the run is over
+    found = monitor_for(np.array([np.vstack([run, over])]))
+    assert (found.stuck, found.missing) == (2 * 9 + 1, 2 * 7 + 1)
+    assert monitor_for(np.random.default_rng(0).normal(size=(2, 50, 1))) == Monitor()
+    assert monitor_for(np.full((1, 5, 1), NAN)).missing == 10
+    kept = monitor_for(np.array([run]), Monitor(steps_between=500.0, stuck=100))
+    assert (kept.steps_between, kept.stuck) == (500.0, 100)
+
+
+def test_thresholds_are_those_of_the_monitor_by_test():
+    told = monitor_data(Monitor(), channels=2)["thresholds"]
+    assert math.exp(-0.5 * told["outlier"][1]) == pytest.approx(1.0 / 400_000)  # chi^2 of two degrees of freedom
+    assert told["glr"] > told["outlier"][0] ** 0.5 > 4.0 and told["cusum"] > 4.0
+    assert told["variance"][0] < 50 < told["variance"][1]
+    assert (told["stuck"], told["missing"]) == (10, 10)
+
+
+def test_the_file_has_it_and_older_ones_do_not(tmp_path):
+    path = write_untuned(tmp_path / "tuned.json", "outliers")
+    content = json.loads(path.read_text())["monitor"]
+    assert tuned_monitor(path) == Monitor(stuck=content["stuck"], missing=content["missing"])
+    assert content["thresholds"] == monitor_data(tuned_monitor(path), 1)["thresholds"]
+    rewrite(path, lambda content: content["monitor"].update(steps_between=3))
+    refused("steps_between must be from 100 to 1e12, but got 3 .in the tuned file", tuned_monitor, path)
+    rewrite(path, lambda content: content.update(monitor=[1]))
+    refused("the monitor of a tuned file must be a mapping", tuned_monitor, path)
+    rewrite(path, lambda content: content.pop("monitor"))
+    refused("must have a monitor .tune again, or give the steps., but", tuned_monitor, path)

@@ -30,15 +30,13 @@ def test_of_a_linear_model_it_is_the_kalman_filter_at_any_horizon(changes):
     for horizon in (1, 2, 5, 50):
         filter_ = MovingHorizonFilter(model=model, horizon=horizon, loss="quadratic", iterations=1)
         found = run(filter_, KEYS, inputs, measurements)
-        np.testing.assert_allclose(found.means[0], means, **CLOSE)
-        np.testing.assert_allclose(found.covs[0], covs, **CLOSE)
+        each_close((found.means[0], found.covs[0]), (means, covs), **CLOSE)
         expected = run(make_filter("ekf", model), KEYS, inputs, measurements)
         for part in ("innovations", "innovation_covs", "log_likelihoods"):
             np.testing.assert_allclose(getattr(found, part), getattr(expected, part), **CLOSE)
 
 
 def stepped(filter_, inputs, measurements):
-    """The belief after all measurements."""
     belief, _ = filter_.update(filter_.init(), measurements[0])
     for u, z in zip(inputs, measurements[1:], strict=True):
         belief, _ = filter_.update(filter_.predict(belief, u), z)
@@ -95,7 +93,6 @@ def disturbances(states, inputs):
 
 
 def rho(square, channels, loss):
-    """A loss of the squared residual."""
     if loss == "student":
         return (K**2 + channels) / 2 * math.log1p(square / K**2)
     return square / 2 if loss == "quadratic" or square < K**2 else K * math.sqrt(square) - K**2 / 2

@@ -5,9 +5,9 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from docs.scripts.filter_pictures import followed, half_lost
 from filters import StateSpaceModel, make_filter, run
 from filters.gaussian.blending import Parts, blender
+from tests.filters.checks import refused
 from tests.models import pendulum
 from tests.thruster_env.core.test_angles import turning
 from thruster_env.model.affine import affine_model, linearize
@@ -148,16 +148,6 @@ def test_the_static_estimator_has_the_posterior_of_the_models():
     assert total == pytest.approx(np.log(weights.sum()) + max(levels), rel=1e-10)
 
 
-def switching(models, stay, steps, rng):
-    """A run of a plant that switches among models: modes, states, inputs, measurements."""
-    modes = np.zeros(steps + 1, dtype=int)
-    for k in range(steps):
-        modes[k + 1] = modes[k] if rng.uniform() < stay else rng.integers(len(models))
-    inputs = np.repeat(rng.uniform(-20.0, 20.0, steps // 25 + 1), 25)[:steps, None]
-    states, seen = followed(models, modes, inputs, rng)
-    return modes, states, inputs, seen
-
-
 def improbable():
     """Filters, one of whose modes has no probability or none that a float64 has, and then fits best; positions."""
     quiet, wild = moving(0.01), moving(4.0)
@@ -237,34 +227,6 @@ def test_parts_far_away_that_have_no_weight_do_not_count():
     np.testing.assert_array_equal(row[:6], [1.0, 2.0, 3.0, 0.5, 0.5, 4.0])
 
 
-@pytest.mark.slow
-def test_a_thruster_that_loses_thrust_is_followed_almost_as_if_the_mode_were_known():
-    whole = thruster_model()
-    models = [whole, half_lost(whole)]
-    filters = [make_filter("ekf", one) for one in models]
-    imm = make_filter("imm", whole, modes=models, stay=0.96)
-    errors, brier = {"told": [], "imm": [], "ekf": []}, []
-    for seed in range(12):
-        modes, states, inputs, seen = switching(models, 0.96, 300, np.random.default_rng(seed))
-        told = filters[0].init()
-        several, single = imm.init(), filters[0].init()
-        for k, (mode, x, z) in enumerate(zip(modes, states, seen, strict=True)):
-            if k:
-                told, u = filters[mode].predict(told, inputs[k - 1]), inputs[k - 1]
-                several, single = imm.predict(several, u), filters[0].predict(single, u)
-            told, _ = filters[mode].update(told, z)
-            several, _ = imm.update(several, z)
-            single, _ = filters[0].update(single, z)
-            for name, belief in (("told", told), ("imm", several), ("ekf", single)):
-                errors[name].append(belief.mean - x)
-            brier.append((imm.mode_probabilities(several)[1], mode == 1))
-    rmse = {name: np.sqrt(np.mean(np.square(one), axis=0)) for name, one in errors.items()}
-    assert (rmse["imm"] < 1.1 * rmse["told"]).all() and (rmse["ekf"] > 1.5 * rmse["imm"]).all(), rmse
-    said, true = np.array(brier).T
-    assert np.mean((said - true) ** 2) == pytest.approx(np.mean(said * (1.0 - said)), rel=0.25)  # calibrated
-    assert np.mean((said - true) ** 2) < 0.1
-
-
 def test_an_angle_is_mixed_the_short_way_round():
     """Estimates near the cut are those far from it, turned: modes, mixtures and innovations alike."""
     rng = np.random.default_rng(4)
@@ -305,16 +267,4 @@ def test_an_angle_is_mixed_the_short_way_round():
     ],
 )
 def test_what_is_refused(changes, rule):
-    with pytest.raises(ValueError, match=rule):
-        make_filter("imm", thruster_model(), **changes)
-
-
-@pytest.mark.parametrize("name", ["imm", "mmae", "fuzzy"])
-def test_the_sample_times_of_several_models_do_not_change(name):
-    filter_ = make_filter(name, thruster_model())
-    for use in (
-        lambda: filter_.session().set_dt(0.02),
-        lambda: filter_.session().scale_process_noise(2.0),
-    ):
-        with pytest.raises(ValueError, match=f"needs a filter with one model, but got '{name}'"):
-            use()
+    refused(rule, make_filter, "imm", thruster_model(), **changes)

@@ -2,12 +2,15 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
 
-from filters import FILTERS, ExtendedKalmanFilter, KalmanFilter, make_filter, run, thruster_model
+from filters import FILTERS, ExtendedKalmanFilter, KalmanFilter, differentiated, make_filter, run, thruster_model
+from filters.differentiated import AT_ONCE, Wanted, recursion_of
 from filters.filter import PageFilter
+from filters.pages.page import called_at_points
 from filters.sensitivity import (
     KINDS,
     ModelSlopes,
@@ -17,13 +20,13 @@ from filters.sensitivity import (
     sensitivity,
     state_score,
 )
+from tests.filters.checks import refused
 from tests.filters.of_arrays import run_page
 from tests.filters.test_differentiated import units
-from tests.filters.test_likelihood import directions, two_channels
+from tests.filters.test_likelihood import directions, scored_data, two_channels
 from tests.filters.test_sensitivity import pendulum as turning_pendulum
-from tests.filters.test_sensitivity import turn
-from tests.filters.test_state_scores import data_of
-from tests.models import plane_model, simulated, wide_model
+from tests.filters.test_sensitivity import ring, turn
+from tests.models import plane_model, random_affine, simulated, wide_model
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 
@@ -38,7 +41,6 @@ def whirl(x, u, c):
 
 
 def whirl_slopes(x, u, c):
-    """The Jacobian of that."""
     return (1.0, 0.1), (-0.1 * c.stiffness * math.cos(x[0]), 1.0 - 0.1 * c.damping)
 
 
@@ -48,7 +50,6 @@ def gaze(x, c):
 
 
 def gaze_slopes(x, c):
-    """The Jacobian of that."""
     cosine = math.cos(x[0])
     return ((1.0 + 0.4 * cosine) / (1.16 + 0.8 * cosine), 0.0), (-0.3 * math.sin(x[0]), 1.0)
 
@@ -156,7 +157,7 @@ def assert_page_is_the_filter(filter_):
 @pytest.mark.parametrize("name", NAMES)
 def test_of_an_affine_model_all_filters_have_the_derivatives_of_kalmans(name):
     model = two_channels()
-    _, inputs, z, x = data_of(model, steps=12)
+    _, inputs, z, x = scored_data(model, steps=12)
     slopes = tuple(map(np.array, directions(model)))
     filters = [KalmanFilter(model=model), made(name, model)]
     for work in (likelihood, lambda *given, **used: [information(*given, **used)]):
@@ -170,7 +171,7 @@ def test_of_an_affine_model_all_filters_have_the_derivatives_of_kalmans(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_the_interpreted_likelihood_is_the_compiled_one(name):
     model = wide_pendulum()
-    _, inputs, z, _ = data_of(model, steps=12)
+    _, inputs, z, _ = scored_data(model, steps=12)
     slopes = tuple(map(np.array, directions(model)))
     compiled = likelihood(model, inputs, z, *slopes, filter=make_filter(name, model))
     alone = likelihood(model, inputs[3:4], z[3:4], *slopes, filter=make_filter(name, model))
@@ -185,7 +186,7 @@ def test_the_interpreted_likelihood_is_the_compiled_one(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_state_that_is_known_does_not_matter_until_a_parameter_makes_it_unknown(name):
     model = plane_model(a=[[0.9, 0.3], [0.0, 1.0]], process_noise_cov=[0.3, 0.0], prior_cov=[1.0, 0.0])
-    _, inputs, z, _ = data_of(model, steps=12)
+    _, inputs, z, _ = scored_data(model, steps=12)
     q, r = np.array([np.diag([1.0, 0.0]), np.diag([0.0, 1.0]), np.zeros((2, 2))]), np.zeros((3, 2, 2))
     r[2] = np.eye(2)
     kalman, other = (likelihood(model, inputs, z, q, r, filter=one) for one in (None, made(name, model)))
@@ -198,7 +199,7 @@ def test_a_state_that_is_known_does_not_matter_until_a_parameter_makes_it_unknow
 @pytest.mark.usefixtures("as_python")
 def test_parameters_of_a_filter_reach_its_page():
     model = wide_pendulum()
-    _, inputs, z, _ = data_of(model, steps=12)
+    _, inputs, z, _ = scored_data(model, steps=12)
     slopes = tuple(map(np.array, directions(model)))
     of = {
         (name, k): likelihood(model, inputs, z, *slopes, filter=make_filter(name, model, **own)).gradients
@@ -239,13 +240,79 @@ def test_filters_without_a_page_are_refused():
     names = "kf, ekf, iekf, ukf, ckf, fading, h-infinity, schmidt, ekf-robust, sage-husa, vb"
     rule = f"a filter with derivatives must be one of {names}, but got "
     assert ", ".join(kind.name for kind in KINDS) in rule
-    with pytest.raises(ValueError, match=f"{rule}'enkf'"):
-        likelihood(*given, filter=make_filter("enkf", model))
-    with pytest.raises(ValueError, match="filter must be an object that make_filter returns, but got 'ukf'"):
-        likelihood(*given, filter="ukf")
+    refused(f"{rule}'enkf'", likelihood, *given, filter=make_filter("enkf", model))
+    refused("filter must be an object that make_filter returns, but got 'ukf'", likelihood, *given, filter="ukf")
     scheduled = KalmanFilter(model=thruster_model(), schedule=3)
-    with pytest.raises(ValueError, match="must have schedule=1, but got 3"):
-        likelihood(*given, filter=scheduled)
+    refused("must have schedule=1, but got 3", likelihood, *given, filter=scheduled)
     three = make_filter("ukf", wide_model(), kappa=-2.5)
-    with pytest.raises(ValueError, match="kappa must be above minus the number of states, -2, but got -2.5"):
-        likelihood(*given, filter=three)
+    refused("kappa must be above minus the number of states, -2, but got -2.5", likelihood, *given, filter=three)
+
+
+PLAIN = Wanted(information=False, constants=False, tails=False)
+
+
+def whirl_if(x, u, c):
+    """The pendulum, by a function that cannot be traced."""
+    return (0.0, 0.0) if int(abs(x[1]) > 1e6) else whirl(x, u, c)
+
+
+def at_once(model, filter_):
+    used, page, _ = differentiable(model, filter_)
+    return recursion_of(used.functions, used.shape, PLAIN, page, True).at_once
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", NAMES)
+def test_functions_that_are_called_have_the_derivatives_of_those_that_are_traced(name):
+    model = wide_pendulum()
+    decides = model.replace(transition=whirl_if)
+    _, inputs, z, x = scored_data(model, steps=12)
+    slopes = tuple(map(np.array, directions(model)))
+    assert (at_once(model, made(name, model)), at_once(decides, made(name, decides))) == (
+        AT_ONCE,
+        1,
+    )
+    for work in (likelihood, partial(state_score, states=x)):
+        given = {"inputs": inputs, "measurements": z, "q_slopes": slopes[0], "r_slopes": slopes[1]}
+        traced, called = (work(one, **given, filter=made(name, one)) for one in (model, decides))
+        np.testing.assert_allclose(called.values, traced.values, rtol=1e-11)
+        assert_slopes(called.gradients, traced.gradients, 1e-8)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", NAMES)
+def test_a_model_that_is_too_large_to_be_written_out_is_called(name, monkeypatch):
+    monkeypatch.setattr(differentiated, "most_operations", lambda shape: 50)
+    recursion_of.cache_clear()
+    model = random_affine(n=7, m=2, p=1)  # its matrices are arrays
+    inputs, z = simulated(model, 3, count=2, missing=0.2)
+    slopes = units(model)
+    slopes = slopes[0], np.array([np.zeros((2, 2))] * 7 + [np.eye(2)])
+    assert at_once(model, made(name, model)) == 1
+    kalman, other = (likelihood(model, inputs, z, *slopes, filter=one) for one in (None, made(name, model)))
+    recursion_of.cache_clear()
+    np.testing.assert_allclose(other.values, kalman.values, rtol=1e-11)
+    np.testing.assert_allclose(other.gradients, kalman.gradients, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("points", [3, 40])
+def test_the_slope_of_points_goes_the_short_way_over_the_cut(points):
+    model = wide_pendulum()
+    values, slopes = called_at_points(model.functions, model.shape, "sight", False, points)
+    x, dx = (np.tile([[a], [b]], points) for a, b in ((math.pi, 1.0), (1.0, 0.5)))
+    seen, expected = gaze(x[:, 0], model.constants), np.array(gaze_slopes(x[:, 0], model.constants)) @ dx[:, 0]
+    np.testing.assert_allclose(np.array(values(x, model.constants)).T, [seen] * points)
+    found = np.array(slopes(x, np.ones(2), model.constants, dx))
+    np.testing.assert_allclose(found.T, [expected] * points, rtol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES[:1])
+def test_forty_states_have_the_derivatives_of_kalmans_filter(name):
+    model = ring(40)
+    inputs, z = simulated(model, 20, count=2, missing=0.2)
+    q, r = np.array([np.eye(40), np.zeros((40, 40))]), np.array([np.zeros((20, 20)), np.eye(20)])
+    kalman, other = (likelihood(model, inputs, z, q, r, filter=one) for one in (None, made(name, model)))
+    np.testing.assert_allclose(other.values, kalman.values, rtol=1e-11)
+    np.testing.assert_allclose(other.gradients, kalman.gradients, rtol=1e-7)

@@ -1,11 +1,17 @@
-"""A single trajectory without the axis of a batch: `run(filter_, z)`, lists, pandas, and inputs of each row."""
+"""A single trajectory without the axis of a batch, lists, pandas, inputs of each row, no keys."""
 
 import numpy as np
 import pytest
 
 import filters
 import tuning
+from filters import EnsembleKalmanFilter, KalmanFilter, run, smooth
 from filters.named import model_named
+from tests.filters.checks import refused
+from tests.models import wide_model
+from tests.oracles import each_equal
+from thruster_env.core.streams import filter_keys
+from thruster_env.model.affine import affine_model
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +37,7 @@ def driven(m=1):
 Z = np.sin(0.3 * np.arange(40.0)) + np.where(np.arange(40) % 7 == 3, np.nan, 0.0)
 
 
-def each_equal(single, batch):
+def equals_batch(single, batch):
     assert type(single) is type(batch)
     for array, part in zip(single, batch, strict=True):
         np.testing.assert_array_equal(array, part[0])
@@ -41,10 +47,10 @@ def each_equal(single, batch):
 def test_a_column_is_a_batch_of_one(walk, form):
     batch = filters.run(walk, inputs=np.zeros((1, 39, 0)), measurements=Z[None, :, None])
     single = filters.run(walk, form(Z))
-    each_equal(single, batch)
+    equals_batch(single, batch)
     assert single.means.shape == (40, 2) and single.innovations.shape == (40, 1)
     assert single.stds[3, 1] == pytest.approx(np.sqrt(single.covs[3, 1, 1])) and single.stds.shape == (40, 2)
-    each_equal(
+    equals_batch(
         filters.smooth(walk, form(Z)),
         filters.smooth(walk, inputs=np.zeros((1, 39, 0)), measurements=Z[None, :, None]),
     )
@@ -52,18 +58,18 @@ def test_a_column_is_a_batch_of_one(walk, form):
 
 def test_pandas_columns_and_tables(walk):
     pandas = pytest.importorskip("pandas")
-    each_equal(filters.run(walk, pandas.Series(Z)), filters.run(walk, Z[None, :, None]))
+    equals_batch(filters.run(walk, pandas.Series(Z)), filters.run(walk, Z[None, :, None]))
     table = pandas.DataFrame({"a": Z, "b": 0.5 * Z})
     u = 0.1 * np.arange(39.0)
     batch = filters.run(driven(2), inputs=u[None, :, None], measurements=table.to_numpy()[None])
-    each_equal(filters.run(driven(2), inputs=pandas.Series(u), measurements=table), batch)
+    equals_batch(filters.run(driven(2), inputs=pandas.Series(u), measurements=table), batch)
 
 
 def test_an_input_of_the_last_row_moves_nothing():
     u = np.cos(np.arange(40.0))
     batch = filters.run(driven(), inputs=u[None, :-1, None], measurements=Z[None, :, None])
     for inputs in (u, u[:-1], u[:, None], u.tolist()):
-        each_equal(filters.run(driven(), inputs=inputs, measurements=Z), batch)
+        equals_batch(filters.run(driven(), inputs=inputs, measurements=Z), batch)
     assert not np.array_equal(filters.run(driven(), inputs=u[::-1], measurements=Z).means, batch.means[0])
 
 
@@ -77,9 +83,13 @@ def test_many_runs_of_measurements_alone(walk):
 def test_an_ensemble_draws_as_the_batch_of_one_does():
     enkf = filters.make_filter("enkf", driven().model, ensemble_size=20)
     u = np.zeros(39)
-    each_equal(
+    equals_batch(
         filters.run(enkf, inputs=u, measurements=Z), filters.run(enkf, None, u[None, :, None], Z[None, :, None])
     )
+
+
+U = np.zeros(39)
+DRIVEN = {"inputs": U, "measurements": Z}
 
 
 @pytest.mark.parametrize(
@@ -88,12 +98,12 @@ def test_an_ensemble_draws_as_the_batch_of_one_does():
         ({"keys": Z}, "a model with 1 input must get it"),
         ({"inputs": np.zeros(20), "measurements": Z}, "inputs and measurements must have shapes"),
         (
-            {"inputs": np.zeros(39), "measurements": np.stack([Z, Z], axis=1)},
+            {"inputs": U, "measurements": np.stack([Z, Z], axis=1)},
             r"measurements of one trajectory must have shape \(K \+ 1, 1\), but got \(40, 2\)$",
         ),
         ({"inputs": 0.5, "measurements": Z}, r"shape \(39, 1\), but got a number: np.full\(\(39, 1\), 0.5\)"),
         (
-            {"inputs": np.zeros(39), "measurements": Z, "update_first": False},
+            {"inputs": U, "measurements": Z, "update_first": False},
             r"inputs must have shape \(40, 1\), a row for each .* update_first=False, but got \(39, 1\)",
         ),
         *(
@@ -111,23 +121,14 @@ def test_an_ensemble_draws_as_the_batch_of_one_does():
             {"inputs": np.append(np.zeros(38), np.nan), "measurements": Z},
             "inputs must be finite, .* but row 38 of inputs has nan",
         ),
-        ({"inputs": np.zeros(39), "measurements": ["a"] * 40}, "measurements must be an array of numbers"),
+        ({"inputs": U, "measurements": ["a"] * 40}, "measurements must be an array of numbers"),
         ({}, "measurements must be an array"),
+        ({**DRIVEN, "dt": 0.1, "noise": 0.3}, "noise must be a function of a step"),
         (
-            {"inputs": np.zeros(39), "measurements": Z, "dt": 0.1, "noise": 0.3},
-            "noise must be a function of a step",
-        ),
-        (
-            {
-                "inputs": np.zeros(39),
-                "measurements": Z,
-                "dt": 0.1,
-                "noise": lambda dt: np.eye(2),
-                "process_noise_covs": np.zeros((39, 2, 2)),
-            },
+            {**DRIVEN, "dt": 0.1, "noise": lambda dt: np.eye(2), "process_noise_covs": np.zeros((39, 2, 2))},
             "in place of process_noise_covs, but got process_noise_covs, too",
         ),
-        ({"keys": Z, "inputs": np.zeros(39)}, r"got None: .*run\(filter_, inputs=u, measurements=z\)"),
+        ({"keys": Z, "inputs": U}, r"got None: .*run\(filter_, inputs=u, measurements=z\)"),
         ({"keys": []}, r"at least one row, but got \[\]"),
         ({"keys": [[1.0, 2.0], [3.0]]}, "measurements must be an array of numbers"),
         ({"keys": np.stack([Z, Z])}, r"got \(2, 40\): z\[..., None\] for 2 trajectories"),
@@ -212,3 +213,44 @@ def test_a_run_prints_few_lines_and_a_batch_is_one_table(walk):
     table = batch.to_frame()
     assert table.index.names == ["run", "time_s"] and table.loc[1].equals(batch.to_frame(1))
     assert batch.plot(1).axes and "FilteredRuns(" in repr(batch._replace(divergences=0))
+
+
+def random_data(model, count=3, steps=7):
+    rng = np.random.default_rng(0)
+    return rng.normal(size=(count, steps, model.inputs)), rng.normal(size=(count, steps + 1, model.m))
+
+
+@pytest.mark.parametrize("kind, numbers", [(KalmanFilter, {}), (EnsembleKalmanFilter, {"ensemble_size": 5})])
+def test_keys_are_those_of_the_first_seeds_unless_they_are_given(kind, numbers, as_python):
+    model = wide_model()
+    filter_, (u, z) = kind(model=model, **numbers), random_data(model)
+    given = run(filter_, filter_keys(range(3)), u, z)
+    each_equal(given, run(filter_, inputs=u, measurements=z))
+    smoothed = smooth(filter_, filter_keys(range(3)), u, z, 2), smooth(filter_, inputs=u, measurements=z, lag=2)
+    np.testing.assert_array_equal(smoothed[0].means, smoothed[1].means)
+
+
+def test_no_keys_are_made_for_a_filter_that_draws_nothing(as_python, monkeypatch):
+    def refuse(seeds):
+        raise AssertionError(seeds)
+
+    monkeypatch.setattr("filters.engine.batch.filter_keys", refuse)
+    model = wide_model()
+    u, z = random_data(model)
+    assert np.isfinite(run(KalmanFilter(model=model), inputs=u, measurements=z).means).all()
+    with pytest.raises(AssertionError, match=r"range\(0, 3\)"):
+        run(EnsembleKalmanFilter(model=model, ensemble_size=5), inputs=u, measurements=z)
+
+
+def test_a_model_without_inputs_needs_none(as_python):
+    noise = {"process_noise_cov": [0.1], "measurement_noise_cov": [1.0], "prior_mean": [0.0], "prior_cov": [1.0]}
+    filter_ = KalmanFilter(model=affine_model(a=[[0.9]], b=np.zeros((1, 0)), c=[[1.0]], **noise))
+    z = random_data(filter_.model)[1]
+    whole = run(filter_, filter_keys(range(3)), np.zeros((3, 7, 0)), z)
+    np.testing.assert_array_equal(whole.means, run(filter_, measurements=z).means)
+
+
+def test_measurements_have_to_be_given(as_python):
+    filter_ = KalmanFilter(model=wide_model())
+    refused(r"measurements must be an array \(B, K \+ 1, m\), but got None", run, filter_)
+    refused("inputs and measurements must have shapes", run, filter_, measurements=random_data(filter_.model)[1])

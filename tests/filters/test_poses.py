@@ -1,14 +1,19 @@
-"""Filters of poses and directions: the invariant filter, sides, naive slopes, refusals."""
+"""Poses, directions and rotations: the invariant filter, sides, naive slopes, gtsam 4.3.0's numbers."""
+
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import filters
+from tests.filters.test_attitude import ran
+from tests.oracles import each_close
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted
 from thruster_env.model import directions, poses, rotations, turns
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import Direction, ExtendedPose, Pose
+from thruster_env.model.turns import Direction, ExtendedPose, Pose, Rotation
 
 DT, GRAVITY = 0.1, (0.0, 0.0, -9.81)
 
@@ -24,7 +29,6 @@ def position(x, c):
 
 
 def navigation(side):
-    """Attitude, velocity and position."""
     return StateSpaceModel(
         transition=fly,
         observe=position,
@@ -88,16 +92,9 @@ def test_estimates_of_extended_poses_do_not_depend_on_the_side_of_the_error(data
     """With the exact reset, and without process noise, whose axes are of the side; errors are consistent."""
     truth, u, z = data
     world, body = navigation("world"), navigation("body")
-    estimates = filters.run(filters.ExtendedKalmanFilter(model=world), inputs=u, measurements=z)
+    estimates = ran(world, u, z)
     assert 6.4 < nees(world, truth, estimates)[:, 5:].mean() < 12.0
-    of_sides = [
-        filters.run(
-            filters.ExtendedKalmanFilter(model=model.replace(process_noise_cov=np.zeros(9))),
-            inputs=u,
-            measurements=z,
-        )
-        for model in (world, body)
-    ]
+    of_sides = [ran(model.replace(process_noise_cov=np.zeros(9)), u, z) for model in (world, body)]
     np.testing.assert_allclose(of_sides[1].means, of_sides[0].means, atol=1e-10)
     np.testing.assert_allclose(of_sides[1].log_likelihoods, of_sides[0].log_likelihoods, atol=1e-8)
 
@@ -115,7 +112,6 @@ def marks(x, c):
 
 
 def camera(side="body"):
-    """A pose, and a direction."""
     start = directions.unit((0.2, 0.3, -1.0))
     return StateSpaceModel(
         transition=turning,
@@ -160,15 +156,83 @@ def test_filters_of_poses_and_directions(name):
         after = turns.move(x, d, known)
         G = slopes(lambda e: turns.difference(turns.move(x, d + e, known), after, known))  # noqa: B023
         x, P = np.array(after), G @ (P - K @ S @ K.T) @ G.T
-        np.testing.assert_allclose(estimates.means[k], x, atol=1e-8)
-        np.testing.assert_allclose(estimates.covs[k], P, atol=1e-8)
+        each_close((estimates.means[k], estimates.covs[k]), (x, P), atol=1e-8)
 
 
 def test_what_is_no_direction_or_pose_is_refused():
-    """Vectors without length 1, by what they must be."""
     with pytest.raises(ValueError, match="'field' must be .x, y, z. of length 1"):
         camera().replace(prior_mean=[1.0, *[0.0] * 6, 0.0, 0.0, 2.0])
     with pytest.raises(ValueError, match="'camera' must begin with a quaternion"):
         camera().replace(prior_mean=[2.0, *[0.0] * 6, 0.0, 0.0, 1.0])
     with pytest.raises(ValueError, match="'camera' and 'field' are of poses and directions: filters.run"):
         filters.AuxiliaryParticleFilter(model=camera()).kernels()
+
+
+GTSAM = json.loads((Path(__file__).parents[1] / "data" / "gtsam_rotations.json").read_text())
+NORTH, Q, R = (0.5, 0.1, -0.86), 1e-3, 0.02  # as gtsam_rotations.py has them
+
+
+def of_matrix(rows):
+    """The quaternion of a rotation matrix, by the largest of its components (Shepperd 1978)."""
+    C = np.asarray(rows)
+    trace = np.trace(C)
+    squares = np.array([trace, *(2.0 * np.diag(C) - trace)])
+    i = int(np.argmax(squares))
+    skew = np.array([C[2, 1] - C[1, 2], C[0, 2] - C[2, 0], C[1, 0] - C[0, 1]])
+    q = np.array([1.0 + trace, *skew]) if i == 0 else np.array([skew[i - 1], *(C + C.T)[i - 1]])
+    q[i] = 1.0 + squares[i]
+    return q / np.linalg.norm(q)
+
+
+@pytest.mark.parametrize("case", GTSAM["rotations"])
+def test_rotations(case):
+    d, C, back, right, inverse = map(np.array, case)
+    np.testing.assert_allclose(rotations.matrix(rotations.exponential(d)), C, atol=1e-15)
+    np.testing.assert_allclose(rotations.logarithm(rotations.exponential(d)), back, atol=1e-14)
+    each_close((rotations.logarithm(of_matrix(C)), rotations.left_jacobian(-d)), (d, right), atol=1e-12)
+    np.testing.assert_allclose(rotations.inverse_left_jacobian(-d), inverse, atol=1e-12)
+
+
+@pytest.mark.parametrize("case", GTSAM["poses"])
+def test_extended_poses(case):
+    first, second, C, velocity, position, product = map(np.array, case)
+    pose = poses.exponential(first)
+    np.testing.assert_allclose(rotations.matrix(pose[:4]), C, atol=1e-14)
+    np.testing.assert_allclose(pose[4:], [*velocity, *position], atol=1e-12)
+    np.testing.assert_allclose(
+        poses.logarithm(poses.product(pose, poses.exponential(second))), product, atol=1e-12
+    )
+
+
+def turned(x, u, c):
+    return rotations.product(x, rotations.exponential(u))
+
+
+def north(x, c):
+    return rotations.to_body(x, NORTH)
+
+
+@pytest.mark.parametrize("case", GTSAM["steps"])
+def test_a_step_of_the_filter(case):
+    """Predicted and updated state and covariance; gtsam leaves out the reset of errors in the world's axes."""
+    C, P, d, z, C_after, P_after = map(np.array, case)
+    model = filters.StateSpaceModel(
+        transition=turned,
+        observe=north,
+        states=(Rotation("attitude", "q", "world"),),
+        inputs=3,
+        prior_mean=of_matrix(C),
+        prior_cov=C @ P @ C.T,
+        process_noise_cov=[Q] * 3,
+        measurement_noise_cov=[R] * 3,
+    )
+    session = filters.make_filter("ekf", model).session()
+    session.start()
+    session.predict(d)
+    predicted = of_matrix(C @ rotations.matrix(rotations.exponential(d)))
+    np.testing.assert_allclose(rotations.matrix(session.mean), rotations.matrix(predicted), atol=1e-13)
+    session.update(z)
+    np.testing.assert_allclose(rotations.matrix(session.mean), C_after, atol=1e-12)
+    correction = rotations.logarithm(rotations.product(session.mean, rotations.inverse(predicted)))
+    back = np.array(rotations.inverse_left_jacobian(correction))
+    np.testing.assert_allclose(back @ session.cov @ back.T, C_after @ P_after @ C_after.T, atol=1e-12)

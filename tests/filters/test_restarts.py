@@ -23,6 +23,8 @@ from tuning.evaluation.held_out import Comparison, summarised, summary
 from tuning.problems.data import Data
 from tuning.problems.model_problem import RunsProblem
 
+pytestmark = pytest.mark.usefixtures("as_python")
+
 
 class Clock(NamedTuple):
     """The constants of a model of any step length."""
@@ -79,7 +81,6 @@ def data(count=1, lost=0):
 
 
 @pytest.mark.parametrize("cause", FAILING)
-@pytest.mark.usefixtures("as_python")
 def test_the_first_step_states_and_cause_are_told(cause):
     states, changes = FAILING[cause]
     filter_, (inputs, z) = make_filter("ekf", model(**changes)), data(3, lost=1)
@@ -92,7 +93,6 @@ def test_the_first_step_states_and_cause_are_told(cause):
     assert pickle.loads(pickle.dumps(told)) == told
 
 
-@pytest.mark.usefixtures("as_python")
 def test_without_restarts_nothing_is_told():
     filter_, (inputs, z) = make_filter("ekf", model()), data()
     with warnings.catch_warnings():
@@ -101,7 +101,6 @@ def test_without_restarts_nothing_is_told():
     assert restarts_of(filter_, found.divergences, None, inputs, z) is None
 
 
-@pytest.mark.usefixtures("as_python")
 def test_a_covariance_that_overflows_is_told_and_so_are_noises_of_each_step():
     filter_ = make_filter("kf", affine([[1.0]], [[1.0]], [[1.0]], q=[0.1], r=[1.0], mean=[0.0], cov=[1.0]))
     inputs, z = np.zeros((1, 4, 1)), np.full((1, 5, 1), np.nan)
@@ -113,7 +112,6 @@ def test_a_covariance_that_overflows_is_told_and_so_are_noises_of_each_step():
     assert told.step == 3
 
 
-@pytest.mark.usefixtures("as_python")
 def test_logs_wrappers_and_evaluations_tell_the_same():
     cause = "F = df/dx is NaN"
     filter_, (inputs, z) = make_filter("ekf", model(**FAILING[cause][1])), data()
@@ -143,7 +141,6 @@ def one_env(filter_):
 
 @pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP"])
 @pytest.mark.parametrize("cause", FAILING)
-@pytest.mark.usefixtures("as_python")
 def test_copies_of_a_vector_env_tell_what_single_ones_do_at_the_steps_where_it_happens(cause, mode):
     filter_, (inputs, _) = make_filter("ekf", model(**FAILING[cause][1])), data(3, lost=1)
     envs = gym.vector.SyncVectorEnv(
@@ -172,7 +169,6 @@ def test_copies_of_a_vector_env_tell_what_single_ones_do_at_the_steps_where_it_h
 
 
 @pytest.mark.parametrize("cause", FAILING)
-@pytest.mark.usefixtures("as_python")
 def test_real_clocks_tell_the_same_and_logs_by_them(cause):
     states, changes = FAILING[cause]
     clocked = model(**changes, constants=Clock(1.0), states=model().states)
@@ -192,7 +188,6 @@ def test_real_clocks_tell_the_same_and_logs_by_them(cause):
     assert estimate_with(filter_, log).restarts[4:] == (step, states, cause)
 
 
-@pytest.mark.usefixtures("as_python")
 def test_the_noise_and_dt_that_a_session_was_set_to_are_those_of_the_cause():
     def transition(x, u, c):
         return 0.9 * x[0], x[1] + u[0] + (math.inf if c.dt > 1.5 else 0.0)
@@ -207,14 +202,11 @@ def test_the_noise_and_dt_that_a_session_was_set_to_are_those_of_the_cause():
     assert live.restarts[4:] == (2, ("b",), "f(x, u) is infinite, it overflows")
 
 
-@pytest.mark.usefixtures("as_python")
 def test_measured_inputs_are_known_to_the_cause():
     def split(self, model):
         return Split(inputs=(1,), measurements=(0,), channels=2)
 
     class Copies(gym.vector.SyncVectorEnv):
-        """Copies of it."""
-
         measured_inputs = split
 
     class Measuring(ModelEnv):
@@ -249,7 +241,6 @@ def test_measured_inputs_are_known_to_the_cause():
     assert "(b): f(x, u) is NaN." in told[0] and told[1].tolist() == [told[0]] * 2
 
 
-@pytest.mark.usefixtures("as_python")
 def test_reports_tell_them_also_of_stored_evaluations():
     filter_, (inputs, z) = make_filter("ekf", model(**FAILING["F = df/dx is NaN"][1])), data(2, lost=1)
     runs = [(u, 0.1 + rows + i) for i in range(3) for u, rows in zip(inputs, z, strict=True)]
@@ -267,7 +258,6 @@ def test_reports_tell_them_also_of_stored_evaluations():
 @pytest.mark.parametrize("name", ["imm", "mmae"])
 @pytest.mark.parametrize("place", [0, 1])
 @pytest.mark.parametrize("cause", FAILING)
-@pytest.mark.usefixtures("as_python")
 def test_a_mode_that_begins_anew_counts_and_is_named(cause, place, name):
     states, changes = FAILING[cause]
     modes = [model(), model()]
@@ -290,7 +280,6 @@ SMOOTHED = {"ekf": {}, "ukf": {}, "enkf": {"ensemble_size": 20}, "imm": {"mode_f
 
 @pytest.mark.parametrize("lag", [None, 2])
 @pytest.mark.parametrize("name", SMOOTHED)
-@pytest.mark.usefixtures("as_python")
 def test_a_smoother_warns_as_the_filter_does(name, lag):
     failing, numbers = model(transition=lost_f), SMOOTHED[name]
     numbers = numbers if name != "imm" else {**numbers, "modes": [failing, model()]}
@@ -307,7 +296,6 @@ def test_a_smoother_warns_as_the_filter_does(name, lag):
     assert caught[0].filename == __file__
 
 
-@pytest.mark.usefixtures("as_python")
 def test_runs_that_begin_where_they_are_measured_are_repeated_from_there():
     inputs, z = data(2, lost=1)
     runs = [(u, 0.1 + 0.01 * i + rows) for i in range(3) for u, rows in zip(inputs, z, strict=True)]

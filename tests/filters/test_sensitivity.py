@@ -9,7 +9,7 @@ from scipy.stats import multivariate_t, norm
 
 from filters import ExtendedKalmanFilter, StateSpaceModel, affine_model, run
 from filters.sensitivity import ModelSlopes, likelihood, sensitivity
-from thruster_env.core.angles import difference
+from tests.filters.textbooks import extended_filter
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import simulate
@@ -128,22 +128,7 @@ def test_the_gradient_is_that_of_central_differences(name, degrees):
 
 def textbook(model, inputs, measurements):
     """Innovations and their covariances of an extended Kalman filter, channels that are NaN left out."""
-    x, p, c = model.prior_mean, model.prior_cov, model.constants
-    shape, found = model.shape, []
-    for k, z in enumerate(measurements):
-        if k:
-            for _ in range(model.substeps):
-                f = np.array(model.transition_jacobian(tuple(x), tuple(inputs[k - 1]), c))
-                x, p = np.array(model.transition(tuple(x), tuple(inputs[k - 1]), c)), f @ p @ f.T
-            p = p + model.process_noise_cov
-        there = ~np.isnan(z)
-        h = np.array(model.observe_jacobian(tuple(x), c))[there]
-        v = difference(z, model.observe(tuple(x), c), shape.measurement_angles)[there]
-        s = h @ p @ h.T + model.measurement_noise_cov[np.ix_(there, there)]
-        gain = np.linalg.solve(s, h @ p).T
-        x, p = difference(x + gain @ v, 0.0, shape.state_angles), p - gain @ s @ gain.T
-        found.append((v, s))
-    return found
+    return list(zip(*extended_filter(model, inputs, measurements)[2:], strict=True))
 
 
 @pytest.mark.parametrize("name", ["pendulum", "thruster"])

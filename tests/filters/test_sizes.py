@@ -1,4 +1,4 @@
-"""Few states with many sensors, and the other way round: every filter, on every path, and Kalman's numbers."""
+"""Any number of states and sensors, in any unit: every filter, on every path, and Kalman's numbers."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,10 @@ import pytest
 from filters import make_filter, run
 from filters.engine.belief import restart_if_lost
 from filters.registry import FILTERS
-from tests.models import KEY, random_affine, small
-from tests.oracles import kalman_filter
+from tests.filters.checks import refused
+from tests.models import KEY, random_affine, rescaled, simulated, small, wide_model
+from tests.oracles import each_close, kalman_filter
+from thruster_env.core.compiled import interpreted
 from thruster_env.core.sources import Source
 
 KEYS = np.array([KEY])
@@ -24,7 +26,6 @@ SIZES = [(2, 12), (1, 16), (5, 10), (12, 4)]  # of sensors or of states a matrix
 
 
 def made(name, model):
-    """A filter whose fields suit the size."""
     if name == "fuzzy":
         return make_filter(name, model, low=-5.0 * np.ones(model.n), high=5.0 * np.ones(model.n), premises=[0])
     return make_filter(name, model, **EXACT[name]) if name in EXACT else small(name, model)
@@ -56,12 +57,10 @@ def test_any_number_of_sensors_is_filtered_in_runs_and_by_steps(name):
         found = run(filter_, KEYS, inputs, z)
         assert np.isfinite(found.means).all() and not found.divergences.any()
         mean, cov = stepped(filter_, inputs, z)
-        np.testing.assert_allclose(mean, found.means[0, -1], rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(cov, found.covs[0, -1], rtol=1e-9, atol=1e-9)
+        each_close((mean, cov), (found.means[0, -1], found.covs[0, -1]), rtol=1e-9, atol=1e-9)
         if name in EXACT:
             means, covs, levels = kalman_filter(model, inputs[0], z[0])
-            np.testing.assert_allclose(found.means[0], means, rtol=1e-8, atol=1e-8)
-            np.testing.assert_allclose(found.covs[0], covs, rtol=1e-8, atol=1e-8)
+            each_close((found.means[0], found.covs[0]), (means, covs), rtol=1e-8, atol=1e-8)
             np.testing.assert_allclose(found.log_likelihoods[0], levels, rtol=1e-8, atol=1e-8)
 
 
@@ -72,8 +71,7 @@ def test_all_forms_of_models_of_any_size_are_kalman_s(name, form, n, m):
     model, inputs, z = drawn(n, m)
     filter_ = make_filter(name, model, form=form)
     found, (means, covs, levels) = run(filter_, KEYS, inputs, z), kalman_filter(model, inputs[0], z[0])
-    np.testing.assert_allclose(found.means[0], means, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(found.covs[0], covs, rtol=1e-8, atol=1e-8)
+    each_close((found.means[0], found.covs[0]), (means, covs), rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(found.log_likelihoods[0], levels, rtol=1e-8, atol=1e-8)
 
 
@@ -85,8 +83,7 @@ def test_compiled_code_of_many_sensors_has_these_numbers_too(name, fields, n, m)
     found, (means, covs, _) = run(filter_, KEYS, inputs, z), kalman_filter(model, inputs[0], z[0])
     np.testing.assert_allclose(found.means[0], means, rtol=1e-8, atol=1e-8)
     mean, cov = stepped(filter_, inputs, z)
-    np.testing.assert_allclose(mean, means[-1], rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(cov, covs[-1], rtol=1e-8, atol=1e-8)
+    each_close((mean, cov), (means[-1], covs[-1]), rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.parametrize("m", [1, 12])
@@ -112,5 +109,29 @@ def test_a_negative_variance_is_lost_for_any_number_of_sensors(m):
 
 
 def test_a_shape_of_no_argument_is_an_error():
-    with pytest.raises(ValueError, match=r"magnitude\(row\) has no argument cov"):
-        Source("magnitude", "row", work=1000, cov=(2, 2))
+    refused(r"magnitude\(row\) has no argument cov", Source, "magnitude", "row", work=1000, cov=(2, 2))
+
+
+UNIT_FREE = ["kf", "kf-steady", "ekf", "iekf", "ukf", "ckf", "enkf", "etkf", "ensrf", "denkf", "ienkf"]
+UNIT_FREE += ["enkf-n", "rhf", "pf", "apf", "rbpf", "sage-husa", "vb", "ekf-robust", "mhe", "open-loop"]
+
+
+# A power of two is exact; 1000 and 0.01 are what units do.
+@pytest.mark.parametrize("name", UNIT_FREE)
+@pytest.mark.parametrize(
+    ("states", "channels"), [((1000.0, 0.01, 7.0), (60.0, 1e-3)), ((2.0**20,) * 3, (8.0, 1.0))]
+)
+def test_a_change_of_units_changes_no_estimate(name, states, channels):
+    model = wide_model()
+    other = rescaled(model, states, channels)
+    inputs, measurements = simulated(model, 50)
+    with interpreted():
+        before = run(small(name, model), KEYS, inputs, measurements)
+        after = run(small(name, other), KEYS, inputs, measurements * channels)
+    np.testing.assert_allclose(after.means / states, before.means, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(after.covs / np.outer(states, states), before.covs, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["kf", "kf-steady", "ukf"])
+def test_units_that_differ_by_many_orders_change_no_estimate(name):
+    test_a_change_of_units_changes_no_estimate(name, (1e9, 3e-9, 7e4), (2e-8, 5e8))

@@ -1,6 +1,8 @@
-"""Smoothers against the whole trajectory as one Gaussian, textbook recursions, and the filters they improve."""
+"""Smoothers against one Gaussian of the whole trajectory, textbooks, naive ensembles and their filters."""
 
+import json
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,18 +10,22 @@ import pytest
 from filters import (
     CubatureKalmanFilter,
     EnsembleKalmanFilter,
+    EnsembleTransformFilter,
     ExtendedKalmanFilter,
+    IteratedEnsembleKalmanFilter,
     IteratedExtendedKalmanFilter,
     KalmanFilter,
+    SerialSquareRootFilter,
     UnscentedKalmanFilter,
     run,
 )
 from filters.consistency.nees import mean_interval, normalized_squares, rmse_ratios
 from filters.runs import smooth
 from tests.filters.test_differentiated import swing_if
-from tests.models import KEY, held_voltages, pendulum, scalar_model, simulated, swing, wide_model
+from tests.models import KEY, held_voltages, pendulum, plane_model, scalar_model, simulated, swing, wide_model
+from tests.oracles import each_close, each_equal, normals
 from thruster_env.core.compiled import interpreted
-from thruster_env.core.streams import episode_keys
+from thruster_env.core.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys
 from thruster_env.model import simulate
 from tuning.plants.thruster import find_scenario
 from tuning.problems.data import held_out_seeds
@@ -85,8 +91,7 @@ def test_on_an_affine_model_it_is_the_whole_trajectory_as_one_gaussian(kind, lag
     with interpreted():
         found = smooth(kind(model=model), KEYS, inputs, measurements, lag)
     means, covs = as_one_gaussian(model, inputs[0], measurements[0], 25 if lag is None else lag)
-    np.testing.assert_allclose(found.means[0], means, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(found.covs[0], covs, rtol=1e-9, atol=1e-9)
+    each_close((found.means[0], found.covs[0]), (means, covs), rtol=1e-9, atol=1e-9)
     assert (found.covs == np.swapaxes(found.covs, -1, -2)).all()
 
 
@@ -99,13 +104,11 @@ def test_no_lag_is_the_filter_and_the_longest_the_full_smoother(kind):
     keys = episode_keys(range(3))
     filtered = run(filter_, keys, inputs, measurements)
     without = smooth(filter_, keys, inputs, measurements, lag=0)
-    np.testing.assert_array_equal(without.means, filtered.means)
-    np.testing.assert_array_equal(without.covs, filtered.covs)
+    each_equal((without.means, without.covs), (filtered.means, filtered.covs))
     full = smooth(filter_, keys, inputs, measurements)
     for lag in (30, 1000):
         longest = smooth(filter_, keys, inputs, measurements, lag)
-        np.testing.assert_array_equal(longest.means, full.means)
-        np.testing.assert_array_equal(longest.covs, full.covs)
+        each_equal((longest.means, longest.covs), (full.means, full.covs))
     np.testing.assert_array_equal(full.means[:, -1], filtered.means[:, -1])
     some = smooth(filter_, keys, inputs, measurements, lag=4)
     np.testing.assert_allclose(some.means[:, -5:], full.means[:, -5:], rtol=1e-12)  # these see all that there is
@@ -121,8 +124,7 @@ def test_compiled_and_as_python_it_is_the_same(kind):
     compiled = smooth(filter_, keys, inputs, measurements, lag=5)
     with interpreted():
         plain = smooth(filter_, keys, inputs, measurements, lag=5)
-    for one, other in zip(compiled, plain, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+    each_close(compiled, plain, rtol=1e-9, atol=1e-12)
 
 
 def test_on_the_pendulum_it_is_the_textbook_recursion():
@@ -194,8 +196,7 @@ def test_a_scheduled_filter_is_smoothed_with_the_model_of_each_input():
             a = (np.array(moved) - predicted.mean).T
             gain = kept.cov @ a.T @ np.linalg.inv(predicted.cov)
             x, p = kept.mean + gain @ (x - predicted.mean), kept.cov + gain @ (p - predicted.cov) @ gain.T
-            np.testing.assert_allclose(found.means[0, k], x, rtol=1e-8, atol=1e-9)
-            np.testing.assert_allclose(found.covs[0, k], p, rtol=1e-8, atol=1e-9)
+            each_close((found.means[0, k], found.covs[0, k]), (x, p), rtol=1e-8, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -238,14 +239,12 @@ def test_nothing_is_carried_back_over_a_restart(kind):
     assert run(filter_, KEYS, inputs, measurements).divergences == 1
     found = smooth(filter_, KEYS, inputs, measurements)
     before = smooth(filter_, KEYS, inputs[:, :4], measurements[:, :5])
-    np.testing.assert_array_equal(found.means[:, :5], before.means)
-    np.testing.assert_array_equal(found.covs[:, :5], before.covs)
+    each_equal((found.means[:, :5], found.covs[:, :5]), (before.means, before.covs))
     assert np.isfinite(found.means).all()
     if kind is KalmanFilter:  # an ensemble's draws depend on the step, so only here the rest can be had alone
         measurements[0, 5] = np.nan  # what met the lost estimate
         after = smooth(filter_, KEYS, inputs[:, 5:], measurements[:, 5:])
-        np.testing.assert_allclose(found.means[:, 5:], after.means, rtol=1e-12)
-        np.testing.assert_allclose(found.covs[:, 5:], after.covs, rtol=1e-12)
+        each_close((found.means[:, 5:], found.covs[:, 5:]), (after.means, after.covs), rtol=1e-12)
 
 
 def test_what_cannot_be_smoothed_is_refused():
@@ -272,3 +271,72 @@ def test_a_model_that_decides_is_smoothed_as_one_that_does_not(kind):
         found.append(smooth(kind(model=model), None, inputs, z))
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("lag", [2, 8])
+def test_the_ensemble_smoother_is_the_naive_one_with_the_same_normals(lag):
+    size, steps, model = 11, 8, wide_model()
+    a, b, offset, c, shift = model.matrices()
+    root_p, root_q, root_r = (
+        np.linalg.cholesky(p) for p in (model.prior_cov, model.process_noise_cov, model.measurement_noise_cov)
+    )
+    inputs, measurements = simulated(model, steps, level=1.0)
+    measurements[0, 3, 1] = measurements[0, 5] = np.nan
+    with interpreted():
+        filter_ = EnsembleKalmanFilter(model=model, ensemble_size=size)
+        found = smooth(filter_, KEYS, inputs, measurements, lag)
+    states = [model.prior_mean[:, None] + root_p @ normals(FILTER_PRIOR, 0, 3, size)]  # of all steps so far
+    for k, z in enumerate(measurements[0]):
+        if k > 0:
+            stirred = root_q @ normals(FILTER_PROCESS, k, 3, size)
+            states.append(a @ states[-1] + (b @ inputs[0, k - 1] + offset)[:, None] + stirred)
+        there = ~np.isnan(z)
+        y = (c @ states[-1] + shift[:, None])[there]
+        v = (root_r @ normals(FILTER_MEASUREMENT, k, 2, size))[there]
+        s = np.cov(y).reshape(len(y), len(y)) + model.measurement_noise_cov[np.ix_(there, there)]
+        moves = np.linalg.solve(s, z[there][:, None] - y - v)
+        for j in range(max(0, k - lag), k + 1):
+            states[j] = states[j] + np.cov(states[j], y)[:3, 3:] @ moves
+    np.testing.assert_allclose(found.means[0], [x.mean(axis=1) for x in states], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.covs[0], [np.cov(x) for x in states], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_large_ensembles_approach_the_kalman_smoother():
+    model, runs = scalar_model(), 30
+    inputs, measurements = with_gaps(model, 5)
+    many = np.repeat(inputs, runs, axis=0), np.repeat(measurements, runs, axis=0)
+    distances = []
+    for size in (50, 200):
+        filter_ = EnsembleKalmanFilter(model=model, ensemble_size=size)
+        found = smooth(filter_, episode_keys(range(runs)), *many, lag=3)
+        exact = smooth(KalmanFilter(model=model), KEYS, inputs, measurements, lag=3)
+        distances.append(np.sqrt(((found.means - exact.means) ** 2).mean()))
+    assert distances[1] < 0.15 * np.sqrt(exact.covs[0, :, 0, 0].mean())
+    assert 0.35 < distances[1] / distances[0] < 0.7  # 1/sqrt(4) but for chance
+
+
+@pytest.mark.parametrize("kind", [EnsembleTransformFilter, SerialSquareRootFilter, IteratedEnsembleKalmanFilter])
+def test_without_process_noise_square_root_smoothers_are_exact_for_their_own_prior(kind):
+    model = wide_model(process_noise_cov=np.zeros((3, 3)))
+    filter_ = kind(model=model, ensemble_size=9)
+    inputs, measurements = with_gaps(model, 12)
+    with interpreted():
+        prior = filter_.init(KEY)
+        found = smooth(filter_, KEYS, inputs, measurements, lag=4)
+        same_prior = model.replace(prior_mean=prior.mean, prior_cov=prior.cov)
+        exact = smooth(KalmanFilter(model=same_prior), KEYS, inputs, measurements, lag=4)
+    each_close((found.means, found.covs), (exact.means, exact.covs), rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_the_same_members_are_smoothed_as_in_dapper():
+    case = json.loads((Path(__file__).parents[1] / "data" / "dapper_smoother.json").read_text())
+    model = plane_model(b=np.zeros((2, 0)), process_noise_cov=np.zeros((2, 2)))
+    filter_ = EnsembleTransformFilter(model=model, ensemble_size=5)
+    np.testing.assert_allclose(filter_.init(KEY).members, case["prior"], rtol=1e-12)
+    measurements = np.array([[[np.nan, np.nan], *case["z"]]])
+    found = smooth(filter_, KEYS, np.zeros((1, len(case["z"]), 0)), measurements, case["lag"])
+    np.testing.assert_allclose(found.means[0, 1:], np.mean(case["members"], axis=2), rtol=1e-10, atol=1e-10)
+    for cov, members in zip(found.covs[0, 1:], case["members"], strict=True):
+        np.testing.assert_allclose(cov, np.cov(members), rtol=1e-10, atol=1e-10)

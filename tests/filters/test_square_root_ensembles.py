@@ -52,7 +52,6 @@ def linear_model(m, seed=3):
 
 
 def updated(kind, model, z, **numbers):
-    """Forecast and analysis of one update."""
     filter_ = kind(model=model, ensemble_size=SIZE, **numbers)
     with interpreted():
         forecast = filter_.predict(filter_.init(KEY), [0.5])
@@ -78,7 +77,6 @@ def naive_transform(x, y, z, r):
 
 
 def naive_serial(x, y, z, r):
-    """The EnSRF, channel by channel."""
     root = np.linalg.cholesky(r)
     joint, z = np.vstack([x, np.linalg.solve(root, y)]), np.linalg.solve(root, z)
     for i in range(len(z)):
@@ -92,7 +90,6 @@ def naive_serial(x, y, z, r):
 
 
 def naive_half(x, y, z, r):
-    """The DEnKF."""
     of_y = centred(y)
     k = centred(x) @ of_y.T @ np.linalg.inv(of_y @ of_y.T + (x.shape[1] - 1) * r)
     return (x.mean(axis=1) + k @ (z - y.mean(axis=1)))[:, None] + centred(x) - 0.5 * k @ of_y

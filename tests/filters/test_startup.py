@@ -7,6 +7,7 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
+from tests.filters.checks import refused
 from thruster_env.thruster.model import thruster_model
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
@@ -37,8 +38,7 @@ def test_p0_is_that_of_the_plant_times_a_factor():
     model = thruster_model(prior_cov_factor=4.0)
     np.testing.assert_array_equal(model.prior_cov, 4.0 * thruster_model().prior_cov)
     np.testing.assert_array_equal(with_prior(0.1).filter(STARTUP).model.prior_cov, np.diag([1e3, 0.4]))
-    with pytest.raises(ValueError, match="prior_cov_factor must be positive, but got 0"):
-        thruster_model(prior_cov_factor=0)
+    refused("prior_cov_factor must be positive, but got 0", thruster_model, prior_cov_factor=0)
 
 
 def test_the_score_feels_p0_where_the_start_up_counts_and_hardly_elsewhere():
@@ -63,8 +63,7 @@ def test_errors_count_from_the_scenario_s_first_scored_step_on():
     np.testing.assert_allclose(whole.mean_squares.mean(axis=0), pooled, rtol=1e-12)
     np.testing.assert_array_equal(whole.start_up_rmse, part.start_up_rmse)
     for wrong in (-1, 500):
-        with pytest.raises(ValueError, match="first_scored_step must be "):
-            STARTUP.replace(first_scored_step=wrong)
+        refused("first_scored_step must be ", STARTUP.replace, first_scored_step=wrong)
     with pytest.raises(
         ValueError, match="at most 499 in runs of 500 steps, but got 500: pass first_scored_step=0 "
     ):
@@ -77,6 +76,7 @@ def test_p0_is_searched_there_and_only_there():
     assert "P0" in Plan("ekf", (NOMINAL, STARTUP)).space() and "P0" not in Plan("low-pass", (STARTUP,)).space()
 
 
+@pytest.mark.slow
 def test_a_study_tunes_p0_and_the_number_survives(tmp_path):
     result = run_study(open_study("s", PLAN, optuna.storages.InMemoryStorage()), PLAN, 40)
     assert result.trials[0].params["P0"] == 1.0

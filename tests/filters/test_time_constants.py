@@ -10,17 +10,12 @@ from filters.bounds import steady_state
 from filters.consistency.time_constants import forgetting_noise, slopes_along, time_constants
 from tests.linear_problem import LinearProblem
 from tests.models import affine, state_space
-from thruster_env.core.compiled import interpreted
 from tuning.problems.data import runs_of
 
 DT = 0.1
 
 
-@pytest.fixture(autouse=True)
-def as_python():
-    """Compiling takes longer than these runs."""
-    with interpreted():
-        yield
+pytestmark = pytest.mark.usefixtures("as_python")
 
 
 def walk(q):

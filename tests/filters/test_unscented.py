@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from filters import CubatureKalmanFilter, UnscentedKalmanFilter, run, thruster_model
-from tests.models import held_voltages, pendulum, simulated
-from thruster_env.core.streams import episode_keys
-from thruster_env.model import simulate
+from tests.models import pendulum, simulated
 
 KEYS = np.zeros((1, 2))
 NUMBERS = [(1.0, 2.0, 0.0), (0.1, 2.0, 1.0), (0.5, 0.0, 0.0), (1.3, 1.0, 2.0)]  # alpha, beta, kappa
@@ -81,39 +79,6 @@ def test_it_is_the_textbook_s_unscented_filter(model, numbers):
 @pytest.mark.parametrize("model", [pendulum(), pendulum(substeps=3), thruster_model()], ids=["1", "3", "thruster"])
 def test_it_is_the_textbook_s_cubature_filter(model):
     assert_textbook(CubatureKalmanFilter(model=model), cubature_weights(2))
-
-
-@pytest.mark.parametrize("numbers", NUMBERS[:2])
-def test_it_is_filterpy_s_unscented_filter_on_the_thruster(numbers):
-    peer = pytest.importorskip("filterpy.kalman")
-    alpha, beta, kappa = numbers
-    model = thruster_model()
-    inputs = held_voltages(1, 8, seed=3)
-    drawn = simulate.simulate(model, episode_keys([3]), inputs)
-    filter_ = UnscentedKalmanFilter(model=model, alpha=alpha, beta=beta, kappa=kappa)
-    estimates = run(filter_, KEYS, inputs, drawn.measurements)
-
-    def advance(x, dt, u):
-        for _ in range(model.substeps):
-            x = model.transition(tuple(x), u, model.constants)
-        return np.array(x)
-
-    def thrust(x):
-        return np.array(model.observe(tuple(x), model.constants))
-
-    points = peer.MerweScaledSigmaPoints(2, alpha, beta, kappa)
-    other = peer.UnscentedKalmanFilter(2, 1, 0.01, hx=thrust, fx=advance, points=points)
-    other.x, other.P = model.prior_mean, model.prior_cov
-    other.Q, other.R = model.process_noise_cov, model.measurement_noise_cov
-    other.sigmas_f = points.sigma_points(other.x, other.P)
-    for k, z in enumerate(drawn.measurements[0]):
-        if k > 0:
-            other.predict(u=tuple(inputs[0, k - 1]))
-        other.update(z)
-        np.testing.assert_allclose(estimates.means[0, k], other.x, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(estimates.covs[0, k], other.P, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(estimates.innovations[0, k], other.y, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(estimates.innovation_covs[0, k], other.S, rtol=1e-9, atol=1e-9)
 
 
 def test_states_that_are_known_exactly_move_no_measurement():

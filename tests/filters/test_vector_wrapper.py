@@ -1,4 +1,4 @@
-"""Filters on vector envs: every copy is what a single wrapped env would be."""
+"""Filters on vector envs: every copy is what a single wrapped env would be, as others' programs ask."""
 
 import gymnasium as gym
 import numpy as np
@@ -7,8 +7,10 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from filters import FILTERS, EstimateState, EstimateStates
+import thruster_env  # noqa: F401 - registers the envs
+from filters import FILTERS, EstimateState, EstimateStates, thruster_model
 from filters.wrappers import ALIASES, filtered_id
+from tests.filters.checks import refused
 from tests.models import affine
 from thruster_env.model.state_space import StateSpaceModel
 
@@ -17,10 +19,27 @@ MODES = ["NextStep", "SameStep", "Disabled"]
 DROPOUT = {"sensors": {"thrust": [{"name": "dropout", "probability": 0.3}]}}
 
 
+BOUNDED = thruster_model().replace(bounds={"omega_m": (0.0, 30.0), "U_a": (0.0, None)})
+KINDS = {
+    "ekf": {"filter": "ekf"},
+    "enkf": {"filter": "enkf", "ensemble_size": 20},
+    "smoothed": {"filter": "ekf", "smoothing_lag": 3},
+    "bounded": {"filter": "ekf", "model": BOUNDED},
+}
+TOLD = {
+    "estimate",
+    "estimate_cov",
+    "innovation",
+    "innovation_cov",
+    "estimate_divergences",
+    "smoothed",
+    "smoothed_cov",
+}
+
+
 def pair(filter_name, mode, **arguments):
     """A wrapped vector env and as many wrapped single envs, with episodes of seven steps."""
-    numbers = {"ensemble_size": 20} if filter_name == "enkf" else {}
-    kind = {"filter": filter_name, "observation": "belief", **numbers}
+    kind = {"observation": "belief", **KINDS[filter_name]}
     name = "BowThrusterTracking-v0"
     vector = gym.make_vec(name, num_envs=COPIES, max_episode_steps=7, autoreset_mode=mode, **arguments)
     singles = [EstimateState(gym.make(name, max_episode_steps=7, **arguments), **kind) for _ in range(COPIES)]
@@ -31,14 +50,14 @@ def assert_copy(vector, i, single):
     observations, info = vector
     observation, expected = single
     np.testing.assert_allclose(observations[i], observation, rtol=1e-5, atol=1e-6)
-    for key in ("estimate", "estimate_cov", "innovation", "innovation_cov", "estimate_divergences"):
+    for key in TOLD & set(expected):
         np.testing.assert_allclose(info[key][i], expected[key], rtol=1e-9, atol=1e-12)
         assert info[f"_{key}"][i]
 
 
 @pytest.mark.parametrize("arguments", [{}, DROPOUT], ids=["plain", "dropout"])
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("filter_name", ["ekf", "enkf"])
+@pytest.mark.parametrize("filter_name", KINDS)
 def test_a_copy_is_a_single_wrapped_env_over_several_episodes(filter_name, mode, arguments):
     vector, singles = pair(filter_name, mode, **arguments)
     start = vector.reset(seed=5)
@@ -54,7 +73,8 @@ def test_a_copy_is_a_single_wrapped_env_over_several_episodes(filter_name, mode,
             observation, _, *ends, expected = single.step(actions[i])
             if mode == "SameStep" and any(ends):
                 np.testing.assert_allclose(info["final_obs"][i], observation, rtol=1e-5, atol=1e-6)
-                np.testing.assert_allclose(info["final_info"]["estimate"][i], expected["estimate"], rtol=1e-9)
+                for key in {"estimate", "smoothed"} & set(expected):
+                    np.testing.assert_allclose(info["final_info"][key][i], expected[key], rtol=1e-9, atol=1e-12)
                 observation, expected = single.reset()
             assert_copy((observations, info), i, (observation, expected))
         ended = terminated | truncated
@@ -182,5 +202,40 @@ def test_every_task_has_an_id_that_takes_any_filter_and_some_short_ones():
 
 
 def test_filter_arguments_must_be_a_mapping():
-    with pytest.raises(ValueError, match="filter_arguments must be a mapping"):
-        gym.make("filters:BowThruster-EKF-v0", filter_arguments=[1])
+    refused("filter_arguments must be a mapping", gym.make, "filters:BowThruster-EKF-v0", filter_arguments=[1])
+
+
+OF_DROPOUTS = {"sensors": {"thrust": [{"name": "dropout", "probability": 0.5}]}}
+
+
+def made(name, wrapped):
+    env = gym.make(name, **({} if "Linear" in name else OF_DROPOUTS))
+    return EstimateState(env, filter="ekf") if wrapped else env
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", ["BowThrusterTracking-v0", "BowThrusterLinear-v0"])
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_every_value_of_info_has_a_dtype_and_the_same_at_reset_and_step(name, wrapped):
+    env = made(name, wrapped)
+    infos = env.reset(seed=0)[1], env.step([3.0])[4]
+    kinds = [{key: (np.shape(value), value.dtype) for key, value in info.items()} for info in infos]
+    assert kinds[0] == kinds[1] and kinds[0]["thrust"] == ((), np.float64)
+    assert all(dtype.kind != "O" for _, dtype in kinds[0].values())
+    assert infos[0]["time"] == 0.0 and infos[1]["time"] == 0.01  # of its moment, not views of what goes on
+    assert not wrapped or kinds[0]["estimate_divergences"] == ((), np.int64)
+
+
+@pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.value)
+def test_a_vector_env_says_how_it_resets_where_gymnasiums_own_do(mode):
+    def envs_of(vectorization_mode, **arguments):
+        return gym.make_vec("BowThruster-v0", 2, vectorization_mode=vectorization_mode, **arguments)
+
+    native = envs_of("vector_entry_point", autoreset_mode=mode)
+    sync = envs_of("sync", vector_kwargs={"autoreset_mode": mode})
+    assert isinstance(sync, SyncVectorEnv) and native.autoreset_mode == sync.autoreset_mode == mode
+    assert EstimateStates(native, filter="ekf").autoreset_mode == mode
+    assert (
+        EstimateStates(sync, filter="ekf", model="thruster_env.thruster.model:thruster_model").autoreset_mode
+        == mode
+    )

@@ -1,7 +1,10 @@
-"""Algebra of matrices: on arrays, as graphs, differentiated, and as calls of functions made for sizes."""
+"""Algebra of matrices, points and weights: arrays, graphs, derivatives, calls made for sizes, and textbooks."""
+
+import math
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_triangular
 from scipy.stats import multivariate_normal, multivariate_t
 
 from filters.algebra import operations, points
@@ -22,23 +25,33 @@ from filters.algebra.operations import (
     wrap,
 )
 from filters.algebra.points import (
+    effective_size,
     first,
     heavier,
     log_density,
+    normalised,
     on_circle,
     ones,
     outer,
     outlier_weight,
     root,
+    root_slope,
     square,
     tail_of,
     units,
+    weighted_covariance,
+    weighted_mean,
+    weighted_square,
+    weights,
     without_first,
 )
-from filters.pages.kernels import Stage, works_of
+from filters.pages.kernels import Stage, as_calls, of_members, works_of
+from filters.particles.kernels import systematic_resampler
+from thruster_env.core.angles import on_one_branch
+from thruster_env.core.streams import exponential
 from thruster_env.graphs.graphs import ROWS
 from thruster_env.graphs.loops import Loops
-from thruster_env.graphs.programs import Place
+from thruster_env.graphs.programs import OF_MEMBERS, Place
 
 RNG = np.random.default_rng(0)
 N, M = 3, 2
@@ -226,3 +239,188 @@ def test_functions_that_code_has_once_for_many_rows_compute_what_numpy_does(n, m
     results = np.split(rows[offset:], [n * m, n * (m + n)])
     for found, expected in zip(results, (K, A @ P @ A.T + K @ R @ K.T, P @ P @ H.T), strict=True):
         np.testing.assert_allclose(found.reshape(expected.shape), expected, rtol=1e-10, atol=1e-12)
+
+
+def symmetric(size):
+    a = RNG.normal(size=(size, size))
+    return a + a.T
+
+
+def called_slope(lower, slope):
+    """The slope of a root by functions that are made for its size."""
+    size = len(lower)
+    of = input_matrix(Place("numbers", 0), lower.shape)
+    moves = input_matrix(Place("move", 0), lower.shape, symmetric=True, like=of)
+    rows, numbers, move = np.zeros(size**2), lower.ravel(), slope.ravel()
+    known = {of: of.operation, moves: moves.operation}
+    calls_of([(Place("rows", 0), root_slope(of, moves))], known, {})(rows, np.zeros(1), numbers, move)
+    return rows.reshape(size, size)
+
+
+@pytest.mark.parametrize("size", [1, 3, 8])
+def test_the_slope_of_a_root_is_that_of_murray_and_of_central_differences(size):
+    p, dp = symmetric(size), symmetric(size)
+    p = p @ p + np.eye(size)
+    lower = root(p)
+    np.testing.assert_allclose(lower, np.linalg.cholesky(p), rtol=1e-13, atol=1e-13)
+    inner = solve_triangular(lower, solve_triangular(lower, dp, lower=True).T, lower=True)
+    expected = lower @ (np.tril(inner) - 0.5 * np.diag(np.diag(inner)))
+    for found in (root_slope(lower, dp), called_slope(lower, dp)):
+        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+    difference = (np.linalg.cholesky(p + 1e-6 * dp) - np.linalg.cholesky(p - 1e-6 * dp)) / 2e-6
+    np.testing.assert_allclose(expected, difference, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("slope_of", [root_slope, called_slope])
+def test_the_root_of_a_singular_matrix_has_a_slope_within_its_range_only(slope_of):
+    b = RNG.normal(size=(4, 4))
+    b[2], b[3] = b[0] - 0.3 * b[1], 0.0
+    p = b @ b.T
+    lower = root(p)
+    np.testing.assert_allclose(lower @ lower.T, p, atol=1e-13)
+    assert not lower[:, 2:].any()
+    np.testing.assert_allclose(slope_of(lower, 3.0 * p), 1.5 * lower, atol=1e-12)
+    leaving = slope_of(lower, np.diag([0.0, 0.0, 0.0, 1.0]))
+    assert np.isnan(leaving[3, 3]) and np.isfinite(np.delete(leaving, 3, axis=0)).all()
+
+
+def test_a_matrix_that_is_no_covariance_has_no_root():
+    assert np.isnan(root(np.array([[np.nan, 0.0], [0.0, 1.0]]))[0, 0])
+    assert root(np.array([[1.0, 2.0], [2.0, 1.0]]))[1, 1] == 0.0  # a pivot below zero counts as rounding
+
+
+def test_angles_come_to_the_side_of_their_circular_mean():
+    y = np.array([[3.0, -3.1, 3.1, 2.9, -2.5], [9.0, 1.0, 2.0, 3.0, 4.0]])
+    found = on_circle(y, (True, False))
+    np.testing.assert_allclose(found[1], y[1])
+    assert np.ptp(found[0]) < 1.0
+    np.testing.assert_allclose(np.exp(1j * found[0]), np.exp(1j * y[0]), rtol=1e-13)
+    np.testing.assert_allclose(
+        found[0] - found[0].mean(), (r := on_one_branch(y.T, (True, False))[:, 0]) - r.mean()
+    )
+    assert on_circle(y, (False, False)) is y
+
+
+SIZE = 11
+
+
+def test_resampling_draws_each_particle_as_often_as_its_weight_says():
+    size, rng = 9, np.random.default_rng(4)
+    weights = rng.exponential(size=size) ** 3
+    weights[[0, 4, 8]] = 0.0
+    resample, counts, repeats = systematic_resampler(1, 1, 2), np.zeros(size), 2000
+    for u in (np.arange(repeats) + 0.5) / repeats:
+        table = np.zeros((5, 16))
+        table[0, :size], table[1, :size] = np.arange(size), weights
+        resample(table, size, u)
+        drawn = table[0, :size].astype(int)
+        expected = np.searchsorted(np.cumsum(weights) / weights.sum(), (u + np.arange(size)) / size)
+        np.testing.assert_array_equal(drawn, expected)
+        assert (table[0, size:] == drawn[0]).all()  # padding follows a real particle
+        count = np.bincount(drawn, minlength=size)
+        assert (np.abs(count - size * weights / weights.sum()) < 1.0).all()
+        counts += count
+    # Over all u a particle is drawn N w times; a grid of 2000 of them leaves an error of 1/2000 for each edge.
+    np.testing.assert_allclose(counts / repeats, size * weights / weights.sum(), atol=2.0 / repeats)
+
+
+def test_resampling_of_no_weight_at_all_changes_nothing():
+    table = np.zeros((5, 8))
+    table[0] = np.arange(8.0)
+    for weight in (0.0, np.nan):
+        table[1] = weight
+        systematic_resampler(1, 1, 2)(table, 6, 0.5)
+        np.testing.assert_array_equal(table[0], np.arange(8.0))
+
+
+def test_the_exponential_is_one():
+    x = np.random.default_rng(0).uniform(-45.0, 5.0, size=2000)
+    np.testing.assert_allclose([exponential(v) for v in x], np.exp(x), rtol=1e-13)
+    assert exponential(0.0) == 1.0
+    assert exponential(-math.inf) == exponential(math.nan) == pytest.approx(math.exp(-46.0))
+
+
+def on_arrays(page, x, log_w):
+    """A page's results on NumPy's arrays."""
+    return [np.squeeze(one) for one in page(x, log_w)]
+
+
+def in_memory(page, x, log_w, make):
+    """The same in memory whose columns are whole vectors; behind the last particle lies what must not count."""
+    n, size = x.shape
+    table = np.full((n + 2, 16), 9.0)
+    table[n], table[:n, :size], table[n, :size] = log_w[0], x, log_w
+    states = input_matrix(Place("table", 0), (n,), member=True)
+    results = page(states, input_matrix(Place("table", n), (), member=True, like=states))
+    places = [Place("table", n + 1) if one.member else Place("rows", 20 * k) for k, one in enumerate(results)]
+    rows, nothing = np.zeros(20 * len(results)), np.zeros(1)
+    make(Stage(dict(zip(places, results, strict=True)), {}))(rows, nothing, nothing, table, nothing, size)
+    return [
+        table[n + 1, :size] if one.member else rows[at : at + math.prod(one.shape)].reshape(one.shape)
+        for (_, at), one in zip(places, results, strict=True)
+    ]
+
+
+def as_program(page, x, log_w):
+    """The same as a program of all particles."""
+    return in_memory(page, x, log_w, lambda stage: of_members(stage, len(x) + 2).work)
+
+
+def as_functions(page, x, log_w):
+    """The same as calls of functions."""
+    return in_memory(page, x, log_w, lambda stage: as_calls(stage, 0, {}, {}, OF_MEMBERS).values)
+
+
+each_way = pytest.mark.parametrize("work", [on_arrays, as_program, as_functions])
+
+
+@pytest.mark.usefixtures("as_python")
+@each_way
+def test_weights_are_normalised_and_tell_their_effective_size(work):
+    def page(x, log_w):
+        w, level = normalised(log_w)
+        return w, level, effective_size(w)
+
+    for logarithms in ([-1000.0, -1001.0, -1002.5, -1900.0], [-3.0, -math.inf, math.nan, -2.0]):
+        found, total, size = work(page, np.zeros((1, 4)), np.array(logarithms))
+        w = np.exp(np.nan_to_num(np.array(logarithms), nan=-math.inf) - max(logarithms[0], logarithms[-1]))
+        assert total == pytest.approx(max(logarithms[0], logarithms[-1]) + math.log(w.sum()), rel=1e-14)
+        np.testing.assert_allclose(found, w / w.sum(), rtol=1e-12, atol=2e-20)
+        assert size == pytest.approx(w.sum() ** 2 / (w**2).sum())
+    _, total, _ = work(page, np.zeros((1, 4)), np.full(4, -math.inf))
+    assert math.isnan(total)
+
+
+@pytest.mark.usefixtures("as_python")
+@each_way
+def test_weighted_moments_are_those_of_their_sums(work):
+    def page(x, log_w):
+        w = weights(log_w)
+        return weighted_mean(x, w), weighted_covariance(x, w), weighted_square(x, w)
+
+    rng = np.random.default_rng(2)
+    x, w = rng.normal(size=(2, SIZE)), rng.dirichlet(np.ones(SIZE))
+    mean, cov, square = work(page, x, np.log(w))
+    d = x - x @ w[:, None]
+    np.testing.assert_allclose(mean, x @ w, rtol=1e-12)
+    np.testing.assert_allclose(cov, d @ np.diag(w) @ d.T / (1.0 - (w**2).sum()), rtol=1e-12)
+    np.testing.assert_allclose(square, x @ np.diag(w) @ x.T, rtol=1e-12)
+
+
+@pytest.mark.usefixtures("as_python")
+@each_way
+def test_the_covariance_of_equal_weights_is_the_sample_covariance(work):
+    x = np.random.default_rng(2).normal(size=(2, SIZE))
+    (found,) = work(lambda x, log_w: (weighted_covariance(x, weights(log_w)),), x, np.full(SIZE, -math.log(SIZE)))
+    np.testing.assert_allclose(found, np.cov(x), rtol=1e-12)
+
+
+@pytest.mark.usefixtures("as_python")
+@each_way
+def test_the_covariance_of_one_weight_that_is_nearly_all_is_what_the_others_say(work):
+    x, small = np.random.default_rng(3).normal(size=(2, SIZE)), 1e-17
+    log_w = np.full(SIZE, math.log(small))
+    log_w[4] = 0.0
+    (found,) = work(lambda x, log_w: (weighted_covariance(x, weights(log_w)),), x, log_w)
+    d = np.delete(x - x[:, 4:5], 4, axis=1)
+    np.testing.assert_allclose(found, d @ d.T / (2 * (SIZE - 1)), rtol=1e-12)

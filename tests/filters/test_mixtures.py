@@ -1,19 +1,118 @@
-"""The fuzzy Kalman filter against the Kalman filter, naive ones with its rules, and its memberships."""
+"""The Gaussian sum and the fuzzy Kalman filter against the Kalman filter and naive recursions."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import FuzzyKalmanFilter, KalmanFilter, StateSpaceModel, run, thruster_model
+from filters import (
+    ExtendedKalmanFilter,
+    FuzzyKalmanFilter,
+    GaussianSumFilter,
+    KalmanFilter,
+    StateSpaceModel,
+    run,
+    thruster_model,
+)
 from filters.gaussian.mixtures import BLENDINGS
 from filters.gaussian.sigma_points import memberships
-from tests.models import pendulum, random_affine, simulated
+from tests.filters.checks import refused
+from tests.models import line_model, pendulum, random_affine, simulated, state_space
 from tests.oracles import each_close, kalman_update
-from thruster_env.core.streams import filter_keys
 
 KEYS = np.zeros((1, 2))
+
+
+def stay(x, u, c):
+    return (0.9 * x[0] + 0.1 * x[1], x[1])
+
+
+def square(x, c):
+    return (x[1] * x[1] + 0.1 * x[0], x[0])
+
+
+def square_model(mean=0.2):
+    return state_space(
+        stay, square, q=[0.1, 0.2], r=[[0.05, 0.01], [0.01, 0.5]], mean=[0.5, mean], cov=[[0.5, 0.2], [0.2, 1.0]]
+    )
+
+
+@pytest.mark.parametrize("parts", [7, 15, 40])
+def test_the_standard_split_has_mean_zero_and_variance_one(parts):
+    nodes, weights, variance = GaussianSumFilter(model=line_model(), parts=parts).standard_split
+    assert len(nodes) == len(weights) == parts
+    assert 0.0 < variance < 1.0 and (weights > 0.0).all()
+    moments = weights.sum(), weights @ nodes, weights @ nodes**2 + variance
+    assert moments == pytest.approx((1.0, 0.0, 1.0), abs=1e-14)
+
+
+@pytest.mark.parametrize("component", [0, 1])
+def test_an_update_is_the_naive_one(component):
+    model = square_model()
+    filter_ = GaussianSumFilter(model=model, parts=9, component=component)
+    z, r = np.array([2.0, 0.3]), model.measurement_noise_cov
+    belief = filter_.init()
+    updated, innovation = filter_.update(belief, z)
+    nodes, weights, variance = filter_.standard_split
+    g = belief.cov[:, component] / math.sqrt(belief.cov[component, component])
+    p = belief.cov - (1.0 - variance) * np.outer(g, g)
+    means, covs, likelihoods, seen, spreads = [], [], [], [], []
+    for node in nodes:
+        x = belief.mean + node * g
+        h = np.array([[0.1, 2.0 * x[1]], [1.0, 0.0]])
+        y, s = np.array(square(x, ())), h @ p @ h.T + r
+        gain = p @ h.T @ np.linalg.inv(s)
+        means.append(x + gain @ (z - y))
+        covs.append(p - gain @ s @ gain.T)
+        likelihoods.append(multivariate_normal.pdf(z, y, s))
+        seen.append(y)
+        spreads.append(s)
+    before = np.dot(weights, seen)
+    apart = np.array(seen) - before
+    s = np.einsum("k,kij->ij", weights, spreads + apart[:, :, None] * apart[:, None, :])
+    np.testing.assert_allclose(innovation.value, z - before, rtol=1e-9)
+    np.testing.assert_allclose(innovation.cov, s, rtol=1e-6)
+    assert innovation.log_likelihood == pytest.approx(math.log(weights @ likelihoods), rel=1e-6)
+    weights = weights * likelihoods / (weights @ likelihoods)
+    mean = weights @ means
+    apart = np.array(means) - mean
+    cov = np.einsum("k,kij->ij", weights, covs + apart[:, :, None] * apart[:, None, :])
+    each_close((updated.mean, updated.cov), (mean, cov), rtol=1e-6)
+    each_close(filter_.part_estimates(updated), (means, covs, weights), rtol=1e-5, atol=1e-7)
+
+
+def test_on_an_affine_model_it_is_nearly_the_kalman_filter():
+    model = line_model()
+    inputs, z = simulated(model, 60, level=1.0)
+    z[0, 10:15] = np.nan
+    exact = run(KalmanFilter(model=model), KEYS, inputs, z)
+    found = run(GaussianSumFilter(model=model), KEYS, inputs, z)
+    spread = np.sqrt(np.einsum("bkii->bki", exact.covs))
+    assert np.abs((found.means - exact.means) / spread).max() < 0.005
+    np.testing.assert_allclose(found.innovation_covs, exact.innovation_covs, rtol=0.005)
+    np.testing.assert_allclose(found.log_likelihoods, exact.log_likelihoods, atol=0.005)
+
+
+def test_it_sees_both_roots_of_a_measurement():
+    filter_ = GaussianSumFilter(model=square_model(mean=0.0), parts=15)
+    belief, _ = filter_.update(filter_.init(), [1.44, np.nan])
+    extended = ExtendedKalmanFilter(model=filter_.model)
+    tangent, _ = extended.update(extended.init(), [1.44, np.nan])
+    means, _, weights = filter_.part_estimates(belief)
+    assert weights[means[:, 1] > 1.0].sum() > 0.4 and weights[means[:, 1] < -1.0].sum() > 0.4
+    assert abs(belief.mean[1]) < 0.1 and belief.cov[1, 1] == pytest.approx(1.44, rel=0.1)
+    assert abs(tangent.mean[1]) < 0.6 and tangent.cov[1, 1] > 0.8  # the flat tangent knows nothing of them
+
+
+def test_a_component_that_is_known_is_not_split():
+    model = line_model().replace(prior_cov=[[1.0, 0.0], [0.0, 0.0]])
+    exact, _ = KalmanFilter(model=model).update(KalmanFilter(model=model).init(), [2.0])
+    found, _ = GaussianSumFilter(model=model).update(GaussianSumFilter(model=model).init(), [2.0])
+    np.testing.assert_allclose(found.mean, exact.mean, rtol=1e-12)
+    np.testing.assert_allclose(found.cov, exact.cov, rtol=1e-12, atol=1e-15)
+
 
 pytestmark = pytest.mark.usefixtures("as_python")
 
@@ -150,8 +249,7 @@ def test_it_is_the_naive_recursion(blending, offsets):
             likelihood = multivariate_normal.logpdf(innovation, np.zeros(2), s)
             assert found.log_likelihoods[0, k] == pytest.approx(likelihood, rel=1e-10, abs=1e-11)
         mean, cov = mixed([x for x, _ in own], [p for _, p in own], weights, blending)
-        np.testing.assert_allclose(found.means[0, k], mean, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(found.covs[0, k], cov, rtol=1e-12, atol=1e-12)
+        each_close((found.means[0, k], found.covs[0, k]), (mean, cov), rtol=1e-12, atol=1e-12)
 
 
 def mixed(means, covs, weights, blending):
@@ -174,35 +272,10 @@ def test_the_blendings_differ_and_the_first_is_the_default():
     assert np.linalg.eigvalsh(found["moments"].covs[0, 1] - found["weights"].covs[0, 1]).max() > 0
 
 
-@pytest.mark.parametrize("blending", BLENDINGS)
-def test_a_batch_is_the_loop(blending):
-    filter_, keys = pendulum_rules(blending=blending), filter_keys(range(2))
-    inputs, z = simulated(filter_.model, 12, count=2, missing=0.2)
-    found = run(filter_, keys, inputs, z)
-    for b in range(2):
-        belief = filter_.init()
-        for k in range(13):
-            belief = belief if k == 0 else filter_.predict(belief, inputs[b, k - 1])
-            belief, innovation = filter_.update(belief, z[b, k])
-            np.testing.assert_allclose(found.means[b, k], belief.mean, rtol=1e-12, atol=1e-13)
-            np.testing.assert_allclose(found.covs[b, k], belief.cov, rtol=1e-12, atol=1e-13)
-            np.testing.assert_allclose(found.innovations[b, k], innovation.value, rtol=1e-12, atol=1e-13)
-
-
-@pytest.mark.parametrize("blending", BLENDINGS[1:])
-def test_without_a_measurement_a_variant_only_predicts(blending):
-    filter_ = pendulum_rules(blending=blending)
-    belief = filter_.predict(filter_.init(), [1.0])
-    updated, _ = filter_.update(belief, [np.nan, np.nan])
-    np.testing.assert_allclose(updated.mean, belief.mean, rtol=1e-15)
-    np.testing.assert_allclose(updated.cov, belief.cov, rtol=1e-15)
-
-
 def test_the_thruster_s_range_is_that_of_its_voltages():
     model = thruster_model(ambient_velocity=-0.4)
     still = thruster_model()
-    np.testing.assert_allclose(still.state_low, -still.state_high)
-    np.testing.assert_allclose(model.state_high, still.state_high)
+    each_close((still.state_low, model.state_high), (-still.state_high, still.state_high))
     np.testing.assert_allclose(model.state_low, still.state_low - [0.0, 0.4])
     filter_ = FuzzyKalmanFilter(model=model)
     np.testing.assert_array_equal([filter_.low, filter_.high], [model.state_low, model.state_high])
@@ -210,8 +283,7 @@ def test_the_thruster_s_range_is_that_of_its_voltages():
 
 def test_a_nonlinear_model_without_a_range_is_refused():
     model = six_states().replace(state_low=None)
-    with pytest.raises(ValueError, match="must know the range of the states, but got neither"):
-        FuzzyKalmanFilter(model=model)
+    refused("must know the range of the states, but got neither", FuzzyKalmanFilter, model=model)
     assert len(FuzzyKalmanFilter(model=model, low=[-5.0] * 6).rules) == 64
 
 

@@ -1,15 +1,19 @@
-"""Bounds, the filter's forms and smoothers where variances lie many powers of ten apart, and bounds on angles."""
+"""Bounds: Riccati's recursion at any scale, naive loops along a path, parts of a large model, errors of angles."""
 
 import math
+from collections import namedtuple
 from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
 
-from filters import affine_model, make_filter, run
-from filters.bounds import path_bound, posterior_bound, wrapped_variances
+from filters import affine_model, bounds, make_filter, run
+from filters.bounds import path_bound, posterior_bound, posterior_variances, riccati_covariances, wrapped_variances
+from tests.filters.checks import refused
 from tests.models import affine, state_space
 from thruster_env.core.checks import covariance_root
+from thruster_env.thruster.model import thruster_model
+from tuning.plants.thruster import find_scenario
 from tuning.problems import model_problem
 from tuning.problems.model_problem import ModelProblem
 
@@ -197,3 +201,84 @@ def test_the_open_loops_error_of_an_angle_goes_the_short_way_round(monkeypatch):
     problem = ModelProblem(truth, steps=60, first_scored_step=50)
     assert np.isnan(problem.bound(problem.data(range(2)))).all()
     assert problem.scale[0] < 0.1
+
+
+def naive(model, inputs, missing):
+    x, p, found = np.array(model.prior_mean), np.array(model.prior_cov), []
+    for k in range(len(inputs) + 1):
+        if k > 0:
+            for _ in range(model.substeps):
+                f = np.array(model.transition_jacobian(tuple(x), tuple(inputs[k - 1]), model.constants))
+                x, p = np.array(model.transition(tuple(x), tuple(inputs[k - 1]), model.constants)), f @ p @ f.T
+            p = p + model.process_noise_cov
+        h = np.array(model.observe_jacobian(tuple(x), model.constants))[~missing[k]]
+        r = model.measurement_noise_cov[~missing[k]][:, ~missing[k]]
+        gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + r)
+        p = p - gain @ h @ p
+        found.append(p)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("sensors", [["thrust"], ["thrust", "speed"]])
+def test_the_bound_is_the_naive_recursion_also_where_measurements_are_missing(sensors):
+    model = find_scenario("nominal").replace(sensors=sensors, measurement_noise_cov=[0.25] * len(sensors)).model()
+    rng = np.random.default_rng(0)
+    inputs, missing = rng.uniform(-12, 12, (2, 30, 1)), rng.random((2, 31, len(sensors))) < 0.4
+    found = path_bound(model, inputs, missing)
+    for b in range(2):
+        np.testing.assert_allclose(found[b], naive(model, inputs[b], missing[b]), rtol=1e-8, atol=1e-15)
+    whole = np.zeros_like(missing[0])
+    np.testing.assert_allclose(path_bound(model, inputs)[1], naive(model, inputs[1], whole), rtol=1e-8, atol=1e-15)
+
+
+def test_for_a_linear_model_it_tends_to_the_steady_state_and_is_the_posterior_bound():
+    model = find_scenario("published_tunnel").model()
+    inputs = np.zeros((1, 60, 1))
+    found = path_bound(model, inputs)[0]
+    np.testing.assert_allclose(found[-1], riccati_covariances(model)[1], rtol=1e-10)
+    np.testing.assert_allclose(found, posterior_bound(model, inputs, truths=2)[0], rtol=1e-8)
+
+
+INPUTS = np.repeat(np.random.default_rng(3).uniform(-12, 12, size=(5, 4, 1)), 3, axis=1)
+
+
+@pytest.mark.parametrize(("bytes_", "work"), [(1, 2e9), (2**28, 8 * 5 * 13 * 3), (1, 1)])
+def test_in_parts_they_are_those_of_the_whole_bound_to_the_bit(monkeypatch, bytes_, work):
+    model = thruster_model()
+    whole = np.einsum("bkii->bki", posterior_bound(model, INPUTS, truths=7, seed=2))
+    monkeypatch.setattr(bounds, "MOST_BYTES", bytes_)
+    monkeypatch.setattr(bounds, "WORK_AT_ONCE", work)
+    monkeypatch.setattr(bounds, "cores", lambda: 2)
+    np.testing.assert_array_equal(posterior_variances(model, INPUTS, truths=7, seed=2), whole)
+
+
+def test_of_a_large_model_the_work_limits_the_sequences_and_equal_ones_are_one(monkeypatch):
+    inputs = np.arange(40.0)[:, None, None] * np.ones((40, 150, 2))
+    sized = namedtuple("Sized", "n substeps", defaults=(1,))
+    assert len(bounds.sequences_taken(inputs, 100, sized(12))) == 40
+    assert bounds.sequences_taken(inputs, 100, sized(40)).tolist() == [2 * i for i in range(20)]
+    assert bounds.sequences_taken(inputs, 100, sized(500)).tolist() == [0]
+    assert bounds.sequences_taken(inputs, 100, sized(2, 100)).tolist() == [2 * i for i in range(20)]
+    for same in (inputs[:, :, :0], 0 * inputs):
+        assert bounds.sequences_taken(same, 100, sized(13)).tolist() == [0]
+    model, some = thruster_model(), [0, 2]
+    monkeypatch.setattr(bounds, "ALL_UP_TO", 1)
+    monkeypatch.setattr(bounds, "MOST_WORK", 2 * 7 * 12 * 8)
+    whole = np.einsum("bkii->bki", posterior_bound(model, INPUTS, truths=7))
+    np.testing.assert_array_equal(posterior_variances(model, INPUTS, truths=7), whole[some])
+
+
+def test_a_nearly_singular_q_loses_no_digits_and_a_singular_one_has_no_bound():
+    def tracker(jitter):
+        g = np.array([0.5, 1.0])
+        noise = {"q": 0.04 * np.outer(g, g) + jitter * np.eye(2), "r": [2.0]}
+        prior = {"mean": [0.0, 0.0], "cov": [100.0, 4.0]}
+        return affine([[1.0, 1.0], [0.0, 1.0]], [[0.0], [0.0]], [[1.0, 0.0]], **noise, **prior)
+
+    inputs = np.zeros((1, 100, 1))
+    for jitter in (1e-2, 1e-7, 1e-11):
+        model = tracker(jitter)
+        steady = riccati_covariances(model)[1]
+        np.testing.assert_allclose(posterior_bound(model, inputs, truths=3)[0, -1], steady, rtol=1e-6)
+    assert bounds.has_bound(np.diag([1e-9, 1e9])) and not bounds.has_bound(np.diag([0.0, 1.0]))
+    refused("positive definite Q", posterior_bound, tracker(1e-17), inputs)
