@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ from thruster_env.model.affine import AffineModel
 from thruster_env.model.continuous import ContinuousModel
 from tuning.api.result import Result, frame, plain_data
 from tuning.likelihood.ascent import climb
-from tuning.series.column import Column, seconds_text
+from tuning.series.column import LEAST_ROWS, Column, seconds_text
 from tuning.series.fit import CANDIDATES, Candidate, Choice, Number, behind, choose, filtered
 from tuning.series.likelihood import ColumnLikelihood, R, model_of
 from tuning.series.paste import ARDUINO, BURST, UnequalSteps, lines_of
@@ -44,6 +45,7 @@ OF_PERIOD = "A period of "
 NEVER = "the filter never forgets its start"
 WIDE = 4  # states, beyond which matrices are not printed
 LARGE = 0.05  # correlation of innovations that matters
+OF_NOISE = 1.5  # variance of the difference of two sensors of one quantity, over that of their noise, at most
 
 # Of a period that stands out.
 CHANCE = 1e-6  # that the highest of a record of noise is called a period
@@ -313,9 +315,27 @@ class SeriesFit(Result):
         apart = self.axes_differ()
         if apart < WHITE:
             sentences.append(f"The axes differ (p = {apart:.2g}): fit each of them alone.")
+        sentences += self._common_sentences()
         if not self.is_wrong:
             sentences.append(f"The innovations are white (p = {white.p_value:.2g}).")
         return [*sentences, *self.column.remarks]
+
+    def _common_sentences(self) -> list[str]:
+        """Axes that differ by their noise alone, as two sensors of one quantity do."""
+        sentences = []
+        for i, j in combinations(range(self.model.m), 2):
+            pair = self.column.table[:, [i, j]]
+            pair = pair[~np.isnan(pair).any(axis=1)]
+            if len(pair) < LEAST_ROWS:
+                continue
+            spread, apart = float(np.var(pair, axis=0).min()), float(np.var(pair[:, 0] - pair[:, 1]))
+            if apart < OF_NOISE * 2.0 * self.r < spread:  # of two signals it is twice the spread
+                first, second = self.column.quantities[i].symbol, self.column.quantities[j].symbol
+                sentences.append(
+                    f"{first} and {second} differ by their noise alone, but axes have a state each: if both "
+                    "measure one quantity, fit each alone, and filter both with one state."
+                )
+        return sentences
 
     def _rounding_sentences(self) -> list[str]:
         """Rounding that is taken for the signal, because a rounded number stays and so looks exact."""
