@@ -576,5 +576,6 @@ def _meaning(number: Number) -> str:
 
 
 def _matrix(values: np.ndarray, prefix: str) -> str:
-    """Numbers as Python writes them, to six digits."""
-    return np.array2string(np.asarray(values), precision=6, separator=", ", prefix=prefix)
+    """Numbers as Python writes them, each to six digits."""
+    formats: Any = {"float_kind": lambda value: f"{value:.6g}"}
+    return np.array2string(np.asarray(values), separator=", ", prefix=prefix, formatter=formats)
