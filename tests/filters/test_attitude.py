@@ -639,10 +639,8 @@ def test_a_measured_quaternion_is_refused_and_the_columns_of_its_matrix_have_its
         return tuple(v for axis in np.eye(3).tolist() for v in rotations.to_world(x[:4], axis))
 
     sigma, model = 0.01, attitude_model()
-    with pytest.raises(
-        ValueError, match="observe must be the same for q and -q of 'attitude'.*make a quaternion a Rotation"
-    ):
-        model.replace(observe=quaternion, measurement_noise_cov=[sigma**2] * 4, measurements=None)
+    rule = "observe must be the same for q and -q of 'attitude'.*make a quaternion a Rotation"
+    refused(rule, model.replace, observe=quaternion, measurement_noise_cov=[sigma**2] * 4, measurements=None)
     of_columns = model.replace(observe=columns, measurement_noise_cov=[2.0 * sigma**2] * 9, measurements=None)
     z = Turned.from_rotvec([0.03, -0.05, 0.02]).as_matrix().T.ravel()
     estimates = filters.run(filters.make_filter("ekf", of_columns), inputs=np.zeros((0, 3)), measurements=[z])

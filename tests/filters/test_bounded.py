@@ -186,10 +186,8 @@ def test_wrong_bounds_and_what_cannot_keep_them_are_refused():
     with pytest.raises(ValueError, match="bounds must be of states x_1, x_2, x_3, and not of angles, but got 'c'"):
         model.replace(bounds={"c": (0.0, None)})
     for pair in ((1.0, 0.0), (0.0, 0.0), 3.0, (INF, None)):
-        with pytest.raises(
-            ValueError, match="bounds of x_2 must be two increasing numbers, of which one may be None"
-        ):
-            model.replace(bounds={1: pair})
+        rule = "bounds of x_2 must be two increasing numbers, of which one may be None"
+        refused(rule, model.replace, bounds={1: pair})
     refused("bounded_by must be one of truncation, projection", model.replace, bounded_by="clipping")
     bounded = ExtendedKalmanFilter(model=model.replace(bounds=BY_NAME))
     with pytest.raises(ValueError, match="a smoothing_lag needs a model without bounds, but got"):

@@ -223,10 +223,8 @@ def test_what_needs_a_filter_of_ours_says_so():
         run(
             filter_, np.zeros((1, 2)), np.zeros((1, 1, 1)), np.zeros((1, 2, 1)), process_noise_covs=np.eye(2)[None]
         )
-    with pytest.raises(
-        ValueError, match="numbers must come with a function that makes an estimator, .* and got gain"
-    ):
-        make_filter(AtOnce(), NOMINAL.model(), gain=2.0)
+    rule = "numbers must come with a function that makes an estimator, .* and got gain"
+    refused(rule, make_filter, AtOnce(), NOMINAL.model(), gain=2.0)
 
 
 def test_what_it_says_it_is_tuned_by_a_study_may_choose_but_no_file_keeps():

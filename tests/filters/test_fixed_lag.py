@@ -152,10 +152,8 @@ def test_a_session_goes_on_after_a_pickle():
 
 def test_what_it_cannot_smooth_and_wrong_lags_are_refused():
     env = gym.make("BowThruster-v0")
-    with pytest.raises(
-        ValueError, match=r"a smoothing_lag needs a filter of kf, ekf, iekf, ukf, ckf, but got 'enkf'"
-    ):
-        EstimateState(env, "enkf", smoothing_lag=3)
+    rule = r"a smoothing_lag needs a filter of kf, ekf, iekf, ukf, ckf, but got 'enkf'"
+    refused(rule, EstimateState, env, "enkf", smoothing_lag=3)
     with pytest.raises(ValueError, match="smoothing_lag must be a whole number of at least 0, but got -1"):
         EstimateState(env, "ekf", smoothing_lag=-1)
     filter_ = EnsembleKalmanFilter(model=pendulum())

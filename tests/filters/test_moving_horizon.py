@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from filters import MovingHorizonFilter, make_filter, run, smooth
+from tests.filters.checks import refused
 from tests.models import KEY, line_model, plane_model, simulated, state_space
 from tests.oracles import each_close, kalman_filter
 
@@ -286,10 +287,8 @@ def test_its_window_is_where_the_cost_is_least_with_the_noise_of_each_step(loss)
 
 
 def test_a_window_is_no_mode_of_a_filter_that_mixes_estimates():
-    with pytest.raises(
-        ValueError, match="'imm', which mixes estimates, must keep no window of steps, but got 'mhe'"
-    ):
-        make_filter("imm", line_model(), mode_filter="mhe")
+    rule = "'imm', which mixes estimates, must keep no window of steps, but got 'mhe'"
+    refused(rule, make_filter, "imm", line_model(), mode_filter="mhe")
     modes, (inputs, measurements) = [{}, {}], simulated(line_model(), 6)
     found = run(make_filter("mmae", line_model(), modes=modes, mode_filter="mhe"), KEYS, inputs, measurements)
     expected = run(make_filter("mhe", line_model()), KEYS, inputs, measurements)

@@ -44,10 +44,8 @@ def test_a_run_of_a_list_a_table_or_a_batch_is_a_table_and_a_picture(as_python):
 
 def test_columns_of_a_table_in_another_order_than_the_models_are_refused():
     kf, swapped = filters.make_filter("kf", LINEAR), pandas.DataFrame(MEASURED, columns=["rate", "position"])
-    with pytest.raises(
-        ValueError, match=r"position, rate, but got rate, position: table\[\['position', 'rate'\]\]"
-    ):
-        filters.run(kf, inputs=U, measurements=swapped)
+    rule = r"position, rate, but got rate, position: table\[\['position', 'rate'\]\]"
+    refused(rule, filters.run, kf, inputs=U, measurements=swapped)
     named = filters.run(kf, inputs=U, measurements=swapped[["position", "rate"]])
     plain = filters.run(kf, inputs=U, measurements=MEASURED[:, ::-1])
     np.testing.assert_array_equal(named.means, plain.means)
