@@ -15,7 +15,7 @@ from filters import (
     thruster_model,
 )
 from tests import models
-from tests.filters.test_attitude import TAKE_ROTATIONS
+from tests.filters.attitudes import TAKE_ROTATIONS
 from tests.filters.textbooks import extended_filter
 from tests.models import DT, random_affine, scalar_model, simulated, state_space, swing, wide_model
 from tests.oracles import each_close

@@ -14,8 +14,7 @@ from filters.monitoring import Monitor, watch_of
 from filters.registry import FILTERS
 from filters.sensitivity import likelihood
 from filters.starts import begun_at
-from tests.filters.checks import refused
-from tests.filters.test_attitude import (
+from tests.filters.attitudes import (
     BIAS,
     DT,
     ENSEMBLES,
@@ -28,6 +27,7 @@ from tests.filters.test_attitude import (
     c_library,
     ran,
 )
+from tests.filters.checks import refused
 from tests.oracles import each_close, each_equal
 from thruster_env.core.compiled import interpreted
 from thruster_env.core.streams import episode_keys

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import filters
-from tests.filters.test_attitude import ran
+from tests.filters.attitudes import ran
 from tests.oracles import each_close
 from tests.slow import slow_but
 from thruster_env.core.compiled import interpreted

@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation as Turned
 
 import filters
-from tests.filters.test_attitude import SENSOR, advance, attitude_model, directions, ran, simulated
+from tests.filters.attitudes import SENSOR, advance, attitude_model, directions, ran, simulated
 from tests.filters.test_measured_rotations import is_at, left_jacobian, tracked, tracker_model
 from tests.oracles import each_close
 from thruster_env.core.compiled import interpreted
