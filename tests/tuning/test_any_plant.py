@@ -10,7 +10,6 @@ from filters.consistency.nees import normalized_squares
 from filters.consistency.report import NO_TRUTH, sentences
 from filters.engine.batch import run
 from tests.linear_problem import LinearProblem
-from thruster_env.core.compiled import interpreted
 from thruster_env.core.files import save_figure
 from tuning.api.held_out import CovarianceCheck, HeldOut
 from tuning.evaluation.compare import compare, contender
@@ -35,9 +34,8 @@ SEEDS = range(8)
 def comparison_on(problem):
     """Rule of thumb, oracle in the tuned filter's place, and oracle on a problem, none of them compiled."""
     choices = [untuned_choice("kf", problem), oracle_choice("kf", problem), oracle_choice("kf", problem)]
-    with interpreted():
-        data = problem.data(SEEDS)
-        found = [evaluate(choice.filter(problem), data, problem.scale) for choice in choices]
+    data = problem.data(SEEDS)
+    found = [evaluate(choice.filter(problem), data, problem.scale) for choice in choices]
     bound = np.full(problem.n, 0.1 if problem.truth else np.nan)
     return Comparison(*found, bound=bound, seeds=SEEDS)
 
@@ -60,10 +58,7 @@ def printed(*parts, width=80):
 def test_an_evaluation_has_one_of_everything_for_each_state_channel_and_output(comparisons):
     problem, comparison = comparisons[3, True]
     found, data = comparison.true, problem.data(SEEDS)
-    with interpreted():
-        estimates = run(
-            oracle_choice("kf", problem).filter(problem), data.filter_keys, data.inputs, data.measurements
-        )
+    estimates = run(oracle_choice("kf", problem).filter(problem), data.filter_keys, data.inputs, data.measurements)
     late, errors = slice(10, None), estimates.means - data.states
     np.testing.assert_allclose([part.value for part in found.rmse], np.sqrt((errors[:, late] ** 2).mean((0, 1))))
     assert [state.symbol for state in found.states] == ["p", "v", "b"] and found.channels == 2
@@ -80,13 +75,12 @@ def test_an_evaluation_has_one_of_everything_for_each_state_channel_and_output(c
 
 def test_states_with_an_infinite_scale_do_not_count():
     problem = LinearProblem(scale=(0.5, np.inf, 0.25))
-    with interpreted():
-        found = evaluate(oracle_choice("kf", problem).filter(problem), problem.data(SEEDS), problem.scale)
+    found = evaluate(oracle_choice("kf", problem).filter(problem), problem.data(SEEDS), problem.scale)
     assert found.score.value == pytest.approx((found.rmse[0].value / 0.5 + found.rmse[2].value / 0.25) / 2)
     assert found.scored == [0, 2]
     filter_, data = oracle_choice("kf", problem).filter(problem), problem.data(SEEDS)
     for scale, rule in (((0.5, 0.5), "one number per state, 3"), ((np.inf,) * 3, "finite in some state")):
-        with interpreted(), pytest.raises(ValueError, match=f"scale must be {rule}"):
+        with pytest.raises(ValueError, match=f"scale must be {rule}"):
             evaluate(filter_, data, scale)
 
 
@@ -148,9 +142,8 @@ def test_the_tables_of_errors_grow_downwards_with_the_states(comparisons):
 
 def test_a_leaderboard_ranks_without_truth_by_the_likelihood():
     filters = [contender("kf", "untuned"), contender("ekf"), contender("low-pass")]
-    with interpreted():
-        (blind,), _ = compare(filters, [LinearProblem(truth=False)], SEEDS)
-        (many,), _ = compare(filters, [LinearProblem(8, steps=20)], range(2))
+    (blind,), _ = compare(filters, [LinearProblem(truth=False)], SEEDS)
+    (many,), _ = compare(filters, [LinearProblem(8, steps=20)], range(2))
     assert [row.verdict for row in blind.rows] == ["tie", "better", "unknown"]
     said = printed(*leaderboard.report(blind))
     assert "has no true states, so filters are compared by" in said and "nan" not in said
@@ -165,10 +158,9 @@ def test_a_leaderboard_ranks_without_truth_by_the_likelihood():
 
 def test_consistency_without_truth_is_that_of_the_innovations(tmp_path):
     problem = LinearProblem(truth=False)
-    with interpreted():
-        data = problem.data(range(30))
-        report = check_consistency(oracle_choice("enkf", problem).with_size(5).filter(problem), data)
-        known = check_consistency(oracle_choice("kf", problem).filter(problem), LinearProblem().data(range(30)))
+    data = problem.data(range(30))
+    report = check_consistency(oracle_choice("enkf", problem).with_size(5).filter(problem), data)
+    known = check_consistency(oracle_choice("kf", problem).filter(problem), LinearProblem().data(range(30)))
     said = sentences(report)
     assert said[0] == NO_TRUTH and not any("NEES" in one or "CRPS" in one for one in said)
     start = "The 95 % interval of the expected range [m] contains the measurement"

@@ -123,7 +123,6 @@ def sluggish(**options):
     return ModelProblem(truth, assumed, Steps(hold=5), steps=20, first_scored_step=4, scale=(1.0,), **options)
 
 
-@pytest.mark.usefixtures("as_python")
 def test_with_a_wrong_model_each_filter_has_the_best_q_and_r_of_a_study_and_noise_estimation():
     problem = sluggish(name="sluggish")
     assert model_error(problem).startswith("the residuals of x have ")
@@ -138,7 +137,6 @@ def test_with_a_wrong_model_each_filter_has_the_best_q_and_r_of_a_study_and_nois
     assert model_error(right) == "" and known(None, "kf", right).source == "true"
 
 
-@pytest.mark.usefixtures("as_python")
 def test_particles_are_left_out_by_default_where_there_are_many_states():
     found = tuning.compare(problem=LinearProblem(n=7, m=1, steps=20), seeds=2, knows="untuned", progress=False)
     assert found.filters == ("ekf", "enkf 30") and "pf is left out: by default particles" in str(found)

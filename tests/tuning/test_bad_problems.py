@@ -24,8 +24,6 @@ from tuning.problems.problem import Parameter
 from tuning.reporting.tuning_report import as_json, report
 from tuning.search.plan import Plan
 
-pytestmark = pytest.mark.usefixtures("as_python")
-
 
 def line(transition=lambda x, u, c: (0.9 * x[0],), **changes):
     return StateSpaceModel(

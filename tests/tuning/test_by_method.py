@@ -70,7 +70,7 @@ def test_what_a_method_lacks_is_said_in_one_line(problem, options, words):
 
 
 @pytest.mark.parametrize(("method", "former"), [("likelihood", "likelihood"), ("random-only", "random")])
-def test_a_journal_that_says_way_is_continued(tmp_path, monkeypatch, as_python, method, former):
+def test_a_journal_that_says_way_is_continued(tmp_path, monkeypatch, method, former):
     """As `tune` wrote it before methods had one name."""
     problem, storage = singular(first_scored_step=50), tmp_path / "studies.journal"
     options = {"filter": "kf", "trials": 2, "progress": False, "storage": storage, "method": method}
@@ -148,7 +148,7 @@ def singular(first_scored_step=0, runs=6, steps=60):
 
 
 @pytest.mark.parametrize("method", ["em", "squarem", "als", "mehra"])
-def test_methods_of_q_and_r_alone_say_how_p0_is_left_out(as_python, method):
+def test_methods_of_q_and_r_alone_say_how_p0_is_left_out(method):
     with pytest.raises(
         ValueError, match="P0 is tuned.*first_scored_step=50 of RunsProblem.*method 'likelihood'"
     ) as said:
@@ -164,7 +164,7 @@ def with_larger_r(task):
     task.keep(task.with_values([1e3 * one for one in task.values_of(task.start, task.free)], task.free))
 
 
-def test_an_answer_that_is_worse_than_the_start_is_not_given(as_python, monkeypatch, tmp_path):
+def test_an_answer_that_is_worse_than_the_start_is_not_given(monkeypatch, tmp_path):
     monkeypatch.setitem(METHODS, "scoring", METHODS["scoring"]._replace(function=with_larger_r))
     problem, options = singular(first_scored_step=50), {"trials": 3, "progress": False}
     storage = tmp_path / "studies.journal"
@@ -180,7 +180,7 @@ def test_an_answer_that_is_worse_than_the_start_is_not_given(as_python, monkeypa
 
 
 @pytest.mark.parametrize("options", [{}, {"space": tuning.SearchSpace(hold_r=True)}])
-def test_an_answer_is_no_worse_than_the_numbers_of_the_model(as_python, monkeypatch, options):
+def test_an_answer_is_no_worse_than_the_numbers_of_the_model(monkeypatch, options):
     keeps_the_rule_of_thumb = METHODS["scoring"]._replace(function=lambda task: None)
     monkeypatch.setitem(METHODS, "scoring", keeps_the_rule_of_thumb)
     problem = singular(first_scored_step=50)
@@ -194,7 +194,7 @@ def test_an_answer_is_no_worse_than_the_numbers_of_the_model(as_python, monkeypa
 
 
 @pytest.mark.parametrize(("method", "options"), [("em", {}), ("em", {"full_r": True}), ("squarem", {})])
-def test_em_leaves_the_variance_of_a_channel_that_is_never_measured(as_python, method, options):
+def test_em_leaves_the_variance_of_a_channel_that_is_never_measured(method, options):
     rng = np.random.default_rng(0)
     model = affine_model(A=[[0.9]], C=[[1.0], [1.0]], Q=[0.01], R=[0.04, 0.09], P0=[0.1])
     runs = [{"measurements": np.column_stack([rng.normal(size=20), np.full(20, np.nan)])} for _ in range(4)]

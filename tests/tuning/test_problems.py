@@ -25,9 +25,6 @@ from tuning.problems.model_problem import ModelProblem
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, oracle_choice, parameters, parameters_of, untuned_choice
 
-pytestmark = pytest.mark.usefixtures("as_python")
-
-
 MAKERS = {
     "thruster": thruster,
     "two sensors": functools.partial(thruster, sensors=["thrust", "speed"], measurement_noise_cov=[0.25, 4.0]),

@@ -149,7 +149,7 @@ def test_standings_pair_all_filters_on_the_same_runs(runs):
     assert rows[0].evaluations[NOISIER].score.value > rows[0].evaluations[HELD_OUT].score.value
 
 
-def test_the_function_trains_stores_compares_and_continues(tmp_path, runs, as_python):
+def test_the_function_trains_stores_compares_and_continues(tmp_path, runs):
     path = tmp_path / "mine.safetensors"
     arguments = {"runs": 16, "batch": 8, "window": 10, "seeds": 6}
     training = tuning.train_estimator("recursive-kalmannet", PROBLEM, steps=4, out=path, **arguments)

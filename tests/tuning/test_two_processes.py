@@ -45,7 +45,7 @@ def beside_another(path, trials):
 
 
 @pytest.mark.parametrize("trials", [2, 5, 8])
-def test_nothing_waits_at_the_end_of_a_study_of_two_processes(as_python, tmp_path, monkeypatch, trials):
+def test_nothing_waits_at_the_end_of_a_study_of_two_processes(tmp_path, monkeypatch, trials):
     monkeypatch.setattr("tuning.search.study.run_trial", lambda trial, plan, *_: run_nothing(trial, plan))
     found = beside_another(str(tmp_path / "j"), trials)
     assert {one.state for one in found} <= {*FINISHED, TrialState.FAIL}
@@ -81,7 +81,7 @@ def after_a_kill(path):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_killed_process_leaves_no_trial_in_a_finished_study(as_python, tmp_path, monkeypatch, workers):
+def test_a_killed_process_leaves_no_trial_in_a_finished_study(tmp_path, monkeypatch, workers):
     path, data = str(tmp_path / "j"), PLAN.training_data()
     study = after_a_kill(path)
     if workers == 1:

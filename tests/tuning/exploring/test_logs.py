@@ -74,7 +74,7 @@ def test_a_log_has_no_disturbances(bench):
     assert not any(knob.group == "disturbances" for knob in bench.knobs)
 
 
-def test_logs_on_their_own_stamps_are_drawn_over_these(as_python):
+def test_logs_on_their_own_stamps_are_drawn_over_these():
     stamps, model = [stamps_of(rows, rows) for rows in (130, 100)], smooth()
     logs = [read_log(recorded(one, 3), model, grid=False, dt=DT, name=f"{len(one)}") for one in stamps]
     view = Bench(LogProblem(logs, model)).view()

@@ -17,7 +17,7 @@ from tuning.api.explore import _forward
 from tuning.exploring.page.session import Server
 
 
-def test_a_notebook_shows_the_page_in_a_frame_until_it_is_closed(as_python):
+def test_a_notebook_shows_the_page_in_a_frame_until_it_is_closed():
     bench = tuning.explore(LinearProblem(n=2, m=1), filter="kf", seeds=2)
     shown = bench._repr_html_()
     url = html.unescape(re.search(r'src="([^"]+)"', shown)[1])
@@ -35,7 +35,7 @@ def test_the_function_is_still_there_when_its_room_was_imported():
     assert tuning.explore is tuning.explore and callable(tuning.explore)
 
 
-def test_own_numbers_are_where_one_starts(as_python):
+def test_own_numbers_are_where_one_starts():
     problem = LinearProblem(n=2, m=1)
     bench = tuning.explore(problem, problem.model(process_noise_cov=[0.3, 0.4])).bench
     assert bench.filter == "ekf" and bench.start["Q11"] == pytest.approx(0.3)
@@ -62,7 +62,7 @@ def test_the_browser_is_led_to_the_page_by_a_file_that_others_cannot_read(tmp_pa
 
 
 @pytest.mark.slow
-def test_the_command_prints_the_address_and_opens_no_token_on_a_command_line(monkeypatch, capsys, as_python):
+def test_the_command_prints_the_address_and_opens_no_token_on_a_command_line(monkeypatch, capsys):
     opened, served = [], []
     monkeypatch.setattr(webbrowser, "open", opened.append)
     monkeypatch.setattr(Server, "run", lambda self: served.append(self.url))

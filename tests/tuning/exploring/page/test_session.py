@@ -56,7 +56,7 @@ def bench():
 
 
 @pytest.fixture
-def tab(bench, monkeypatch, as_python):
+def tab(bench, monkeypatch):
     return Tab(bench, monkeypatch)
 
 
@@ -206,7 +206,7 @@ def test_numbers_that_json_has_not_become_nothing():
     }
 
 
-def test_names_of_a_problem_are_text_on_the_page(as_python):
+def test_names_of_a_problem_are_text_on_the_page():
     problem = LinearProblem(n=2, m=1)
     problem.name = "</title><script>alert(1)</script>"
     server = Server(page_of(Bench(problem, "kf"), SEEDS), ends_when_left=False).start()
@@ -216,7 +216,7 @@ def test_names_of_a_problem_are_text_on_the_page(as_python):
     assert "<script>alert" not in text and "&lt;script&gt;alert" in text and 'lang="en"' in text
 
 
-def test_a_bench_can_be_pickled(bench, as_python):
+def test_a_bench_can_be_pickled(bench):
     assert pickle.loads(pickle.dumps(bench)).filter == "kf"
 
 
