@@ -16,7 +16,7 @@ from filters.filter import PageFilter
 from filters.gaussian import extended
 from filters.gaussian.extended import ExtendedKalmanFilter, add_process_noise, propagate
 from filters.pages.page import Page
-from thruster_env.core.checks import at_least, covariance, one_of
+from thruster_env.core.checks import at_least, covariance, one_of, short_repr
 from thruster_env.model.affine import AffineModel, linearize
 
 MOST_POINTS = 200  # of a schedule; programs are written out for them
@@ -135,7 +135,7 @@ class KalmanFilter(AffineFilter):
             raise ValueError(
                 "a schedule must come with the covariance form and a model that has operating points, "
                 f"but got schedule={self.schedule}, form={self.form!r}, "
-                f"operating_points={self.model.operating_points!r}"
+                f"operating_points={short_repr(self.model.operating_points)}"
             )
         _ = self.own_parameters  # raises ValueError for an operating point that does not exist
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from thruster_env.core.angles import difference
-from thruster_env.logs.grid import date_text, time_text
 from thruster_env.logs.imu import of_inertial_sensors
+from thruster_env.logs.times import date_text, time_text
 
 if TYPE_CHECKING:
     from thruster_env.logs.log import Log

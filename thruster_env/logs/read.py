@@ -32,20 +32,17 @@ from thruster_env.logs.grid import (
     Grid,
     Series,
     closeness,
-    follows,
     grid_of,
-    in_seconds,
     mean_held,
     resolution_of,
     sampled,
-    time_text,
 )
 from thruster_env.logs.log import FEWEST_STEPS, Log
 from thruster_env.logs.recorders.registry import Recorded, check_stamps, format_of
 from thruster_env.logs.table import Table, read_table, table_of
+from thruster_env.logs.times import follows, in_seconds, time_text
 from thruster_env.model.state_space import StateSpaceModel
 
-SECOND = "s"
 INPUTS_ACT = ("from", "until", "between")  # when the input of a row acts
 MOST_STEPS = 10_000_000
 MOST_DOUBLED = 0.1  # of the rows, with the time of the row before; of more the times are wrong

@@ -23,9 +23,9 @@ import numpy as np
 from thruster_env.core.checks import as_floats, listed, short_repr
 from thruster_env.core.modules import to_install
 from thruster_env.logs.columns import DATE_NAMES, TIME_NAMES, parted, simple
-from thruster_env.logs.dates import DATES, MISSING_TEXT, is_clock, is_day, joined, seconds_of, since_first
 from thruster_env.logs.findings import Remark
 from thruster_env.logs.recorders.topics import Refused, check_bytes, opened
+from thruster_env.logs.times import DATE_RULE, MISSING_TEXT, is_clock, is_day, joined, seconds_of, since_first
 
 # What stands for a missing number, in any case of letters.
 MISSING = ("", "nan", "na", "n/a", "null", "none", "<na>", "nat")
@@ -82,7 +82,7 @@ class Table:
                 row = next(row for row, text in enumerate(texts) if not _is_number(text))
                 hint = _hint(texts, row, column)
                 is_date = _is_time(column) and not hint.startswith((", with", " below"))
-                rule = f"{DATES}, or numbers" if is_date else f"columns must hold numbers{hint}"
+                rule = f"{DATE_RULE}, or numbers" if is_date else f"columns must hold numbers{hint}"
                 where = self.location(row, column)
                 raise ValueError(f"{rule}, but got {short_repr(cells[row])} in {where}")
             numbers = parsed.copy()
@@ -119,7 +119,7 @@ class Table:
             return None
         for row, text in enumerate(texts):
             if text != MISSING_TEXT and np.isnan(seconds[row]):
-                raise ValueError(f"{DATES}, but got {short_repr(text)} in {self.location(row, column)}")
+                raise ValueError(f"{DATE_RULE}, but got {short_repr(text)} in {self.location(row, column)}")
         return seconds
 
     def _with_partner(self, column: str, texts: list[str]) -> list[str]:

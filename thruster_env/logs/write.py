@@ -27,10 +27,10 @@ from thruster_env.core.files import (
 from thruster_env.core.modules import to_install
 from thruster_env.logs.columns import TIME_NAMES, parted, plain, suffix
 from thruster_env.logs.findings import GAP, OUTLIER, SATURATED, STUCK, outliers
-from thruster_env.logs.grid import digits_for
 from thruster_env.logs.log import Log
 from thruster_env.logs.recorders.registry import ENDINGS
 from thruster_env.logs.table import SUFFIXES, read_table
+from thruster_env.logs.times import digits_for
 from thruster_env.model.quantities import Quantity
 
 EXACT = "exact"  # every digit of a number

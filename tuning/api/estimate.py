@@ -33,8 +33,8 @@ from filters.monitoring import Alarm, Monitor, monitor_of, tuned_monitor
 from thruster_env.core.checks import short_repr
 from thruster_env.core.files import save_figure
 from thruster_env.core.text_tables import Table
-from thruster_env.logs.grid import date_text, time_text
 from thruster_env.logs.log import Log
+from thruster_env.logs.times import date_text, time_text
 from thruster_env.logs.write import check_picture, check_suffix, write_columns
 from thruster_env.model.quantities import Quantity
 from tuning.api.markers import (

@@ -17,12 +17,12 @@ from thruster_env.core.text_tables import Table, Unfolded, console, plain_text
 from thruster_env.env.model_env import ANY_DT
 from thruster_env.logs.columns import find_columns, quantities_of
 from thruster_env.logs.findings import sentences
-from thruster_env.logs.grid import time_text
 from thruster_env.logs.log import Log
 from thruster_env.logs.recorders.bag_counts import METADATA
 from thruster_env.logs.recorders.bags import HEADER, RECEIPT
 from thruster_env.logs.recorders.registry import ENDINGS, Contents, Field, contents, format_of
 from thruster_env.logs.table import SUFFIXES, read_table
+from thruster_env.logs.times import time_text
 from thruster_env.logs.write import check_picture, check_suffix, draw_findings, write_log
 from tuning.api.markers import INPUT, OUTPUT, READ, WRITTEN, LogsArgument, Option
 from tuning.api.read_logs import recorded_runs

@@ -5,8 +5,8 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 
-from thruster_env.logs.dates import date_of, seconds_of
 from thruster_env.logs.table import Table
+from thruster_env.logs.times import date_of, seconds_of
 
 STEPS = np.array([0.0, 3600.0, 86400.0, 30 * 86400.0 + 1.0])
 MOMENTS = [datetime(2026, 4, 30, 22) + timedelta(seconds=step) for step in STEPS.tolist()]

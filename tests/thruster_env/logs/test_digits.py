@@ -5,7 +5,7 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 
-from thruster_env.logs.grid import in_seconds
+from thruster_env.logs.times import in_seconds
 
 FIRST = datetime(2024, 1, 30, 22)
 

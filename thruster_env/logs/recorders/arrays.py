@@ -17,7 +17,6 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from thruster_env.logs.columns import TIME_NAMES, parted
-from thruster_env.logs.grid import in_seconds
 from thruster_env.logs.recorders.topics import (
     MOST_COLUMNS,
     MOST_FIELDS,
@@ -32,6 +31,7 @@ from thruster_env.logs.recorders.topics import (
     package,
     reading,
 )
+from thruster_env.logs.times import in_seconds
 
 NUMERIC = "biuf"  # NumPy's kinds
 FEWEST = 2  # samples; what has fewer is a constant

@@ -16,12 +16,12 @@ from thruster_env.core.checks import listed, one_of
 from thruster_env.logs.columns import INPUT, MEASUREMENT, TIME, Column, find_columns, parted
 from thruster_env.logs.columns import Wanted as MergedWanted
 from thruster_env.logs.findings import CLOCK, OUTSIDE, Remark
-from thruster_env.logs.grid import SECOND, follows, in_seconds, time_text
 from thruster_env.logs.recorders import arrays, autopilots, bags, tables
 from thruster_env.logs.recorders.bag_counts import METADATA
 from thruster_env.logs.recorders.bags import HEADER, RECEIPT, STAMPS, Choice, Clocked, chosen_clock
 from thruster_env.logs.recorders.topics import Format, Topic, Wanted, unreadable
 from thruster_env.logs.table import SUFFIXES, Table, read_table
+from thruster_env.logs.times import SECOND, follows, in_seconds, time_text
 
 BINS = 8  # of the course of a field
 STAMP = "times"  # header of the rows' times

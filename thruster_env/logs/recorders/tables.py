@@ -16,8 +16,8 @@ from zipfile import ZipFile
 import numpy as np
 
 from thruster_env.logs.columns import DATE_NAMES, TIME_NAMES, parted
-from thruster_env.logs.grid import in_seconds
 from thruster_env.logs.recorders.topics import Topic, Wanted, check_bytes, reading
+from thruster_env.logs.times import in_seconds
 
 KIND, CSV, ZIP, ZIP_MAGIC = "folder of CSV files", ".csv", ".zip", b"PK\x03\x04"
 ReadTable = Callable[[Path], Any]
