@@ -399,7 +399,7 @@ def _in_rows(model: StateSpaceModel, keys: Any, inputs: Any, measurements: Any) 
         way = f": z[..., None] for {len(z)} trajectories" if m == 1 and z.shape[0] < z.shape[1] else ""
         way = ": z.T" if len(z) == m else way
         raise ValueError(f"{rule}, but got {z.shape}{way}")
-    if u is not None and not u.ndim:
+    if u is not None and not u.ndim and z.ndim:
         shape = (*z.shape[:-2], z.shape[-2 if z.ndim == 3 else 0] - 1, model.inputs)
         raise ValueError(f"inputs must have shape {shape}, but got a number: np.full({shape}, {u:g}) is constant")
     if z.ndim < 3 and u is not None:

@@ -1,6 +1,7 @@
 """Wrong types in Python: refused in one line that states the rule, before anything has moved."""
 
 import math
+from itertools import product
 
 import gymnasium as gym
 import numpy as np
@@ -283,3 +284,14 @@ def test_what_has_no_value_at_the_mean_is_tried_beside_it():
     refused(lambda: pendulum(observe=lambda x, c: (1.0 / x[0],), **changes), "but returned 1 entry")
     # Each extended step would restart: a limit is due, or no Jacobian, where differences take its place.
     refused(lambda: pendulum(observe_jacobian=lambda x, c: ((math.nan, 0.0), (0.0, 1.0))), "must be finite at the")
+
+
+def test_whatever_keys_inputs_and_measurements_are_they_are_taken_or_refused_in_one_line():
+    filter_ = make_filter("ekf", thruster_model())
+    arrays = [np.ones(shape) for shape in ((), (3,), (3, 1), (2, 3, 1), (1, 2, 3, 1))]
+    anything = [True, 1.0, "a", None, [], [1, 2], {}, object(), math.nan, np.array("x"), 1j, *arrays]
+    for keys, inputs, measurements in product([None, True, [[1, 2]]], anything, anything):
+        try:
+            run(filter_, keys, inputs, measurements)
+        except ValueError as error:
+            assert "\n" not in str(error)
