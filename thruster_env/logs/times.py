@@ -21,7 +21,8 @@ TICKS = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # a second
 STAMP_NAMES = ("timestamp", "stamp")
 SHORTEST_STEP, LONGEST_STEP = 1e-4, 5.0  # [s], of stamps in ms, us or ns
 DOUBTED = 2.0  # [s], of whole stamps, which may as well be in ms
-MOST_SECONDS = 86400.0  # [s], of stamps in seconds
+DAY, YEAR = 86400.0, 365.25 * 86400.0  # s
+MOST_SECONDS = DAY  # [s], of stamps in seconds
 LEAST_DAYS, LEAST_SECONDS = 2e4, 2e-5  # stamps beyond the first are dates in days if steps are below the other [s]
 STAMP_DIGITS = 17  # of a float64
 
@@ -33,13 +34,12 @@ WIDTHS = {8: "20260501", 10: "2026050112", 12: "202605011200", 14: "202605011200
 DATE_COLUMNS = ("date", "datum", "year", "jahr")  # columns whose numbers are no seconds
 CALENDAR = 1500.0, 2200.0  # years as numbers
 DAYS = (20e3, 80e3), (6e5, 8e5), (2.3e6, 2.6e6)  # Excel's and modified Julian ones, MATLAB's, Julian ones
-DAY, YEAR = 86400.0, 365.25 * 86400.0  # s
 DAY_ROUNDING = 0.1  # s, of days with six decimals
 
 # Of dates that are written as text.
 MISSING_TEXT = "nan"
 DATE_RULE = "times must be dates as of ISO 8601, such as 2026-05-01T12:00:00.01"
-HALF_DAY = 43200.0  # [s], by which a clock time falls at midnight, at least
+HALF_DAY = DAY / 2.0  # [s], by which a clock time falls at midnight, at least
 
 _CLOCK = r"(?P<hour>\d{1,2}):(?P<minute>\d{2})(?::(?P<second>\d{2}(?:[.,]\d+)?))?(?:\s*(?P<half>[AaPp])[Mm])?"
 _ZONE = r"(?:\s*(?P<zone>Z|UTC|GMT|[+-]\d{2}:?\d{2}))?"
@@ -114,7 +114,7 @@ def unit_of(stamps: np.ndarray, header: str, where: str) -> tuple[str, str]:
     low, high = SHORTEST_STEP, LONGEST_STEP
     possible = [(unit, ticks) for unit, ticks in TICKS.items() if not (is_stamp and unit == "ms")]
     units = [unit for unit, ticks in possible if is_whole and low * ticks <= step <= high * ticks]
-    as_seconds = f"{step:.4g} s" if step < MOST_SECONDS else f"{step / MOST_SECONDS:.3g} days"
+    as_seconds = f"{step:.4g} s" if step < DAY else f"{step / DAY:.3g} days"
     if len(units) != 1:
         rule = "times must be in seconds, or their column say its unit"
         way = f"use --column 'time={header}[us]', or [ns], [ms], [s]"
@@ -299,7 +299,7 @@ def _clock_seconds(cells: Sequence[str]) -> np.ndarray | None:
     times = np.array([np.nan if match is None else _seconds(match.groupdict()) for match in matches])
     present = ~np.isnan(times)
     days = np.cumsum(np.diff(times[present], prepend=times[present][0]) < -HALF_DAY)
-    times[present] += 86400.0 * days
+    times[present] += DAY * days
     return times - times[present][0]
 
 

@@ -319,7 +319,7 @@ def response_figure(path: str | Path, model: LinearModel, dt: float, title: str)
     step settles to.
 
     Args:
-        path: PNG file to write.
+        path: file to write, .png, .svg or .pdf.
         model: the thruster near an operating point.
         dt: sample time [s].
         title: said above the picture.
