@@ -449,7 +449,7 @@ class ReplayEnv(gym.Env):
     ):
         """Read the log and make spaces; see the class for the arguments."""
         options = {"columns": columns, "clock_offset": clock_offset, "dt": dt, "grid": grid, "stamps": stamps}
-        self.log, maker = read_for(log, model, of_any_dt=False, **options)
+        self.log, maker = read_for(log, model, any_dt=False, **options)
         offer = object_named(model, "model") if isinstance(model, str) else model
         self.continuous = None if self.log.stamps is None else continuous_of(offer)
         self.dt, self.state_space_model = self.log.dt, maker
@@ -488,10 +488,10 @@ class ReplayEnv(gym.Env):
         return self._last.copy(), info
 
 
-def read_for(log: Any, model, *, of_any_dt: bool = False, **options) -> tuple[Log, Callable[..., StateSpaceModel]]:
+def read_for(log: Any, model, *, any_dt: bool = False, **options) -> tuple[Log, Callable[..., StateSpaceModel]]:
     """A log, read if it is a path or a table, and the function of changes that makes the model at its sample time.
 
-    Arguments and errors are those of `ReplayEnv`; a model `of_any_dt` has no sample time yet.
+    Arguments and errors are those of `ReplayEnv`; with `any_dt` the model's sample time may be another one.
     """
     offer = object_named(model, "model") if isinstance(model, str) else model
     if not isinstance(log, Log):
@@ -511,7 +511,7 @@ def read_for(log: Any, model, *, of_any_dt: bool = False, **options) -> tuple[Lo
                 for quantities in (logged, modelled)
             ]
             raise ValueError(f"{what} of log {log.name} must be the model's, {listed[1]}, but it has {listed[0]}")
-    if log.stamps is None and not of_any_dt:
+    if log.stamps is None and not any_dt:
         _check_sample_time(made_model, log)
     return replace(log, measurements=seen_by(made_model, log.measurements)), maker
 

@@ -112,7 +112,7 @@ def read_named(
     whose = room.DEFAULT_PRESET if preset is None else str(preset)
     thruster = room.Preset(whose, sensors, ANY_DT)
     try:
-        log, _ = read_for(path, thruster.state_space_model(), of_any_dt=True, **options)
+        log, _ = read_for(path, thruster.state_space_model(), any_dt=True, **options)
     except ValueError as error:
         lacks_all = all(part in str(error) for part in (NO_COLUMN, "the input ", "the measurement "))
         if preset is not None or sensors or options["columns"] or not lacks_all:
@@ -121,7 +121,7 @@ def read_named(
     known = {key: value for key, value in thruster.clock_offset.items() if f"measurement:{key}" not in log.offsets}
     if known and not isinstance(path, Log):  # offsets of the user or of the log itself have priority
         options["clock_offset"] |= known
-        log, _ = read_for(path, thruster.state_space_model(), of_any_dt=True, **options)
+        log, _ = read_for(path, thruster.state_space_model(), any_dt=True, **options)
     return log, room.Preset(whose, sensors, log.dt)
 
 
