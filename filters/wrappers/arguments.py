@@ -68,6 +68,7 @@ def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | 
         if make is None:
             rule = "an env that offers no state_space_model must come with a model"
             raise ValueError(f"{rule}, but got {env} alone: pass model=...")
+        refuse_other_actions(env)
         return f"the model of {env.unwrapped}", make
     if isinstance(model, StateSpaceModel):
         return "the model", model
@@ -314,6 +315,51 @@ def check_spaces(
     if int(np.prod(actions.shape)) != size:
         raise ValueError(f"the action space must have the model's {size} entries, but got {actions}")
     return actions
+
+
+CHANGING = gym.ActionWrapper, gym.vector.VectorActionWrapper
+CLIPPING = gym.wrappers.ClipAction, gym.wrappers.vector.ClipAction
+REPEATING = "RepeatAction", "MaxAndSkipObservation"
+NORMALISING = gym.wrappers.NormalizeObservation, gym.wrappers.vector.NormalizeObservation
+
+
+def layers(env) -> list:
+    """An env and all that it wraps, from outside."""
+    inside = [env]
+    while isinstance(inside[-1], gym.Wrapper | gym.vector.VectorWrapper):
+        inside.append(inside[-1].env)
+    return inside
+
+
+def clipping_space(env) -> gym.Space:
+    """The space of an env's actions, or of each copy's, to which the env clips them: within `ClipAction` its own.
+
+    Raises ValueError for an env that begins episodes within a step, which no filter of one env notices.
+    """
+    for layer in layers(env):
+        if isinstance(layer, gym.wrappers.Autoreset):
+            raise ValueError(f"an env must begin episodes by reset() alone, but got {layer}: leave Autoreset out")
+    changing = next((layer for layer in layers(env) if isinstance(layer, CHANGING)), env)
+    clipping = changing.env if isinstance(changing, CLIPPING) else env
+    return clipping.single_action_space if isinstance(clipping, gym.vector.VectorEnv) else clipping.action_space
+
+
+def refuse_other_actions(env) -> None:
+    """Raise ValueError if a wrapper of an env that offers a model changes or repeats actions; it may clip them."""
+    for layer in layers(env):
+        if hasattr(type(layer), "state_space_model") or "state_space_model" in vars(layer):
+            return
+        name, changes = type(layer).__name__, isinstance(layer, CHANGING) and not isinstance(layer, CLIPPING)
+        if changes or name in REPEATING:
+            rule = "a filter with the env's own model must get the env's own actions"
+            raise ValueError(f"{rule}, but got {layer}: put {name} around the filter, or pass model=...")
+
+
+def refuse_normalised(env, info: Mapping) -> None:
+    """Raise ValueError if the observation, of which the measurement is taken, is normalised by its past."""
+    if "measurement" not in info and any(isinstance(layer, NORMALISING) for layer in layers(env)):
+        rule = "measurements must be in the model's units"
+        raise ValueError(f"{rule}, but got {env}: put NormalizeObservation around the filter")
 
 
 def _box(name: str, space: gym.Space) -> gym.spaces.Box:

@@ -29,8 +29,10 @@ from filters.wrappers.arguments import (
     ModelInSpec,
     WithMeasuredInputs,
     check_spaces,
+    clipping_space,
     filter_for,
     given_filter,
+    refuse_normalised,
     split_of,
     warn_if_far,
 )
@@ -128,7 +130,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
         split = split_of(env, self.filter.model)
         self._split = bool(split.inputs)  # whether some channels are inputs of the model
-        actions = check_spaces(env.action_space, env.observation_space, self.filter.model, len(split.inputs))
+        actions = check_spaces(clipping_space(env), env.observation_space, self.filter.model, len(split.inputs))
         n, m = self.filter.model.n, split.channels
         # What an env appends to its measurement, validity flags and the reference, stays in the observation.
         self._appended = env.get_wrapper_attr(APPENDED) if env.has_wrapper_attr(APPENDED) else 0
@@ -154,6 +156,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         """Reset env and filter; the belief is the prior, updated with the first measurement."""
         seed = checked_seed(seed)
         observation, info = self.env.reset(seed=seed, options=options)
+        refuse_normalised(self.env, info)
         if seed is not None:
             self._generator = filter_generator(seed)
         z = _measurement(observation, info)
@@ -281,7 +284,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
         split = split_of(env, self.filter.model)
         inputs = len(split.inputs)
-        actions = check_spaces(env.single_action_space, env.single_observation_space, self.filter.model, inputs)
+        actions = check_spaces(clipping_space(env), env.single_observation_space, self.filter.model, inputs)
         self._n, self._m = self.filter.model.n, split.channels
         self._appended = getattr(env.unwrapped, APPENDED, 0)
         length = {
@@ -316,6 +319,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         self._keys.seeds(seed)  # a wrong one changes nothing
         seeds: Any = seed  # Gymnasium takes a list of them, too, but its annotation does not say so
         observations, info = self.env.reset(seed=seeds, options=options)
+        refuse_normalised(self.env, info)
         which = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         self._keys.seed(seed, which)
         z = self._measurements(observations, info)
@@ -340,7 +344,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
             last = info.get("final_info", {})
             u = np.where(done[:, None], last["recorded_input"], u) if "recorded_input" in last else u
-            self._end(u, z, done, info)
+            self._end(u, z, done, observations, info)
             self._start(done, z)
         elif self.autoreset_mode == AutoresetMode.NEXT_STEP and self._done.any():
             self._advance(u, z, idle=self._done)
@@ -365,12 +369,10 @@ class EstimateStates(gym.vector.VectorWrapper):
             m, part = self.filter.model.m, self._beliefs.part
             warn_if_far(self._name, part("innovation", m)[which], part("innovation_cov", m, m)[which])
 
-    def _end(self, u, z, done, info) -> None:
+    def _end(self, u, z, done, observations, info) -> None:
         """Update with the last measurements of episodes that end; put these estimates into final_obs and info."""
         final = np.full(self.num_envs, None, dtype=object) if "final_obs" not in info else info["final_obs"]
-        observations = np.zeros(
-            (self.num_envs, *(self.env.single_observation_space.shape or ())), dtype=np.float32
-        )
+        observations = observations.copy()
         for i in np.flatnonzero(done):
             observations[i] = final[i]
         final_info = info.setdefault("final_info", {})

@@ -87,22 +87,25 @@ def test_a_copy_is_a_single_wrapped_env_over_several_episodes(filter_name, mode,
 class Oscillator(gym.Env):
     """Somebody else's env: episodes end at random, and not every info has a measurement or a flag."""
 
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
     action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.x, self.steps = self.np_random.normal(size=2), 0
-        return self.x.astype(np.float32), {}
+        return self.x.copy(), {}
 
     def step(self, action):
         force = float(action[0]) - self.x[0]
         self.x = self.x + 0.1 * np.array([self.x[1], force]) + 0.01 * self.np_random.normal(size=2)
         self.steps += 1
-        info = {"measurement": self.x + 0.1 * self.np_random.normal(size=2)}
+        info, reports = (
+            {"measurement": self.x + 0.1 * self.np_random.normal(size=2)},
+            self.np_random.random() < 0.7,
+        )
         if self.steps > 1:
             info["measurement_valid"] = self.np_random.random(2) > 0.3
-        return self.x.astype(np.float32), 0.0, bool(self.np_random.random() < 0.15), self.steps >= 5, info
+        return self.x.copy(), 0.0, bool(self.np_random.random() < 0.15), self.steps >= 5, info if reports else {}
 
 
 def oscillator():
@@ -162,6 +165,17 @@ def test_many_copies_on_all_cores_are_the_few():
     for _ in range(5):
         of_many, of_few = many.step(np.full((600, 1), 9.0)), few.step(np.full((2, 1), 9.0))
     np.testing.assert_allclose(of_many[-1]["estimate"][:2], of_few[-1]["estimate"], rtol=1e-12)
+
+
+def test_a_vector_env_s_own_model_gets_actions_as_the_env_does():
+    plain, inside = (gym.make_vec("BowThruster-v0", num_envs=2) for _ in range(2))
+    envs = [EstimateStates(env) for env in (plain, gym.wrappers.vector.ClipAction(inside))]
+    for env in envs:
+        env.reset(seed=1)
+    infos = [env.step(np.full((2, 1), 99.0, np.float32))[-1] for env in envs]
+    np.testing.assert_array_equal(infos[0]["estimate"], infos[1]["estimate"])
+    rule = "must get the env's own actions, but got"
+    refused(rule, EstimateStates, gym.wrappers.vector.RescaleAction(inside, np.float32(-1.0), np.float32(1.0)))
 
 
 def test_a_third_party_vector_env_takes_a_filter_too():

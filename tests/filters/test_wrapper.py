@@ -430,6 +430,48 @@ class TestOtherEnvs:
         np.testing.assert_array_equal(env.filter.model.process_noise_cov, 4.0 * np.eye(2))
 
 
+class TestWrappersInside:
+    """Of Gymnasium's own, between env and filter, as a user may have them by habit."""
+
+    def test_actions_are_clipped_where_the_env_clips_them(self):
+        plain, clipped = wrapped("ekf"), wrapped("ekf", gym.wrappers.ClipAction(bow_thruster()))
+        actions = 10.0 * voltages(30)
+        expected, estimates = (infos_of("estimate", played(env, actions, seed=0)[2]) for env in (plain, clipped))
+        np.testing.assert_array_equal(estimates, expected)
+        outside = gym.wrappers.TransformAction(
+            gym.wrappers.ClipAction(Scripted(SCRIPT)), lambda a: a, Scripted.action_space
+        )
+        EstimateState(outside, "kf", model=two_channels())
+
+    @pytest.mark.parametrize(
+        "wrapper",
+        [
+            lambda env: gym.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0)),
+            lambda env: gym.wrappers.TransformAction(env, np.negative, env.action_space),
+            lambda env: gym.wrappers.StickyAction(env, 0.5),
+            lambda env: gym.wrappers.MaxAndSkipObservation(env, 2),
+        ],
+    )
+    def test_the_env_s_own_model_gets_the_env_s_own_actions(self, wrapper):
+        refused("must get the env's own actions, but got", EstimateState, wrapper(bow_thruster()))
+        wrapper(EstimateState(bow_thruster()))
+        EstimateState(wrapper(Scripted(SCRIPT)), model=two_channels())  # whose inputs are the outer actions
+
+    def test_an_offer_of_a_wrapper_is_of_that_wrappers_actions(self):
+        env = gym.wrappers.RescaleAction(bow_thruster(), np.float32(-1.0), np.float32(1.0))
+        env.state_space_model = bow_thruster().unwrapped.state_space_model
+        EstimateState(gym.wrappers.TimeLimit(env, 5))
+
+    def test_an_env_that_begins_episodes_within_a_step_is_refused(self):
+        rule = r"must begin episodes by reset\(\) alone, but got <Autoreset"
+        refused(rule, EstimateState, gym.wrappers.Autoreset(bow_thruster()))
+
+    def test_normalised_observations_are_no_measurements(self):
+        env = gym.wrappers.NormalizeObservation(Scripted(SCRIPT, in_info=False))
+        refused("must be in the model's units, but got", EstimateState(env, model=two_channels()).reset)
+        EstimateState(gym.wrappers.NormalizeObservation(Scripted(SCRIPT)), model=two_channels()).reset()
+
+
 def swing(x, u, c):
     """Gymnasium's pendulum: angle from upright [rad], speed [rad/s]; gravity 10, length and mass 1, dt 0.05."""
     speed = x[1] + 0.05 * (15.0 * math.sin(x[0]) + 3.0 * u[0])

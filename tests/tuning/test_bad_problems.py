@@ -1,5 +1,6 @@
 """What is no problem, or does not fit, is one clear line; a model that diverges is told its substeps."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from rich.console import Console
@@ -124,6 +125,10 @@ BAD = {
     "discrete": (
         lambda: EnvProblem("CartPole-v1", "random", line()),
         r"must have a Box as its action space, but that of problem 'an env' is Discrete\(2\): wrap it in ",
+    ),
+    "autoreset": (
+        lambda: EnvProblem(lambda: gym.wrappers.Autoreset(gym.make("Pendulum-v1")), "random", line()),
+        r"an env must begin episodes by reset\(\) alone, but got <Autoreset",
     ),
     "actions": (
         lambda: EnvProblem("Pendulum-v1", "random", line()),

@@ -3,6 +3,7 @@
 import functools
 import pickle
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ from filters.bounds import posterior_bound
 from filters.tuned_file import NOISE
 from tests import pendulum_problem
 from tests.models import wide_model
+from tests.oracles import each_equal
 from tests.small_problems import pair, thruster
 from tests.tuned_files import write_untuned
 from tuning.evaluation import held_out as summary
@@ -158,6 +160,18 @@ def test_policies_act_on_what_the_env_shows():
     drawn = EnvProblem("Pendulum-v1", "random", pendulum_problem.model(), steps=60, state_of=lambda env: env.state)
     inputs = drawn.data([1, 2]).inputs
     assert np.abs(inputs).max() <= 2.0 and inputs.std() > 1.0 and not np.array_equal(*inputs)
+
+
+def test_the_inputs_of_data_are_what_the_env_applied_and_measurements_have_units():
+    def pendulum(wrapper=lambda env: env):
+        return EnvProblem(lambda: wrapper(gym.make("Pendulum-v1")), BinarySequence(amplitude=9.0, hold=5),
+                          pendulum_problem.model(), steps=60, state_of=pendulum_problem.state)  # fmt: skip
+
+    plain, clipped = pendulum().data([3]), pendulum(gym.wrappers.ClipAction).data([3])
+    each_equal((clipped.inputs, clipped.measurements), (plain.inputs, plain.measurements))
+    assert abs(plain.inputs).max() == 2.0
+    with pytest.raises(ValueError, match="measurements must be in the model's units, but got <NormalizeObserv"):
+        pendulum(gym.wrappers.NormalizeObservation).data([3])
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils.seeding import np_random
 
+from filters.wrappers.arguments import clipping_space, refuse_normalised
 from thruster_env.core.checks import as_floats, covariance, covariance_root, short_repr
 from thruster_env.core.modules import error_line
 from thruster_env.core.streams import (
@@ -353,6 +354,8 @@ class EnvProblem(AssumedProblem):
             rule = f"reset of the env of problem {self.name} must return (observation, info)"
             raise ValueError(f"{rule}, but returned {short_repr(begun)}")
         observation, info = begun
+        if self.measure is None:
+            refuse_normalised(env, info)
         measurements, states = [self.measured(observation, info)], [self.state(env, info)]
         choose = chooser(self.policy if excitation is None else excitation, space, seed)
         for k in range(self.steps):
@@ -411,7 +414,7 @@ class EnvProblem(AssumedProblem):
 
 def _box(env: gym.Env, name: str) -> gym.spaces.Box:
     """The action space of an env; ValueError unless it is a Box."""
-    space = env.action_space
+    space = clipping_space(env)
     if not isinstance(space, gym.spaces.Box):
         raise ValueError(
             f"an env must have a Box as its action space, but that of problem {name!r} is {space}: wrap it in "
