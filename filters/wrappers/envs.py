@@ -69,7 +69,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     state so many steps ago, given all measurements up to now; in the first steps the state at the reset.
 
     Args:
-        env: any env with Box actions and observations.
+        env: any env with Box actions and observations. What changes its actions, as `RescaleAction` does, belongs
+            around the filter if the model is the env's own.
         filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None. Or a filter
             object with its model, such as `tuning.tune(...).filter`; or an estimator of
             another package, as `filters.estimators.foreign.Estimator`, a function that makes one
