@@ -15,6 +15,8 @@ from filters.consistency.nees import (
     FEWEST_RUNS,
     LAGS,
     LEVELS,
+    POSITIVE,
+    SHARE,
     Interval,
     SquaresCheck,
     Uniformity,
@@ -242,9 +244,9 @@ def report_of(
         nees=check_whitened("NEES", whitened_errors),
         nis=check_whitened("NIS", whitened_innovations, present),
         whiteness=_whiteness(whitened_innovations, present, lags),
-        coverage=tuple(mean_interval(covered(errors[..., i], deviations[..., i])) for i in range(n)),
+        coverage=tuple(mean_interval(covered(errors[..., i], deviations[..., i]), within=SHARE) for i in range(n)),
         coverage_by_level=np.array([_mean(covered(errors, deviations, level), (0, 1)) for level in LEVELS]),
-        crps=tuple(mean_interval(crps[..., i]) for i in range(n)),
+        crps=tuple(mean_interval(crps[..., i], within=POSITIVE) for i in range(n)),
         crps_expected=_mean(expected, (0, 1)),
         crps_ratio=_mean(crps, 0) / _mean(expected, 0),
         tails=_kurtosis(whitened_innovations, present),
@@ -254,7 +256,7 @@ def report_of(
         ensemble=None if members is None or states is None else check_ensemble(members, states, angles),
         channels=channels,
         innovation_coverage=tuple(
-            mean_interval(covered(measured[..., j], expected_deviations[..., j])) for j in range(m)
+            mean_interval(covered(measured[..., j], expected_deviations[..., j]), within=SHARE) for j in range(m)
         ),
         innovation_coverage_by_level=np.array(
             [_mean(covered(measured, expected_deviations, level), (0, 1)) for level in LEVELS]
@@ -282,7 +284,7 @@ def check_ensemble(members: Members, states: np.ndarray, angles: Sequence[bool] 
     return EnsembleCheck(
         size,
         tuple(uniformity(ensemble_ranks(*part), steps=size + 1) for part in parts),
-        tuple(mean_interval(ensemble_crps(*part)) for part in parts),
+        tuple(mean_interval(ensemble_crps(*part), within=POSITIVE) for part in parts),
     )
 
 

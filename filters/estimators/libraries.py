@@ -228,7 +228,8 @@ def from_control(
     a, b, c, d = _attributes(system, "a state space, as of python-control or scipy.signal", "A", "B", "C", "D")
     if d.any():
         raise ValueError(
-            f"D must be zero, but got {d.tolist()}: affine_model(d=) takes the D of the input until then"
+            f"D must be zero, but got {d.tolist()}: filter z - D u of the same instant with D = 0, "
+            "or give affine_model(d=) the D of the input until then"
         )
     n, own_dt = len(a), getattr(system, "dt", None)
     g = np.eye(n) if noise_input is None else as_floats(noise_input)

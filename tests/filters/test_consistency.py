@@ -58,6 +58,22 @@ class TestIntervals:
         assert found.value == pytest.approx(values.mean())
         assert (found.high - found.low) / (2 * 1.96 * values[:, 0].std() / 20) == pytest.approx(1.0, abs=0.1)
 
+    @pytest.mark.parametrize("runs", [2, 3, 5, 9])
+    def test_few_runs_cover_the_right_mean_and_ratio_as_often_as_stated(self, runs):
+        """As the exact interval does, which is Student's, within its 95 % and what chance leaves of 500 draws."""
+        rng = np.random.default_rng(runs)
+        means = [mean_interval(rng.normal(size=runs)) for _ in range(500)]
+        pairs = rng.gamma(3.0, size=(500, 2, runs, 1))
+        ratios = [rmse_ratios(a, b)[0] for a, b in pairs]
+        for intervals, right in ((means, 0.0), (ratios, 1.0)):
+            assert 0.90 < np.mean([found.covers(right) for found in intervals]) < 0.985
+        assert all(0.0 < found.low < found.value < found.high for found in ratios)
+
+    def test_an_interval_of_few_runs_is_within_what_a_mean_can_be(self):
+        assert mean_interval(np.array([0.9, 1.0]), within=(0.0, 1.0)).high == 1.0
+        assert mean_interval(np.array([0.9, 1.0])).high > 1.1
+        assert mean_interval(np.array([7.0])) == (7.0, 7.0, 7.0)
+
     def test_missing_numbers_are_left_out(self):
         values = np.array([[1.0, np.nan, 3.0], [np.nan] * 3, [5.0, 5.0, 5.0]])
         assert mean_interval(values).value == pytest.approx(19 / 5)

@@ -431,6 +431,40 @@ def test_a_continuous_system_is_sampled_and_its_gain_is_that_of_riccati():
     assert filters.from_control(TransferFunction([1.0], [1.0, 0.4, 4.0]), [0.0, 1.0], [0.3], dt=0.1).model.n == 2
 
 
+def test_a_cross_covariance_of_the_noises_is_an_input_of_the_measurement():
+    """As docs/other_packages.md says; against the joint Gaussian of all states and measurements."""
+    a, b, c = np.array([[0.9, 0.2], [-0.3, 0.7]]), np.array([[0.5], [1.0]]), np.array([[1.0, 0.4]])
+    q, r, n = np.array([[0.3, 0.1], [0.1, 0.2]]), np.array([[0.4]]), np.array([[0.2], [-0.1]])
+    steps, rng = 12, np.random.default_rng(4)
+    u, z = rng.normal(size=(steps - 1, 1)), rng.normal(size=(steps, 1))
+    # Each state and measurement is a mean and a linear function of x_0 and all (w_k, v_k).
+    size = 2 + 3 * steps
+    x, row, rows, states = np.zeros(2), np.eye(2, size), [], []
+    for k in range(steps):
+        states.append((x, row))
+        rows.append((c @ x, c @ row + np.eye(1, size, 4 + 3 * k)))
+        x, row = a @ x + (b @ u[k] if k < steps - 1 else 0.0), a @ row + np.eye(2, size, 2 + 3 * k)
+    cov = np.kron(np.eye(steps + 1), np.block([[q, n], [n.T, r]]))[1:, 1:]
+    cov[:2, :2] = np.eye(2)
+
+    def conditioned(k, last):
+        of_z = np.concatenate([part for _, part in rows[: last + 1]])
+        residual = z[: last + 1, 0] - np.concatenate([mean for mean, _ in rows[: last + 1]])
+        gain = np.linalg.solve(of_z @ cov @ of_z.T, of_z @ cov @ states[k][1].T).T
+        return states[k][0] + gain @ residual
+
+    moved = n @ np.linalg.inv(r)
+    model = filters.affine_model(
+        A=a - moved @ c, B=np.hstack([b, moved]), C=c, Q=q - moved @ n.T, R=r, P0=np.eye(2)
+    )
+    for name in ("kf", "ekf", "ukf"):
+        arguments = filters.make_filter(name, model), None, np.hstack([u, z[:-1]]), z
+        expected = [conditioned(k, k) for k in range(steps)]
+        np.testing.assert_allclose(filters.run(*arguments).means, expected, rtol=1e-9, atol=1e-12)
+        expected = [conditioned(k, steps - 1) for k in range(steps)]
+        np.testing.assert_allclose(filters.smooth(*arguments).means, expected, rtol=1e-9, atol=1e-12)
+
+
 def test_what_does_not_fit_is_refused():
     from scipy.signal import StateSpace
 
@@ -446,7 +480,7 @@ def test_what_does_not_fit_is_refused():
     for converter in (filters.from_pykalman, filters.from_statsmodels):
         refused("but got 3", converter, 3)
     refused("dt=", filters.from_control, StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]]), [1.0], [1.0])
-    with pytest.raises(ValueError, match="D must be zero"):
+    with pytest.raises(ValueError, match=r"D must be zero, but got \[\[1.0\]\]: filter z - D u"):
         filters.from_control(StateSpace([[-1.0]], [[1.0]], [[1.0]], [[1.0]]), [1.0], [1.0], dt=0.1)
     resting = StateSpace(np.zeros((2, 2)), np.ones((2, 1)), [[1.0, 0.0]], 0.0)
     refused(r"\(prior_cov=\), but got none", filters.from_control, resting, [1.0, 1.0], [1.0], dt=0.1)

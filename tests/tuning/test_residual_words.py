@@ -122,7 +122,7 @@ def test_a_wrong_model_is_asked_for_and_never_called_consistent():
     said = consistency_sentence(comparison)
     assert said.startswith("Made consistent by Q and R, not by the model: mean NIS") and "onsistent:" not in said
     (doubt,) = model_doubts(problem, comparison)
-    higher = "0.39 [0.36, 0.41] higher a measurement"
+    higher = "0.39 [0.17, 0.61] higher a measurement"
     regression = f"linear regression on past rows predicts with a log-likelihood {higher}"
     assert doubt == f"Is this model the right one? A {regression}."
     own = comparison._replace(tuned=comparison.tuned._replace(nis=comparison.given.nis))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from filters.consistency.nees import (
+    POSITIVE,
     Interval,
     blow_up_sentence,
     interval,
@@ -187,7 +188,7 @@ def compute_metrics(
     nees_variance, nis_variance = variance_ratios(runs) if variances else (np.nan, np.nan)
     return Evaluation(
         **_errors(filter_, runs, data, scale, intervals),
-        nis=mean_interval(runs.nis, intervals),
+        nis=mean_interval(runs.nis, intervals, POSITIVE),
         expected_nis=float(counts.mean()) if counts.size else np.nan,
         channels=filter_.model.m,
         log_likelihood=float(runs.log_likelihoods.mean()),
@@ -223,9 +224,8 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
     scale, weights, of_outputs = _checked(scale, len(states)), runs.weights, outputs_of(filter_.model)
     score_interval = without_interval(score(mean_squares, scale, weights))
     if intervals:
-        score_interval = interval(
-            score_interval.value, _scores(np.sqrt(resampled_means(mean_squares, weights)), scale)
-        )
+        resampled = _scores(np.sqrt(resampled_means(mean_squares, weights)), scale)
+        score_interval = interval(score_interval.value, resampled, len(mean_squares), is_ratio=True)
     squares_of = runs.output_mean_squares.items()
     outputs = {symbol: rmse_intervals(squares, intervals, weights)[0] for symbol, squares in squares_of}
     return {
@@ -235,7 +235,7 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
         "start_up_rmse": np.sqrt(start_up.mean(axis=(0, 1)) if data.counted is None else _mean_there(start_up)),
         "score": score_interval,
         "output_rmse": outputs,
-        "nees": mean_interval(nees, intervals),
+        "nees": mean_interval(nees, intervals, POSITIVE),
         "median_nees": float(np.nanmedian(nees)) if np.isfinite(nees).any() else np.nan,
         "mean_squares": mean_squares,
         "scale": scale,
@@ -336,7 +336,7 @@ def score_ratio(a: Evaluation, b: Evaluation) -> Interval:
     if not (a.has_truth and b.has_truth):
         return NOTHING
     value = score(a.mean_squares, a.scale, a.weights) / score(b.mean_squares, b.scale, b.weights)
-    return interval(value, resampled_ratios(a, b))
+    return interval(value, resampled_ratios(a, b), len(a.mean_squares), is_ratio=True)
 
 
 def median_score_ratio(a: Evaluation, b: Evaluation) -> float:

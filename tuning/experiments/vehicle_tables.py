@@ -204,7 +204,7 @@ def position_ratio(a: Scores, b: Scores, field: str) -> Interval:
     """RMSE of position of a over that of b on the same runs, paired, of a field of poses such as "full"."""
     above, below = (getattr(scores, field)[:, :3].sum(axis=1) for scores in (a, b))
     ratios = np.sqrt(resampled_means(above) / resampled_means(below))
-    return interval(float(np.sqrt(above.mean() / below.mean())), ratios)
+    return interval(float(np.sqrt(above.mean() / below.mean())), ratios, len(above), is_ratio=True)
 
 
 def _ratio(scores: Scores, base: Scores) -> str:
