@@ -83,6 +83,7 @@ class Filter:
         Raises ValueError for another key.
         """
         session = self._borrow()
+        session.read_functions()
         session.set_key(key)
         session.run("start")
         belief = session.belief()

@@ -501,7 +501,7 @@ class WithSmoother:
         self._means[which], self._covs[which] = mean[which, None], cov[which, None]
         self._inputs[which], self._restarted[which], self._age[which] = 0.0, False, 0
         self._divergences[which] = divergences[which]
-        self._numbers = self._first_numbers(self._lag)
+        self._numbers, self._passes = self._first_numbers(self._lag), None
 
     def step(self, u, z, idle: np.ndarray | None = None) -> None:
         """Predict with u and update with z; NaN marks a missing channel."""

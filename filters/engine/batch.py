@@ -479,7 +479,12 @@ class Beliefs:
         self._rows[:], self._tables[:] = rows, tables
 
     def start(self, which: np.ndarray, keys: np.ndarray, z: np.ndarray) -> None:
-        """Set the prior in some copies with keys (len(which), 2), and update it with measurements z (N, m)."""
+        """Set the prior in some copies with keys (len(which), 2), and update it with measurements z (N, m).
+
+        If these are all copies, the model's functions are used as they are now.
+        """
+        if len(which) == len(self._rows) and self._filter.kernels() is not self._kernels:
+            type(self).__init__(self, self._filter, len(self._rows))
         self._rows[which, self._places.key_0] = keys[:, 0]
         self._rows[which, self._places.key_1] = keys[:, 1]
         tasks = np.full(len(self._rows), float(IDLE))

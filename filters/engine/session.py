@@ -255,12 +255,19 @@ class Session:
 
     def start(self, key=(0, 0), z=None) -> None:
         """Set the prior with a random key (2,) and update it with a first measurement z (m,), if there is one."""
+        self.read_functions()
         self.set_key(key)
         if z is None:
             self._do(START)
             return
         self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
         self._do(START + UPDATE)
+
+    def read_functions(self) -> None:
+        """Use the model's functions as they are now: values that they have from outside may be others since."""
+        kernels = self._filter.kernels()
+        if kernels is not self._kernels:
+            self._kernels, self._operate = kernels, self._operate_first
 
     def predict(self, u=()) -> None:
         """Predict one step ahead under input u (p,); ValueError for one that is not finite numbers."""

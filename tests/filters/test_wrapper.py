@@ -10,7 +10,16 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import thruster_env  # noqa: F401 - registers the env
-from filters import FILTERS, EstimateState, StateSpaceModel, make_filter, run, thruster_model
+from filters import (
+    FILTERS,
+    EstimateState,
+    EstimateStates,
+    StateSpaceModel,
+    make_filter,
+    run,
+    smooth,
+    thruster_model,
+)
 from tests.filters.checks import refused
 from tests.models import TUNED, affine, state_space
 from tests.oracles import each_equal
@@ -428,6 +437,40 @@ class TestOtherEnvs:
     def test_any_env_may_offer_its_model(self):
         env = EstimateState(Offering(SCRIPT), "kf", model_arguments={"noise": 4.0})
         np.testing.assert_array_equal(env.filter.model.process_noise_cov, 4.0 * np.eye(2))
+
+
+@pytest.mark.parametrize("lag", [None, 2])
+def test_what_a_function_reads_outside_is_read_when_a_run_begins(lag):
+    """By env, copies, sessions and beliefs as by `filters.run`; a model of a run stays as it is."""
+    gain = np.array([1.0])
+
+    def swinging(x, u, c):
+        return x[0] + 0.1 * x[1], x[1] - 0.1 * gain[0] * math.sin(x[0]) + 0.1 * u[0] + 0.1 * u[1]
+
+    numbers = {"q": [0.01, 0.02], "r": [0.1, 0.2], "mean": [1.0, 0.0], "cov": [0.5, 0.4]}
+    model = state_space(swinging, lambda x, c: (x[0], x[1]), inputs=2, **numbers)
+    filter_, actions = make_filter("ekf", model), np.full((5, 2), 0.5)
+    env = EstimateState(Scripted(SCRIPT), filter_, smoothing_lag=lag)
+    copies = gym.vector.SyncVectorEnv([lambda: Scripted(SCRIPT)] * 2)
+    copies = EstimateStates(copies, filter_, smoothing_lag=lag)
+    session = filter_.session()
+    for gain[0] in (1.0, 4.0):
+        expected = run(filter_, inputs=actions, measurements=SCRIPT).means
+        info = played(env, actions)[2][-1]
+        np.testing.assert_allclose(info["estimate"], expected[-1], rtol=1e-9)
+        copies.reset()
+        session.start(z=SCRIPT[0])
+        belief = filter_.update(filter_.init(), SCRIPT[0])[0]
+        for action, z in zip(actions, SCRIPT[1:], strict=True):
+            infos = copies.step(np.tile(action, (2, 1)))[-1]
+            session.step(action, z)
+            belief = filter_.update(filter_.predict(belief, action), z)[0]
+        for mean in (*infos["estimate"], session.mean, belief.mean):
+            np.testing.assert_allclose(mean, expected[-1], rtol=1e-9)
+        if lag:
+            smoothed = smooth(filter_, inputs=actions, measurements=SCRIPT, lag=lag).means[3]
+            np.testing.assert_allclose(info["smoothed"], smoothed, rtol=1e-9)
+            np.testing.assert_allclose(infos["smoothed"][1], smoothed, rtol=1e-9)
 
 
 class TestWrappersInside:
