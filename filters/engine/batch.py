@@ -460,10 +460,8 @@ class Beliefs:
         row, *of_thread = new_memory(self._kernels, self._size)
         self._rows = np.zeros((count, len(row)))
         self._tables = np.zeros((count, self._kernels.kept_rows, of_thread[0].shape[1]))
-        self._u, self._z = (
-            np.zeros((count, filter_.kernel_model.inputs)),
-            np.zeros((count, self._kernels.channels)),
-        )
+        self._u = np.zeros((count, filter_.kernel_model.inputs))
+        self._z = np.zeros((count, self._kernels.channels))
         operation = _operation(self._kernels, self._u.shape[1], is_interpreting())
         beliefs = self._rows, self._tables, self._u, self._z, self._numbers
         parts = -(-count // LANES) if self._kernels.vectors else count
@@ -479,11 +477,8 @@ class Beliefs:
         self._rows[:], self._tables[:] = rows, tables
 
     def start(self, which: np.ndarray, keys: np.ndarray, z: np.ndarray) -> None:
-        """Set the prior in some copies with keys (len(which), 2), and update it with measurements z (N, m).
-
-        If these are all copies, the model's functions are used as they are now.
-        """
-        if len(which) == len(self._rows) and self._filter.kernels() is not self._kernels:
+        """Set the prior in some copies with keys (len(which), 2), and update it with measurements z (N, m)."""
+        if len(which) == len(self._rows) and self._filter.kernels() is not self._kernels:  # other functions
             type(self).__init__(self, self._filter, len(self._rows))
         self._rows[which, self._places.key_0] = keys[:, 0]
         self._rows[which, self._places.key_1] = keys[:, 1]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import t
 
 import tuning
 from filters import bounds, make_filter, run
@@ -87,7 +88,9 @@ def test_intervals_resample_whole_runs_with_their_lengths():
     picks = np.random.default_rng(0).multinomial(5, [0.2] * 5, size=RESAMPLES)
     sums, counts = np.array([one.sum(axis=0) for one in squares]), np.array([len(one) for one in squares])
     ends = np.quantile(np.sqrt(picks @ sums / (picks @ counts)[:, None]), [0.025, 0.975], axis=0)
-    np.testing.assert_allclose([(one.low, one.high) for one in found.rmse], ends.T, rtol=1e-12)
+    rmse, wider = np.sqrt(sums.sum(axis=0) / counts.sum()), t.ppf(0.975, 4) / 1.96 * np.sqrt(5 / 4)
+    expected = rmse * (ends / rmse) ** wider
+    np.testing.assert_allclose([(one.low, one.high) for one in found.rmse], expected.T, rtol=1e-12)
     worse = evaluate(WORSE, data_of(runs), SCALE)
     np.testing.assert_allclose(score_ratio(worse, found).value, worse.score.value / found.score.value, rtol=1e-12)
     assert likelihood_gain(found, worse).value == pytest.approx(found.log_likelihood - worse.log_likelihood)

@@ -55,9 +55,7 @@ class StateSpaceModel:
     which take the same. They take and return tuples of components, Jacobians as tuples of rows (n rows of n, m
     rows of n), and may use the parameters of the model, `constants` c. They are plain Python: loops, arrays,
     dataclasses and a few branches become machine code wherever the model is used (`thruster_env.model.traced`).
-    What cannot runs as Python, and a warning says why. What a function reads besides its arguments, as a variable
-    outside, is read when a run begins, by filters of an affine approximation when they are made: what changes
-    within a run is an input.
+    What cannot runs as Python, and a warning says why. Globals and closures are read when a run begins.
 
     Above 36 states or inputs, or 96 constants in a plain tuple, x, u or c is an array of float64 and not a tuple;
     it is complex if a Jacobian is computed by complex steps (`np.empty_like(x)` makes another such array). It is
