@@ -99,26 +99,26 @@ class Session:
 
     def __getstate__(self) -> tuple:
         """The filter and its memory; machine code and views are rebuilt from these."""
-        return self._filter, self.divergences, (*self._memory, self._values, self._numbers)
+        restarts = self.divergences if self._has_belief else None
+        return self._filter, restarts, (*self._memory, self._values, self._numbers)
 
     def __setstate__(self, state: tuple) -> None:
         filter_, divergences, arrays = state
         type(self).__init__(self, filter_)
         self._go_on(divergences, arrays)
 
-    def _go_on(self, divergences: int, arrays: tuple) -> None:
+    def _go_on(self, divergences: int | None, arrays: tuple) -> None:
         if not np.array_equal(self._numbers, arrays[-1]):
             self._remember_noise()
         for array, stored in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
             array[...] = stored
-        self._has_belief = True
-        self.divergences = divergences
+        self._has_belief, self.divergences = divergences is not None, divergences or 0
 
     def _operate_first(self, task: int) -> int:
         """Operate for the first time, which may compile."""
         if not (task & START or self._has_belief):
             raise ValueError("a session must begin with start(key, z) or load(belief), but got neither")
-        self._operate = operation_on(self._kernels, self._given)
+        self._operate, self._has_belief = operation_on(self._kernels, self._given), True
         return self._operate(task)
 
     def _do(self, task: int) -> None:

@@ -140,7 +140,8 @@ def test_predict_and_update_of_a_session_are_its_step():
         second.update(z)
     np.testing.assert_array_equal(first.mean, second.mean)
     refused("z must be 1 number, each finite or NaN, but got", second.update, [np.inf])
-    refused("a session must begin with start", third.predict, [1.0])
+    for session in (third, copy.deepcopy(third), pickle.loads(pickle.dumps(made("ekf").session(gate=3.0)))):
+        refused("a session must begin with start", session.step, [1.0], [1.0])
 
 
 def test_threads_share_a_filter_and_not_its_memory():

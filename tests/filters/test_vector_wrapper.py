@@ -178,6 +178,15 @@ def test_a_vector_env_s_own_model_gets_actions_as_the_env_does():
     refused(rule, EstimateStates, gym.wrappers.vector.RescaleAction(inside, np.float32(-1.0), np.float32(1.0)))
 
 
+def test_copies_begin_with_a_reset_of_all():
+    env = SyncVectorEnv([Oscillator] * COPIES, autoreset_mode=AutoresetMode.DISABLED)
+    env = EstimateStates(env, model=oscillator())
+    actions = np.zeros((COPIES, 1), np.float32)
+    refused(r"must begin with reset\(\), but step came first", env.step, actions)
+    env.reset(seed=1)
+    env.step(actions)
+
+
 def test_a_third_party_vector_env_takes_a_filter_too():
     env = gym.make_vec("Pendulum-v1", num_envs=2, vectorization_mode="sync")
     wrapped = EstimateStates(env, "ekf", model="tests.filters.test_vector_wrapper:still")
