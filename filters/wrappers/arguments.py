@@ -13,6 +13,7 @@ import inspect
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import takewhile
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -320,6 +321,7 @@ def check_spaces(
 CHANGING = gym.ActionWrapper, gym.vector.VectorActionWrapper
 CLIPPING = gym.wrappers.ClipAction, gym.wrappers.vector.ClipAction
 REPEATING = "RepeatAction", "MaxAndSkipObservation"
+OBSERVING = gym.ObservationWrapper, gym.vector.VectorObservationWrapper, gym.wrappers.FrameStackObservation
 NORMALISING = gym.wrappers.NormalizeObservation, gym.wrappers.vector.NormalizeObservation
 
 
@@ -329,6 +331,21 @@ def layers(env) -> list:
     while isinstance(inside[-1], gym.Wrapper | gym.vector.VectorWrapper):
         inside.append(inside[-1].env)
     return inside
+
+
+def outside(env, name: str) -> list:
+    """The layers of an env around that which offers an attribute."""
+    return list(takewhile(lambda layer: not (hasattr(type(layer), name) or name in vars(layer)), layers(env)))
+
+
+def appended_entries(env) -> int:
+    """How many entries an env's observation has after the measurement; ValueError if they may be other ones."""
+    count = offered(env, APPENDED) or 0
+    for layer in outside(env, APPENDED) if count else ():
+        if isinstance(layer, OBSERVING):
+            rule = f"the last {count} entries of an observation must be the env's own"
+            raise ValueError(f"{rule}, but got {layer}: put {type(layer).__name__} around the filter")
+    return count
 
 
 def clipping_space(env) -> gym.Space:
@@ -346,9 +363,7 @@ def clipping_space(env) -> gym.Space:
 
 def refuse_other_actions(env) -> None:
     """Raise ValueError if a wrapper of an env that offers a model changes or repeats actions; it may clip them."""
-    for layer in layers(env):
-        if hasattr(type(layer), "state_space_model") or "state_space_model" in vars(layer):
-            return
+    for layer in outside(env, "state_space_model"):
         name, changes = type(layer).__name__, isinstance(layer, CHANGING) and not isinstance(layer, CLIPPING)
         if changes or name in REPEATING:
             rule = "a filter with the env's own model must get the env's own actions"

@@ -23,11 +23,11 @@ from filters.named import NamedMaker, model_named
 from filters.smoothers import WithSmoother
 from filters.starts import FirstRestart, FirstRestarts
 from filters.wrappers.arguments import (
-    APPENDED,
     OBSERVATIONS,
     EstimatorInSpec,
     ModelInSpec,
     WithMeasuredInputs,
+    appended_entries,
     check_spaces,
     clipping_space,
     filter_for,
@@ -134,7 +134,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         actions = check_spaces(clipping_space(env), env.observation_space, self.filter.model, len(split.inputs))
         n, m = self.filter.model.n, split.channels
         # What an env appends to its measurement, validity flags and the reference, stays in the observation.
-        self._appended = env.get_wrapper_attr(APPENDED) if env.has_wrapper_attr(APPENDED) else 0
+        self._appended = appended_entries(env)
         length = {"estimate": n, "measurement+estimate": m + n, "belief": n + self.filter.model.t}[observation]
         length += self._appended
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
@@ -287,7 +287,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         inputs = len(split.inputs)
         actions = check_spaces(clipping_space(env), env.single_observation_space, self.filter.model, inputs)
         self._n, self._m = self.filter.model.n, split.channels
-        self._appended = getattr(env.unwrapped, APPENDED, 0)
+        self._appended = appended_entries(env)
         length = {
             "estimate": self._n,
             "measurement+estimate": self._m + self._n,

@@ -178,6 +178,11 @@ def test_a_vector_env_s_own_model_gets_actions_as_the_env_does():
     refused(rule, EstimateStates, gym.wrappers.vector.RescaleAction(inside, np.float32(-1.0), np.float32(1.0)))
 
 
+def test_a_reference_behind_the_measurements_of_copies_stays_the_env_s():
+    env = gym.wrappers.vector.NormalizeObservation(gym.make_vec("BowThrusterTracking-v0", num_envs=2))
+    refused("the last 1 entries of an observation must be the env's own", EstimateStates, env)
+
+
 def test_copies_begin_with_a_reset_of_all():
     env = SyncVectorEnv([Oscillator] * COPIES, autoreset_mode=AutoresetMode.DISABLED)
     env = EstimateStates(env, model=oscillator())

@@ -509,6 +509,15 @@ class TestWrappersInside:
         rule = r"must begin episodes by reset\(\) alone, but got <Autoreset"
         refused(rule, EstimateState, gym.wrappers.Autoreset(bow_thruster()))
 
+    @pytest.mark.parametrize("kind", ["TimeAwareObservation", "NormalizeObservation", "FrameStackObservation"])
+    def test_a_reference_behind_the_measurement_stays_the_env_s(self, kind):
+        arguments = (2,) if kind == "FrameStackObservation" else ()
+        wrapper = getattr(gym.wrappers, kind)
+        rule = f"the last 1 entries of an observation must be the env's own, but got <{kind}"
+        refused(rule, EstimateState, wrapper(gym.make("BowThrusterTracking-v0"), *arguments))
+        wrapper(EstimateState(gym.make("BowThrusterTracking-v0")), *arguments).reset(seed=0)
+        EstimateState(wrapper(bow_thruster(), *arguments))  # which has nothing behind it
+
     def test_normalised_observations_are_no_measurements(self):
         env = gym.wrappers.NormalizeObservation(Scripted(SCRIPT, in_info=False))
         refused("must be in the model's units, but got", EstimateState(env, model=two_channels()).reset)
