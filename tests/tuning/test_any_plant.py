@@ -1,17 +1,24 @@
-"""Evaluation, tables, reports and figures of any number of states and channels, with and without truth."""
+"""Evaluation, tables, reports and figures of any number of states and channels, of odd names, without truth."""
 
 import io
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
+import tuning
+from filters import affine_model
 from filters.consistency.nees import normalized_squares
 from filters.consistency.report import NO_TRUTH, sentences
 from filters.engine.batch import run
+from tests.filters.checks import refused
 from tests.linear_problem import LinearProblem
 from thruster_env.core.files import save_figure
+from thruster_env.core.text_tables import verbatim
+from thruster_env.model.quantities import Quantity
 from tuning.api.held_out import CovarianceCheck, HeldOut
+from tuning.api.progress import working
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
 from tuning.evaluation.held_out import Comparison, summary
@@ -21,12 +28,14 @@ from tuning.plants.thruster import find_scenario
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import score_label
 from tuning.reporting import tables as leaderboard
-from tuning.reporting.choice_words import gains
+from tuning.reporting.choice_words import gains, number_rows
+from tuning.reporting.page import Table, markdown_page
 from tuning.reporting.search_figures import draw_consistency
 from tuning.reporting.sections import Subject, advice, held_out_section
 from tuning.reporting.tables import ABOVE, choice_table, comparison_table
+from tuning.search.parameters import index_pairs
 from tuning.search.plan import Plan, check_objectives, find_objective, nis_ratio
-from tuning.search.space import oracle_choice, untuned_choice
+from tuning.search.space import Choice, oracle_choice, untuned_choice
 
 SEEDS = range(8)
 
@@ -80,8 +89,7 @@ def test_states_with_an_infinite_scale_do_not_count():
     assert found.scored == [0, 2]
     filter_, data = oracle_choice("kf", problem).filter(problem), problem.data(SEEDS)
     for scale, rule in (((0.5, 0.5), "one number per state, 3"), ((np.inf,) * 3, "finite in some state")):
-        with pytest.raises(ValueError, match=f"scale must be {rule}"):
-            evaluate(filter_, data, scale)
+        refused(f"scale must be {rule}", evaluate, filter_, data, scale)
 
 
 def test_without_truth_the_innovations_stay(comparisons):
@@ -186,10 +194,7 @@ def test_objectives_say_what_they_need(comparisons):
             Plan("kf", (blind,), objectives=(objective,)).checked()
     with pytest.raises(ValueError, match="derived output of linear-3 must be one of output:E, but got 'thrust'"):
         Plan("kf", (problem,), objectives=("thrust",)).checked()
-    with pytest.raises(
-        ValueError, match="objective must be one of score, mse, .*output:SYMBOL, but got 'output:'"
-    ):
-        find_objective("output:")
+    refused("objective must be one of score, mse, .*output:SYMBOL, but got 'output:'", find_objective, "output:")
 
 
 def test_a_report_without_truth_says_so_and_has_no_errors(comparisons):
@@ -218,3 +223,133 @@ def test_numbers_of_a_filter_have_the_units_of_their_states(comparisons):
         "R22 [(m/s)^2]",
     ]
     assert "R22 [(m/s)²]" in table.html()
+
+
+ODD = [
+    r"$\frac$",
+    "[/]",
+    "[bold]x[/bold]",
+    "a|b",
+    "<b>x</b>",
+    "[x](http://y)",
+    r"$\alpha$ and $",
+    "&lt;",
+    "n" * 400,
+]
+
+
+def model(name, unit="N"):
+    return affine_model(
+        A=[[0.9]],
+        B=[[0.5]],
+        C=[[1.0]],
+        Q=[0.01],
+        R=[0.04],
+        P0=[1.0],
+        states=[(name, "x", unit)],
+        input_quantities=[(name, "u", unit)],
+        measurements=[(f"{name} read", "z", unit)],
+    )
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_labels_of_figures_show_a_name_as_it_is(name):
+    figure = Figure()
+    axis = figure.subplots()
+    axis.set_title(verbatim(name, most=90))
+    axis.set_ylabel(Quantity(name, "omega_m", name[:20]).plot_label)
+    figure.savefig(io.BytesIO(), format="svg")
+    assert verbatim(name).replace(r"\$", "$") == name and len(verbatim(name, most=90)) < 100
+    assert verbatim("log L of the\ninnovations\a") == "log L of the\ninnovations?"
+
+
+@pytest.mark.parametrize("name", [r"$\frac$", "[/]", "n" * 400])
+def test_a_log_of_odd_names_is_drawn(name):
+    rng = np.random.default_rng(0)
+    table = {"t": 0.1 * np.arange(200), "u": rng.normal(size=200), "z": rng.normal(size=200), "x": np.zeros(200)}
+    found = tuning.estimate((model(name, unit=r"$\frac"), table))
+    for figure in (found.plot_states(), found.plot_innovations()):
+        figure.savefig(io.BytesIO(), format="png")
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_names_are_no_markup_where_work_is_shown(name):
+    stream = io.StringIO()
+    with working(name, Console(file=stream, force_terminal=True, width=500)):
+        pass
+    assert name.split()[0] in stream.getvalue()
+
+
+def test_names_are_text_in_markdown_and_html():
+    for name in ODD:
+        page = markdown_page(name, [name, Table(name, ["", name], [[name, name]])])
+        for raw in ("[x](http", "<b>", "| a|b", "$"):
+            at = page.find(raw)
+            assert at < 0 or page[at - 1] == "\\" or raw == "| a|b"
+        assert "a|b" not in page and "&lt;" not in page and "\n$" not in page
+        assert "<b>" not in Table(name, ["", name], [[name, name]]).html()
+
+
+def test_variances_that_are_the_same_share_a_row_and_correlations_stand_where_q_does():
+    model = affine_model(
+        A=0.5 * np.eye(5), B=np.zeros((5, 1)), C=np.eye(5)[:2], Q=np.ones(5), R=[1.0, 1.0], P0=np.ones(5)
+    )
+    problem = ModelProblem(model, inputs=[0.0] * 60, scale=np.ones(5))
+    equal = Choice("ekf", {"process_noise_cov": (2.0,) * 5, "measurement_noise_cov": (1.0, 3.0)}, {})
+    silent = Choice("ekf", {}, {})
+    rows = number_rows([equal, silent], "ekf", problem, str)
+    assert rows == [["Q11 to Q55", "2.0", "None"], ["R11", "1.0", "None"], ["R22", "3.0", "None"]]
+    own = equal._replace(model={"process_noise_cov": tuple(map(tuple, np.diag([1.0, 2, 2, 2, 2]).tolist()))})
+    assert number_rows([own], "ekf", problem, str)[:2] == [["Q11", "1.0"], ["Q22 to Q55", "2.0"]]
+    tied = np.eye(5)
+    tied[0, 1] = tied[1, 0] = 0.5
+    tied = Choice("ekf", {"process_noise_cov": tuple(map(tuple, tied.tolist()))}, {})
+    found = {row[0]: row[1:] for row in number_rows([tied, equal, silent], "ekf", problem, str)}
+    assert found["largest of 10 Q correlations"] == ["0.5", "0.0", "None"]
+
+
+@pytest.mark.parametrize(("m", "labels"), [(3, ["R correlation 12", "R correlation 13", "R correlation 23"]),
+                                           (4, ["largest of 6 R correlations"])])  # fmt: skip
+def test_correlations_of_r_of_four_channels_are_one_row_like_those_of_q(m, labels):
+    model = affine_model(
+        A=0.5 * np.eye(m),
+        B=np.zeros((m, 1)),
+        C=np.eye(m),
+        Q=np.ones(m),
+        R=np.ones(m),
+        x0=np.zeros(m),
+        P0=np.ones(m),
+    )
+    problem = ModelProblem(model, inputs=[0.0] * 60, scale=np.ones(m))
+    r = np.eye(m)
+    r[0, 1] = r[1, 0] = 0.5
+    r[0, 2] = r[2, 0] = -0.6
+    choice = Choice("ekf", {"measurement_noise_cov": tuple(map(tuple, r.tolist()))}, {})
+    found = {row[0]: row[1:] for row in number_rows([choice], "ekf", problem, lambda v: f"{v:.2f}")}
+    assert [label for label in found if "correlation" in label] == labels
+    if m == 4:
+        assert found[labels[0]] == ["-0.60"]
+
+
+def test_correlations_of_many_states_are_one_row_and_two_digits_stand_apart():
+    n = 11
+    model = affine_model(
+        A=0.5 * np.eye(n),
+        B=np.zeros((n, 1)),
+        C=np.eye(n)[:1],
+        Q=np.ones(n),
+        R=[1.0],
+        x0=np.zeros(n),
+        P0=np.ones(n),
+    )
+    problem = ModelProblem(model, inputs=[0.0] * 60, scale=np.ones(n))
+    assert repr(problem) == f"ModelProblem({problem.name!r})"
+    q = np.diag(1.0 + np.arange(n))
+    q[0, 1] = q[1, 0] = -0.8 * np.sqrt(2.0)
+    rows = number_rows(
+        [Choice("ekf", {"process_noise_cov": tuple(map(tuple, q.tolist()))}, {})], "ekf", problem, str
+    )
+    assert [row[0] for row in rows if row[0].startswith("Q")][-2:] == ["Q10,10", "Q11,11"]
+    (largest,) = [row for row in rows if "correlation" in row[0]]
+    assert largest[0] == "largest of 55 Q correlations" and float(largest[1]) == pytest.approx(-0.8)
+    assert index_pairs("Q11 and Q1010, R1111") == "Q11 and Q10,10, R11,11"

@@ -6,17 +6,25 @@ import json
 import pickle
 import signal
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import matplotlib.figure
 import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
 import tuning
 from filters import EstimateState
 from filters.c.project import c_filter
 from filters.monitoring import Monitor
+from tests.filters.checks import refused
+from thruster_env.core.text_tables import Table
+from tuning.api.markers import INPUT, RUNS, Option
+from tuning.api.result import Result, plain_data
+from tuning.cli.verbs import command_of
 from tuning.problems.find import find_problem
 from tuning.reporting.tuning_report import next_steps, report
 
@@ -66,17 +74,15 @@ def test_the_tuned_filter_is_ready_to_use(study, tmp_path):
         EstimateState(wrapped.env, tuned={"filter": "ekf"})
     with pytest.raises(ValueError, match="tuned must come without filter: it has its own, but got 'ukf'"):
         EstimateState(wrapped.env, "ukf", tuned=study)
-    with pytest.raises(ValueError, match="filter must be a name, .* a study is tuned=study; but got Study"):
-        EstimateState(wrapped.env, study)
+    refused("filter must be a name, .* a study is tuned=study; but got Study", EstimateState, wrapped.env, study)
 
 
 def test_what_is_printed_are_the_tables_of_the_command_line(study):
     found = study.held_out
     lines = str(found).splitlines()
     printed = report(study)
-    assert printed[0].startswith(lines[0]) and lines[0].startswith(
-        "The study returns trial 4 rescaled for its log score"
-    )
+    assert printed[0].startswith(lines[0])
+    assert lines[0].startswith("The study returns trial 4 rescaled for its log score")
     assert any(line.startswith("RMSE on held-out seeds") for line in lines) and "\x1b" not in str(found)
     assert any(line.startswith(" scaled ") or line.startswith(" scaled default") for line in lines)
     assert f"{found.evaluation.rmse[0].value:.3f}" in str(found) and "Score of the tuned filter" in str(found)
@@ -115,9 +121,8 @@ def test_a_study_in_memory_is_that_of_a_storage_and_goes_on_there(tmp_path, caps
 def test_tables_have_what_is_in_the_values(study):
     trials, errors = study.to_frame(), study.held_out.to_frame()
     assert len(trials) == len(study.trials) and trials.index.tolist() == list(range(1, TRIALS + 1))
-    assert (
-        trials.loc[1, "R"] == study.trials[0].params["R"] and trials.loc[1, "score"] == study.trials[0].values[0]
-    )
+    assert trials.loc[1, "R"] == study.trials[0].params["R"]
+    assert trials.loc[1, "score"] == study.trials[0].values[0]
     assert errors.index.tolist() == list(study.held_out.evaluations)
     tuned = study.held_out.evaluation
     assert errors.loc["tuned", "score"] == tuned.score.value and errors.loc["tuned", "NEES"] == tuned.nees.value
@@ -126,8 +131,7 @@ def test_tables_have_what_is_in_the_values(study):
 
 def test_without_pandas_one_line_says_what_to_install(study, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ValueError, match=r"to_frame must have pandas, .* pip install pandas"):
-        study.to_frame()
+    refused(r"to_frame must have pandas, .* pip install pandas", study.to_frame)
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -195,8 +199,7 @@ WRONG = [
 @pytest.mark.parametrize("call, said", WRONG)
 def test_errors_state_the_rule_and_the_value(call, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=said):
-        call()
+    refused(said, call)
 
 
 def test_a_scenario_that_was_changed_has_another_name_in_files(tmp_path):
@@ -205,3 +208,68 @@ def test_a_scenario_that_was_changed_has_another_name_in_files(tmp_path):
     assert found.problem.name == "nominal (changed)" and found.problem.steps == 120
     file = found.save(tmp_path / "t.json")
     assert tuning.evaluate(file, seeds=2, progress=False).problem.steps == 120
+
+
+@dataclass(frozen=True)
+class Tank(Result):
+    """Levels of a tank."""
+
+    levels: tuple[float, ...]
+
+    def tables(self):
+        rows = [[f"{number}", f"{level:.2f} ±0.01"] for number, level in enumerate(self.levels)]
+        return [Table("Levels", ["run", "level\n[m^2]"], rows, "The tank | is full."), "Nothing leaks."]
+
+    def as_dict(self):
+        return {"levels": self.levels}
+
+
+def tank(level: Annotated[float, Option(INPUT)] = 1.0, repeats: Annotated[int, Option(RUNS, least=1)] = 2) -> Tank:
+    """Measure a tank several times.
+
+    Args:
+        level: of the water [m].
+        repeats: number of measurements.
+    """
+    return Tank((level,) * repeats)
+
+
+@pytest.fixture
+def command(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    app = typer.Typer()
+    app.command()(command_of(tank))
+    return lambda *arguments: CliRunner().invoke(app, arguments)
+
+
+def test_a_result_and_the_json_of_its_command_are_the_same_data(tmp_path):
+    file, written = tmp_path / "acc.csv", tmp_path / "fit.json"
+    file.write_text("\n".join(["acc", *(f"{(7 * k) % 11}" for k in range(60))]))
+    app = typer.Typer()
+    app.command()(command_of(tuning.fit))
+    CliRunner().invoke(app, [str(file), "--json", str(written)])
+    stored = json.loads(written.read_text())
+    del stored["text_tables"]
+    assert json.loads(json.dumps(tuning.fit(file).as_dict(), allow_nan=False)) == stored
+    mixed = {1: (np.nan, np.inf), "x": np.array([[0.5, np.nan]])}
+    assert plain_data(mixed) == {"1": [None, None], "x": [[0.5, None]]}
+
+
+def test_a_table_is_shown_by_terminal_notebook_page_and_markdown(tmp_path):
+    result = tank(0.5)
+    page = result.report(tmp_path / "tank.html")
+    forms = str(result), result._repr_html_(), page.read_text(), page.with_suffix(".md").read_text()
+    for text in forms:
+        assert all(word in text for word in ("Levels", "run", "0.50", "±0.01", "is full.", "Nothing leaks."))
+    assert forms[3] == result.to_markdown() and "The tank \\| is full." in forms[3] and "m²" in forms[2]
+    refused(r"a page \(--report\) must end in .html, but got 'tank.pdf'", result.report, "tank.pdf")
+
+
+def test_an_argument_is_an_option_and_json_has_the_tables(command):
+    said = command("--help").stdout
+    assert "--repeats" in said and "Number of measurements." in said and "x>=1" in said and "--report" not in said
+    data = json.loads(command("--repeats", "3", "--json", "-").stdout)
+    assert data["levels"] == [1.0] * 3
+    (table,) = data["text_tables"]
+    assert table["title"] == "Levels" and table["rows"][2] == ["2", "1.00 ±0.01"]
+    assert "Nothing leaks." in command().stdout

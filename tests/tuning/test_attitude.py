@@ -1,4 +1,4 @@
-"""The model `attitude` on recordings: its numbers without the reference, and its errors against that."""
+"""The model `attitude` on recordings, behind gaps, and the Allan deviation of a sensor at rest."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,15 @@ from scipy.spatial.transform import Rotation as Turned
 
 import filters
 import tuning
-from filters.inertial import attitude
+from filters.inertial import attitude, attitude_imu
+from filters.logs.estimate import estimate, lost_in_gaps
+from filters.logs.findings import findings, verdict
 from filters.starts import begun_at
 from tests.data.broad import RATE, broad
+from thruster_env.logs.log import piece_of
+from thruster_env.logs.read import read_log
+from tuning.cli.main import main
+from tuning.logs.allan import allan_deviation, flicker_noise, noise_of
 
 
 def table_of(trial):
@@ -67,3 +73,99 @@ def test_a_study_on_a_recording(undrawn, tmp_path):
     assert study.result.choice.model["dip"] == pytest.approx(69.7, abs=0.5)
     tuning.report(str(tmp_path / "tuned.json"), out=tmp_path / "report")
     assert "In each step q_3 moves by" in (tmp_path / "report" / "tuned.html").read_text(encoding="utf-8")
+
+
+DT, ROWS, GAP = 0.02, 600, slice(300, 400)  # a gap of 2 s
+MODEL = attitude(DT, accelerometer=0.05, magnetometer=0.5, acceleration=0.05, gyroscope=1e-3)
+
+
+def turning_table(rate):
+    """A sensor that turns about up and east, with its reference, without the rows of the gap."""
+    draw, t = np.random.default_rng(4).normal, DT * np.arange(ROWS)
+    turn = Turned.from_rotvec(np.column_stack([0.05 * np.sin(t), 0 * t, rate * np.sin(0.8 * t)]))
+    gyro = np.zeros((ROWS, 3))
+    gyro[1:] = (turn[:-1].inv() * turn[1:]).as_rotvec() / DT
+    dip = np.radians(60.0)
+    acc = turn.inv().apply([0.0, 0.0, 9.81]) + 0.05 * draw(size=(ROWS, 3))
+    mag = turn.inv().apply([0.0, 50 * np.cos(dip), -50 * np.sin(dip)]) + 0.5 * draw(size=(ROWS, 3))
+    q = turn.as_quat()
+    columns = {"time": t}
+    for name, values in (("gyr", gyro), ("acc", acc), ("mag", mag)):
+        columns |= {f"{name}_{axis}": values[:, i] for i, axis in enumerate("xyz")}
+    columns |= {f"q_{axis}": q[:, i] for i, axis in enumerate("xyzw")}
+    return {name: np.delete(values, np.arange(ROWS)[GAP]) for name, values in columns.items()}
+
+
+@pytest.mark.parametrize("grid", [True, False])
+def test_the_filter_begins_anew_after_a_gap(grid):
+    """After it estimates are those of the rest of the log alone, with small errors."""
+    log = read_log(turning_table(2.0), MODEL, grid=grid)
+    (row,) = lost_in_gaps(MODEL, log)
+    assert row == (GAP.stop if grid else GAP.start)
+    whole = estimate(log, "ekf", MODEL)
+    rest = estimate(piece_of(log, row, log.steps + 1 - row), "ekf", MODEL)
+    np.testing.assert_array_equal(whole.means[row:], rest.means)
+    np.testing.assert_array_equal(whole.covs[row:], rest.covs)
+    found = findings(whole)
+    (angle,) = (reference for reference in found.references if reference.quantity.symbol == "q_angle")
+    assert angle.rmse < 1.5
+    assert "The sensor turns in gaps: after the gap the filter begins anew" in " ".join(verdict(whole, found))
+
+
+def test_a_sensor_that_barely_turns_or_has_no_magnetometer_goes_on():
+    assert lost_in_gaps(MODEL, read_log(turning_table(0.0), MODEL)) == []
+    blind = attitude_imu(DT)
+    assert lost_in_gaps(blind, read_log(turning_table(2.0), blind)) == []
+
+
+SAMPLE, COUNT = 0.02, 60_000
+
+
+def test_closed_forms_of_white_noise_walks_and_flicker():
+    """N/sqrt(tau), K sqrt(tau/3) and 0.664 B; a drift at a constant rate R is R tau/sqrt(2)."""
+    draws = np.random.default_rng(5).standard_normal((2, COUNT))
+    for values, expected in (
+        (draws[0] / np.sqrt(SAMPLE), lambda tau: 1.0 / np.sqrt(tau)),
+        (np.sqrt(SAMPLE) * np.cumsum(draws[1]), lambda tau: np.sqrt((tau**2 + SAMPLE**2 / 2.0) / (3.0 * tau))),
+        (flicker_noise(draws[0]), lambda tau: np.full_like(tau, 0.664)),
+        (SAMPLE * np.arange(COUNT), lambda tau: tau / np.sqrt(2.0)),
+    ):
+        taus, deviations = allan_deviation(values, SAMPLE)
+        some_samples = (taus > 4.0 * SAMPLE) & (taus < 10.0)
+        np.testing.assert_allclose(deviations[some_samples], expected(taus[some_samples]), rtol=0.12)
+
+
+def test_the_noise_of_a_record_lies_in_its_intervals():
+    rng = np.random.default_rng(3)
+    true = {"N": 2e-3, "B": 0.0, "K": 4e-4}
+    values = true["N"] / np.sqrt(SAMPLE) * rng.standard_normal(COUNT)
+    values += true["K"] * np.sqrt(SAMPLE) * np.cumsum(rng.standard_normal(COUNT))
+    *_, noise = noise_of(values, SAMPLE, rng)
+    assert noise["N"].value == pytest.approx(2e-3, rel=0.02)
+    for name, value in true.items():
+        assert noise[name].low <= value <= noise[name].high
+    assert noise["K"].low > 0.0
+
+
+def test_a_log_at_rest_from_the_command_line(tmp_path, monkeypatch, capsys):
+    """Start values of the model; a short log and one in motion are refused in a line."""
+    rng, path = np.random.default_rng(2), tmp_path / "imu.csv"
+    time = np.arange(6_200) / 50.0
+    columns = {"time": time} | {f"gyr_{axis}": 2e-4 * np.sqrt(50.0) * rng.standard_normal(6_200) for axis in "xyz"}
+
+    def written(**changes):
+        table = columns | changes
+        np.savetxt(path, np.column_stack(list(table.values())), delimiter=",", header=",".join(table), comments="")
+        return str(path)
+
+    def thruster(*arguments):
+        monkeypatch.setattr("sys.argv", ["thruster", "log", *arguments, "--allan"])
+        with pytest.raises(SystemExit):
+            main()
+        return " ".join("".join(capsys.readouterr()).split())
+
+    result = thruster(written(), "--plot", str(tmp_path / "allan.png"))
+    assert "--model attitude:gyroscope=0.0002,bias_walk=" in result
+    assert (tmp_path / "allan.png").stat().st_size > 10_000
+    refused = thruster(written(gyr_z=0.3 * np.sin(0.05 * time)))
+    assert "must be at rest, but means of gyr_z over 1 s differ by 0.6 rad/s" in refused

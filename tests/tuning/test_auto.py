@@ -13,6 +13,7 @@ from optuna.trial import TrialState
 
 import tuning
 from filters.registry import FILTERS
+from tests.filters.checks import refused
 from tuning.api.tune import warn_of_few_trials
 from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.held_out import evaluate_held_out
@@ -281,8 +282,7 @@ def test_without_a_budget_auto_has_a_default_one_and_few_trials_are_warned_of(mo
     ],
 )
 def test_a_plan_that_cannot_work_is_refused(change, rule):
-    with pytest.raises(ValueError, match=rule):
-        open_study("s", PLAN._replace(**change), optuna.storages.InMemoryStorage())
+    refused(rule, open_study, "s", PLAN._replace(**change), optuna.storages.InMemoryStorage())
 
 
 def test_budget_and_kinds_belong_to_the_identity(monkeypatch):
@@ -291,8 +291,7 @@ def test_budget_and_kinds_belong_to_the_identity(monkeypatch):
     with pytest.raises(ValueError, match="must be for {'budget': 2.0}, but it was made for {'budget': 1.0}"):
         open_study("s", PLAN._replace(budget=2.0), storage)
     monkeypatch.setattr("tuning.search.plan.AUTO_FILTER_TYPES", FEW)
-    with pytest.raises(ValueError, match="must be for {'kinds': .*'pf'"):
-        open_study("s", PLAN, storage)
+    refused("must be for {'kinds': .*'pf'", open_study, "s", PLAN, storage)
 
 
 def test_cost_is_of_one_core_and_grows_with_the_ensemble():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests import pendulum_problem
+from tests.filters.checks import refused
 from tests.linear_problem import LinearProblem
 from tests.small_problems import pair
 from tests.tuned_files import rewrite, write_untuned
@@ -112,21 +113,18 @@ def test_rounding_is_no_other_number():
     array[::7] = np.nan
     assert digest_of(array) == digest_of(array * (1.0 + 1e-13)) != digest_of(array * (1.0 + 1e-5))
     assert digest_of(0.1 + 0.2, -0.0) == digest_of(0.3, -0.0) != digest_of(0.3001, -0.0)
-    assert digest_of(np.zeros((2, 3))) != digest_of(np.zeros((3, 2))) and digest_of({"a": 1}) != digest_of(
-        {"a": 2}
-    )
+    assert digest_of(np.zeros((2, 3))) != digest_of(np.zeros((3, 2)))
+    assert digest_of({"a": 1}) != digest_of({"a": 2})
 
 
 def test_a_digest_of_an_older_version_is_no_other_problem_and_is_said(tmp_path):
     old, new = "0123456789ab", one_number().digest
-    assert (
-        is_older([old], [new]) and is_older({"a": old}, {"a": new}) and not is_older(old, LinearProblem().digest)
-    )
+    assert is_older([old], [new]) and is_older({"a": old}, {"a": new})
+    assert not is_older(old, LinearProblem().digest)
     storage, plan = open_storage(str(tmp_path / "studies.journal")), Plan("ekf", (one_number(),))
     study = open_study("mine", plan, storage)
     study.set_user_attr("identity", {**plan.identity, "scenario_digests": [old]})
-    with pytest.raises(ValueError, match="but 'mine' has those of an older one, .*: give it another name"):
-        open_study("mine", plan, storage)
+    refused("but 'mine' has those of an older one, .*: give it another name", open_study, "mine", plan, storage)
     problem = one_number(name="of:mine")
     path = write_untuned(tmp_path / "tuned.json", problem)
 

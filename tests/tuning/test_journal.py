@@ -15,6 +15,7 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
+from tests.filters.checks import refused
 from tuning.plants.thruster import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.storage import JournalFile, open_storage
@@ -104,8 +105,7 @@ def test_a_trial_that_another_process_has_ended_is_an_error_once(path):
         optuna.load_study(study_name="s", storage=open_storage(path)).tell(0, state=TrialState.FAIL)
         trial.should_prune()
 
-    with pytest.raises(ValueError, match="Cannot tell a FAIL trial"):
-        study.optimize(ended_elsewhere, n_trials=1)
+    refused("Cannot tell a FAIL trial", study.optimize, ended_elsewhere, n_trials=1)
     assert [trial.state for trial in study.trials] == [TrialState.FAIL]
 
 
@@ -136,8 +136,7 @@ def test_a_journal_of_nonsense_is_refused_in_one_line(path, distribution):
         if "distribution" in line:
             line["distribution"] = distribution
     Path(path).write_text("".join(json.dumps(line) + "\n" for line in lines))
-    with pytest.raises(ValueError, match="storage must be a journal file that can be written, but got"):
-        open_storage(path)
+    refused("storage must be a journal file that can be written, but got", open_storage, path)
 
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)

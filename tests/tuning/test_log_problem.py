@@ -1,14 +1,18 @@
-"""Recorded runs as a problem: blocks, what is held out, what counts, and truth where logs have it."""
+"""Recorded runs as a problem: blocks, what is held out, what counts, truth where logs have it, one sample time."""
 
 import json
 import pickle
+from typing import NamedTuple
 
 import numpy as np
-import optuna
 import pytest
 
+import filters
+import tuning
 from filters import run
 from filters.sensitivity import likelihood
+from tests.filters.checks import refused
+from thruster_env.env.model_env import ReplayEnv
 from thruster_env.logs.log import Log
 from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
@@ -20,7 +24,6 @@ from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.experiments.benchmark import run_in_memory
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import identify
-from tuning.plants.thruster import find_scenario
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem
 from tuning.problems.log_parts import LEAD, parts_of
@@ -93,8 +96,7 @@ def test_every_third_run_is_held_out_or_those_that_are_named():
     ],
 )
 def test_logs_that_cannot_be_a_problem_are_refused(make, said):
-    with pytest.raises(ValueError, match=said):
-        make()
+    refused(said, make)
 
 
 def _rows():
@@ -147,9 +149,8 @@ def test_the_noise_of_a_simulation_is_found_again_without_its_truth():
     said = scaling_sentence(comparison)
     assert "The scaled default is the given Q and R with this Q times" in said
     assert "give the model state_low and state_high" in said  # for the model has no ranges
-    assert "against the given filter" in tuning_effect(comparison) and "rule of thumb" not in tuning_effect(
-        comparison
-    )
+    assert "against the given filter" in tuning_effect(comparison)
+    assert "rule of thumb" not in tuning_effect(comparison)
     numbers, errors, *_ = HeldOut(result.choice, problem, comparison).tables()
     assert [row[0] for row in errors.rows][:2] == ["given", "scaled default"] and "given" in numbers.columns
 
@@ -209,60 +210,53 @@ def test_a_study_that_never_saw_the_truth_comes_close_to_one_that_did():
     assert score_ratio(by_blind, by_seen).value < 1.02 and seen != blind
 
 
-PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
+DT = 0.05
+LOG = {"t": DT * np.arange(400), "z": np.cumsum(np.random.default_rng(0).normal(size=400))}
 
 
-def storage_with_one_trial():
-    storage = optuna.storages.InMemoryStorage()
-    study = open_study("s", PLAN, storage)
-    study.tell(propose(study)[0], 1.0)
-    return storage
+class Constants(NamedTuple):
+    dt: float
 
 
-def propose(study):
-    trial = study.ask(PLAN.space())
-    return trial, tuple(trial.params.values())
+def move(x, u, c):
+    return x[0] + c.dt * x[1], x[1]
 
 
-@pytest.mark.parametrize("sampler", ["tpe", "random", "nsga-ii"])
-def test_two_that_join_at_the_same_number_of_trials_never_propose_alike(sampler):
-    plan, storage = PLAN._replace(sampler=sampler), optuna.storages.InMemoryStorage()
-    both = [open_study("s", plan, storage)]
-    both[0].tell(propose(both[0])[0], 1.0)  # the untuned filter, which is queued
-    both = [open_study("s", plan, storage) for _ in range(2)]
-    proposed = []
-    for study in [*both, *both[::-1], *both]:
-        trial, point = propose(study)
-        proposed.append(point)
-        study.tell(trial, 1.0)
-    assert len(set(proposed)) == len(proposed)
+def look(x, c):
+    return (x[0],)
 
 
-def test_so_do_two_that_begin_a_study_at_once(monkeypatch):
-    storage = optuna.storages.InMemoryStorage()
-    get_trials = optuna.Study.get_trials
-    with monkeypatch.context() as patch:  # neither sees what the other has queued
-        patch.setattr(optuna.Study, "get_trials", lambda *args, **kwargs: [])
-        both = [open_study("s", PLAN, storage) for _ in range(2)]
-    assert optuna.Study.get_trials is get_trials
-    queued = [propose(study)[1] for study in both]
-    assert queued[0] == queued[1]  # the untuned filter, which does no harm
-    points = [propose(study)[1] for study in both + both]
-    assert len(set(points)) == len(points)
+def model(dt=0.02):
+    return filters.StateSpaceModel(
+        transition=move,
+        observe=look,
+        constants=Constants(dt),
+        process_noise_cov=[1e-3, 1.0],
+        measurement_noise_cov=[0.1],
+        prior_mean=[0.0, 0.0],
+        prior_cov=[1.0, 1.0],
+        measurements=["z"],
+    )
 
 
-def test_a_single_process_proposes_the_same_again():
-    def points(storage):
-        study = open_study("s", PLAN, storage)
-        study.enqueue_trial({"Q11": 1.0})  # as a study does after good trials
-        found = []
-        for _ in range(5):
-            trial, point = propose(study)
-            found.append(point)
-            study.tell(trial, 1.0)
-        return found
+def of_one_dt():
+    return model()
 
-    first = points(optuna.storages.InMemoryStorage())
-    assert first == points(optuna.storages.InMemoryStorage()) and len(set(first)) == 5
-    resumed = points(storage_with_one_trial())
-    assert resumed == points(storage_with_one_trial()) and not set(resumed[1:]) & set(first)
+
+def matrices(dt):
+    return filters.affine_model(F=[[1.0]], H=[[1.0]], Q=[1.0], R=[0.1], P0=[1.0], measurements=["z"], dt=dt)
+
+
+REFUSED = r"sample time of the model must be that of log .*, 0.05 s, but is 0.02 s: give a function of dt"
+
+
+@pytest.mark.parametrize("source", [of_one_dt, model(), matrices(0.02)])
+def test_a_model_of_another_sample_time_than_its_log_is_refused(source):
+    refused(REFUSED, tuning.estimate, tuning.read_logs(LOG, model=source), filter="ekf")
+    refused(REFUSED, tuning.identify, tuning.read_logs(LOG, model=source), free="R")
+    refused(REFUSED, ReplayEnv, LOG, source)
+
+
+@pytest.mark.parametrize("source", [model, model(DT * 1.001), matrices(DT), matrices(None)])
+def test_a_model_of_the_sample_time_of_its_log_or_of_none_is_taken(source):
+    assert ReplayEnv(LOG, source).log.dt == pytest.approx(DT)

@@ -1,4 +1,4 @@
-"""Pruning decides as Optuna's test does, by a sum of ranks, and a study ends where it ends without."""
+"""Which trials go on, as Optuna's test decides by a sum of ranks, and which one is chosen at the end."""
 
 import warnings
 
@@ -8,13 +8,24 @@ import pytest
 from optuna.trial import TrialState
 from scipy import stats
 
+from tuning.evaluation.baselines import SCALED
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.experiments.benchmark import run_in_memory
 from tuning.plants.thruster import find_scenario
+from tuning.search.among_types import BASELINE
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import choice_of
-from tuning.search.study import P_THRESHOLD, PairedPruner, critical_rank_sum, positive_rank_sum
-from tuning.search.trials import BLOCK, measure
+from tuning.search.storage import open_storage
+from tuning.search.study import (
+    BEST,
+    P_THRESHOLD,
+    PairedPruner,
+    critical_rank_sum,
+    open_study,
+    positive_rank_sum,
+    run_study,
+)
+from tuning.search.trials import BLOCK, CONSISTENCY, best_trial, is_consistent, measure
 
 
 def pruner_of_optuna():
@@ -115,3 +126,37 @@ def test_with_pruning_a_study_ends_at_the_score_that_it_has_without():
         assert full.score.value > 0.995 * pruned.best_value
     by = [evaluate(result.choice.filter(scenario), held_out, scenario.scale) for result in (pruned, whole)]
     assert score_ratio(*by).value == pytest.approx(1.0, abs=0.02)
+
+
+PLAN = Plan("ekf", (find_scenario("mismatch"),))  # whose untuned filter has a mean NIS of 0.2
+
+
+def trial(value, outside=None):
+    constraints = {} if outside is None else {CONSISTENCY: outside}
+    return optuna.trial.create_trial(values=[value], constraints=constraints)
+
+
+@pytest.mark.parametrize(
+    ("trials", "best"),
+    [
+        ([(40.0, 0.5), (1.0, 0.7)], 1.0),  # none is consistent: the score decides
+        ([(40.0, 0.0), (1.0, 0.7)], 40.0),
+        ([(40.0, -0.1), (30.0, -0.01), (1.0, 1e-9)], 30.0),
+        ([(2.0, None), (1.0, None)], 1.0),
+    ],
+)
+def test_the_best_trial_has_the_least_error_of_the_consistent_ones_else_of_all(trials, best):
+    assert best_trial([trial(*each) for each in trials]).value == best
+    assert best_trial([]) is None
+
+
+def test_a_study_names_its_best_trial_to_programs_that_know_no_constraints(tmp_path):
+    storage = open_storage(str(tmp_path / "j"))
+    run_study(open_study("s", PLAN, storage), PLAN, 4)
+    study = optuna.load_study(study_name="s", storage=storage)
+    best = best_trial(study.trials)
+    assert study.user_attrs[BEST] == best.number == study.best_trial.number
+    assert is_consistent(best) and best.user_attrs[BASELINE] == SCALED
+    study.set_user_attr(BEST, 0)  # what a slower worker wrote last
+    run_study(open_study("s", PLAN, storage), PLAN, 4)
+    assert study.user_attrs[BEST] == best.number

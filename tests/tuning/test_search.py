@@ -10,15 +10,26 @@ import pytest
 from optuna.distributions import FloatDistribution, IntDistribution
 from optuna.trial import TrialState
 
+from filters.registry import FILTERS
+from tests.filters.checks import refused
 from tests.slow import slow_but
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
+from tuning.experiments import lorenz63
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
 from tuning.plants.thruster import find_scenario
 from tuning.search import trials
 from tuning.search.among_types import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED
+from tuning.search.parameters import size_ladder
 from tuning.search.plan import LARGEST, NIS_BAND, Plan, nis_violation
-from tuning.search.space import choice_of, distributions, oracle_choice, untuned_choice
+from tuning.search.space import (
+    choice_of,
+    distributions,
+    oracle_choice,
+    parameters_of,
+    trial_parameters,
+    untuned_choice,
+)
 from tuning.search.study import open_study, run_study
 from tuning.search.trials import (
     BLOCK,
@@ -170,8 +181,7 @@ def test_a_grid_ends_where_it_is_exhausted():
     ],
 )
 def test_a_plan_that_cannot_work_is_refused(change, rule):
-    with pytest.raises(ValueError, match=rule):
-        open_study("s", PLAN._replace(**change), optuna.storages.InMemoryStorage())
+    refused(rule, open_study, "s", PLAN._replace(**change), optuna.storages.InMemoryStorage())
 
 
 @pytest.mark.parametrize(
@@ -266,8 +276,7 @@ def test_a_trial_s_state_is_read_as_data_and_no_code_runs(tmp_path, monkeypatch)
     state = {"cma:optimizer:0": pickle.dumps(Attack(marker)).hex()}
     trial = optuna.trial.create_trial(value=1.0, system_attrs=state)
     sampler = make_sampler("cma-es", 0, 0, {})
-    with pytest.raises(ValueError, match="must be that of an optimizer, but a trial's names .*open$"):
-        sampler._restore_optimizer([trial])
+    refused("must be that of an optimizer, but a trial's names .*open$", sampler._restore_optimizer, [trial])
     assert not marker.exists()
     assert sampler._restore_optimizer([optuna.trial.create_trial(value=1.0)]) is None
 
@@ -293,3 +302,40 @@ def test_a_study_goes_on_as_with_optuna_s_own():
     ours = make_sampler("cma-es", 0, 0, {})
     seed = int(np.random.SeedSequence([0, 0, 0]).generate_state(1)[0])
     assert values(ours) == values(optuna.samplers.CmaEsSampler(seed=seed))
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_choice_survives_its_trial_parameters(name):
+    choice = untuned_choice(name, NOMINAL)
+    assert choice_of(name, parameters_of(choice), NOMINAL) == choice
+    assert choice.filter(NOMINAL).name == name
+
+
+@pytest.mark.parametrize(("name", "size"), [("enkf", 30), ("ienkf", 30), ("pf", 1000), ("rbpf", 100)])
+def test_particle_filters_have_sizes_of_their_own(name, size):
+    assert untuned_choice(name, NOMINAL).numbers["ensemble_size"] == size
+    ladder = size_ladder(name)
+    assert (ladder[0], ladder[-1]) == {30: (5, 200), 100: (20, 1000), 1000: (200, 5000)}[size] and size in ladder
+
+
+@pytest.mark.parametrize("name", ["pf", "apf"])
+def test_particles_are_regularised_by_a_study_where_there_is_no_process_noise(name):
+    untuned, known = untuned_choice(name, lorenz63.problem), untuned_choice(name, NOMINAL)
+    assert untuned.numbers["regularisation"] == 0.0 and "regularisation" not in known.numbers
+    assert "regularisation" not in distributions(name, NOMINAL)
+    space = distributions(name, lorenz63.problem, hold_r=True)
+    values = {"N": 300, "regularisation": 1.5} | ({"resampling_threshold": 0.3} if name == "pf" else {})
+    choice = choice_of(name, values, lorenz63.problem)
+    assert set(space) == set(values) and trial_parameters(choice, space) == values
+    assert choice.filter(lorenz63.problem).regularisation == 1.5
+
+
+def test_baselines_are_not_searched_over_q_and_r():
+    assert parameters_of(untuned_choice("open-loop", NOMINAL)) == {}
+    assert parameters_of(untuned_choice("low-pass", NOMINAL)) == {"time_constant": 2.0}
+    choice = choice_of("low-pass", {"time_constant": 4.0}, NOMINAL)
+    assert choice.numbers == {"time_constant": 4.0} and parameters_of(choice) == {"time_constant": 4.0}
+    storage = optuna.storages.InMemoryStorage()
+    for name in ("open-loop", "inversion"):
+        with pytest.raises(ValueError, match=f"filter must have something to tune, but got '{name}'"):
+            open_study("s", Plan(name, (NOMINAL,)), storage)

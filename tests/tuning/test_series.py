@@ -1,11 +1,8 @@
-"""Q and R of a column of numbers: closed forms, Durbin and Koopman's Nile, code that runs, and clear refusals."""
+"""Q and R of a column of numbers: closed forms, Durbin and Koopman's Nile, statsmodels, drawn records."""
 
 import copy
-import ctypes
 import math
 import pickle
-import shutil
-import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -14,13 +11,12 @@ import pytest
 import filters
 import tuning
 from filters.models import NAMED, Scales, named_model
-from filters.named import model_named
+from tests.filters.checks import refused
 from thruster_env.graphs.loops import machine_code_of
-from tuning.series.answer import _digits, outstanding_period
+from tuning.series.answer import _digits, _matrix, outstanding_period
 from tuning.series.column import column_of, seconds_text
 from tuning.series.fit import Number, choose
 from tuning.series.likelihood import ColumnLikelihood
-from tuning.series.paste import LANGUAGES, lines_of
 from tuning.series.recursion import _recursion
 
 # Flow of the Nile at Aswan, 1871 to 1970 [1e8 m^3]: Durbin, Koopman (2012), "Time series analysis by state space
@@ -70,11 +66,8 @@ def test_the_nile_has_the_variances_of_durbin_and_koopman(nile):
     """Durbin, Koopman (2012), section 2.10.3: 1469.1 and 15098.5."""
     drift, noise = nile.numbers
     assert drift.value == pytest.approx(1469.1, rel=1e-3) and nile.r == pytest.approx(15098.5, rel=1e-4)
-    assert (
-        nile.q[0, 0] == pytest.approx(drift.value, rel=1e-12)
-        and drift.low < 1469.1 < drift.high
-        and noise.unit == ""
-    )
+    assert nile.q[0, 0] == pytest.approx(drift.value, rel=1e-12) and noise.unit == ""
+    assert drift.low < 1469.1 < drift.high
     assert nile.gain[0] == pytest.approx(0.267, abs=1e-3)  # section 2.11
     assert nile.memory == pytest.approx(-1.0 / math.log(1.0 - nile.gain[0]), rel=1e-9)
     assert not nile.is_wrong and "white" in nile.sentences()[-1]
@@ -112,16 +105,13 @@ def test_a_sum_has_the_parts_side_by_side():
     np.testing.assert_array_equal(f[:2, 2:], 0.0)
     np.testing.assert_array_equal(c, [[1.0, 0.0, 1.0, 0.0]])
     both = named_model("ornstein-uhlenbeck + oscillator")
-    assert [number.name for number in both.free if "std" in number.name] == [
-        "ornstein_uhlenbeck_std",
-        "oscillator_std",
-    ]
-    with pytest.raises(ValueError, match="parts of a sum must differ"):
-        named_model("oscillator + oscillator")
-    with pytest.raises(ValueError, match="at most one part with a level"):
-        named_model("constant + constant-velocity")
-    with pytest.raises(ValueError, match="a model must be one of"):
-        named_model("constant-speed")
+    stds = [number.name for number in both.free if "std" in number.name]
+    assert stds == ["ornstein_uhlenbeck_std", "oscillator_std"]
+    for name, rule in (
+        ("oscillator + oscillator", "parts of a sum must differ"),
+        ("constant + constant-velocity", "at most one part with a level"),
+    ):
+        refused(rule, named_model, name)
 
 
 @pytest.mark.parametrize("name", NUMBERS)
@@ -130,9 +120,8 @@ def test_intervals_hold_the_numbers_that_made_the_data(name):
     fit = tuning.fit(simulated(name, 800, seed=3), 0.1, model=name)
     for number in fit.numbers:
         value = {**NUMBERS[name], "R": 0.2}[number.name]
-        low, high = (  # wider by half, in logarithms: these are 95 % intervals of 17 numbers
-            number.value * (end / number.value) ** 1.5 for end in (number.low, number.high)
-        )
+        # Wider by half, in logarithms: these are 95 % intervals of 17 numbers.
+        low, high = (number.value * (end / number.value) ** 1.5 for end in (number.low, number.high))
         assert low < value < high, (number, value)
 
 
@@ -214,8 +203,7 @@ def test_a_fit_on_unequal_steps_filters_them_anew(as_python):
     np.testing.assert_allclose(anew.means, fit.estimates.means[0], rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(anew.covs, fit.estimates.covs[0], rtol=1e-6)
     assert filters.run(fit.filter, z).to_frame().index[1] == pytest.approx(fit.column.dt)
-    with pytest.raises(ValueError, match="but got SeriesFit.*: use its .filter"):
-        filters.run(fit, z)
+    refused("but got SeriesFit.*: use its .filter", filters.run, fit, z)
 
 
 def test_unequal_steps_are_taken_as_they_are():
@@ -294,159 +282,6 @@ def test_the_recursion_needs_no_numba():
     assert machine_code_of(code._function, code._shapes) is not None
 
 
-def test_lines_for_python_make_the_same_filter(position):
-    names = {}
-    exec(position.code("python"), names)
-    np.testing.assert_allclose(names["filter_"].model.numbers, position.filter.model.numbers, rtol=1e-11)
-    with pytest.raises(ValueError, match="a language must be one of"):
-        position.code("cobol")
-    assert set(LANGUAGES) == {"python", "filterpy", "pykalman", "matlab", "arduino"}
-
-
-def test_lines_for_filterpy_give_the_same_estimates(position):
-    pytest.importorskip("filterpy.kalman")
-    setup, step = position.code("filterpy").split("# the first")
-    names = {}
-    exec(setup, names)
-    kf, z = names["kf"], position.column.values
-    kf.update(z[0])
-    for k in range(1, 50):
-        exec(step.split("\n", 1)[1], {**names, "z": z[k]})
-        np.testing.assert_allclose(kf.x[:, 0], position.estimates.means[0, k], rtol=1e-6, atol=1e-9)
-    before = kf.x
-    exec(step.split("\n", 1)[1], {**names, "z": math.nan})
-    np.testing.assert_allclose(kf.x, kf.F @ before)
-
-
-@pytest.mark.skipif(shutil.which("cc") is None, reason="the lines of C need a compiler")
-def test_lines_for_a_controller_are_the_filter_once_it_has_settled(position, tmp_path):
-    """Far from zero, too, where float would round z to half a unit; the first call sets the level."""
-    code = position.code("arduino")
-    assert code.startswith("// a step is 0.1 s\n// measured: z [1]\n// state: position [1], velocity [1/s]\n")
-    source = tmp_path / "filter.c"
-    source.write_text(code + "\ndouble state(int i) { return i ? x2 : x1; }\n")
-    subprocess.run(["cc", "-shared", "-fPIC", "-o", str(tmp_path / "filter.so"), str(source)], check=True)
-    library = ctypes.CDLL(str(tmp_path / "filter.so"))
-    library.filter.argtypes, library.state.restype = [ctypes.c_double], ctypes.c_double
-    far = 5200300.0
-    for k, z in enumerate(position.column.values):
-        library.filter(z + far)
-        if not k:
-            assert [library.state(0), library.state(1)] == [z + far, 0.0]
-    state = [library.state(0) - far, library.state(1)]
-    np.testing.assert_allclose(state, position.estimates.means[0, -1], rtol=2e-6)
-
-
-def test_a_controller_gets_no_constant_gain_that_needs_longer_than_the_record(nile):
-    values = {"constant_drift": 1.0, "harmonic_drift": 1e-6, "R": 15098.5}
-    slow = replace(nile, chosen=nile.chosen._replace(name="constant + harmonic:period=11", values=values))
-    with pytest.raises(ValueError, match="forget its start within the record, 99 s, but .* forgets in .*python"):
-        slow.code("arduino")
-    assert "# a step is 1 s" in slow.code("python") and "% a step is 1 s" in slow.code("matlab")
-
-
-def test_a_controller_begins_at_the_level_of_a_sum():
-    model = model_named("oscillator + constant:frequency=0.1,damping=0.2,std=0.5,drift=1,R=1")(dt=1.0)
-    assert "    x1 = 0.0;\n    x2 = 0.0;\n    x3 = z;\n" in lines_of("arduino", model, np.full((3, 1), 0.1), 1.0)
-
-
-def test_an_index_of_dates_and_a_file_are_the_same_numbers(position, tmp_path):
-    pandas = pytest.importorskip("pandas")
-    z = position.column.values
-    index = pandas.date_range("2026-01-01", periods=len(z), freq="100ms")
-    of_series = column_of(pandas.Series(z, index=index, name="depth [m]"))
-    file = tmp_path / "depth.csv"
-    file.write_text("t,depth [m]\n" + "".join(f"{0.1 * k:.1f},{float(value)!r}\n" for k, value in enumerate(z)))
-    of_file = column_of(file)
-    for column in (of_series, of_file):
-        np.testing.assert_array_equal(column.values, z)
-        assert column.dt == pytest.approx(0.1) and column.quantities[0][:3] == ("depth", "depth", "m")
-    assert column_of(list(z)).dt == 1.0 and column_of([*z[:30], None]).measured.sum() == 30
-
-
-def test_a_pandas_index_of_times_is_taken_and_one_that_counts_is_not():
-    pandas = pytest.importorskip("pandas")
-    z, dates = np.arange(40.0) % 7.0, pandas.date_range("2026-01-01", periods=40, freq="100ms")
-    seconds = 0.1 * np.arange(40.0)
-    for index in (seconds, pandas.Index(seconds, name="elapsed"), pandas.Index(1e3 * seconds, name="elapsed_ms")):
-        assert column_of(pandas.Series(z, index=index)).dt == pytest.approx(0.1)
-    assert column_of(pandas.Series(z, index=map(str, dates))).dt == pytest.approx(0.1)
-    hours = pandas.period_range("2026-01-01", periods=40, freq="h")
-    assert column_of(pandas.DataFrame({"z": z}, index=hours)).dt == 3600.0
-    for index in (None, np.arange(40.0), range(100, 140), [f"row {k}" for k in range(40)]):
-        assert column_of(pandas.Series(z, index=index)).dt == 1.0
-    with pytest.raises(ValueError, match="index of numbers must increase, but 3.8.* follows 3.9"):
-        column_of(pandas.Series(z, index=seconds[::-1]))
-    table = pandas.DataFrame({"time": np.arange(40.0), "z": z}, index=seconds)
-    assert column_of(table).dt == 1.0  # its column of times is meant
-    missing = column_of(pandas.Series(z, index=seconds).drop(seconds[[5, 6]]))
-    assert np.flatnonzero(np.isnan(missing.values)).tolist() == [5, 6]
-
-
-@pytest.mark.parametrize(
-    ("times", "header", "dt"),
-    [
-        ([f"2026-05-01T12:{k // 60:02d}:{k % 60:02d}" for k in range(0, 120, 2)], "Datum", 2.0),
-        ([100000 * k for k in range(60)], "micros", 0.1),
-        ([20 * k for k in range(60)], "millis", 0.02),
-        ([0.5 * k for k in range(60)], "Zeit", 0.5),
-        ([0.5 * k for k in range(60)], "T", 0.5),
-        ([0.5 * k for k in range(60)], "Sekunde", 1.0),  # no name of times
-        ([20.0 + k % 7 for k in range(60)], "T", 1.0),  # a temperature
-    ],
-)
-def test_times_are_found_beside_a_column_or_their_lack_is_said(tmp_path, times, header, dt):
-    file = tmp_path / "log.csv"
-    z = np.random.default_rng(1).normal(size=60)
-    file.write_text(
-        f"{header},Füllstand\n" + "".join(f"{t},{v!r}\n" for t, v in zip(times, z.tolist(), strict=True))
-    )
-    column = column_of(file, column="Füllstand")
-    assert column.dt == pytest.approx(dt)
-    lacks = f"no column of times was found (columns {header}, Füllstand): 1 s is assumed, give --dt, or --column "
-    assert (f"{lacks}Füllstand,time={header}." in column.remarks) == (dt == 1.0)
-    if header == "Sekunde":
-        stated = column_of(file, column="Füllstand,time=Sekunde")
-        assert stated.dt == 0.5 and stated.remarks == () and column_of(file, 0.25, column="Füllstand").dt == 0.25
-        assert column_of(file, column="time=Sekunde").dt == 0.5
-
-
-@pytest.mark.parametrize("times", ["date", "t", "time"])
-def test_a_temperature_beside_times_is_no_time(times):
-    table = {times: 2.0 * np.arange(60), "T": 20.0 + np.arange(60.0)}
-    column = column_of(table)
-    assert column.quantities[0].symbol == "T" and column.dt == 2.0
-
-
-@pytest.mark.parametrize("unit", ["kPa", "degC", "Hz", "deg", "km"])
-def test_numbers_keep_the_unit_of_their_column(position, tmp_path, unit):
-    file = tmp_path / "log.csv"
-    z = position.column.values[:60]
-    file.write_text(f"t,value [{unit}]\n" + "".join(f"{k},{v!r}\n" for k, v in enumerate(z.tolist())))
-    column = column_of(file)
-    np.testing.assert_array_equal(column.values, z)
-    assert column.quantities[0].unit == unit
-
-
-def test_times_of_an_array_are_seconds_whatever_their_size():
-    z = np.random.default_rng(1).normal(size=60)
-    for times in (2.6e6 * np.arange(60.0), 1e12 + np.arange(60.0), 1e9 * np.arange(60.0)):
-        column = column_of(z, times=times)
-        np.testing.assert_array_equal(column.times, times - times[0])
-        assert not column.remarks
-
-
-@pytest.mark.parametrize("name", ["harmonic:period=12,harmonics=2", "ar:2", "constant + seasonal:period=4"])
-def test_the_text_of_an_answer_makes_its_model_elsewhere(name):
-    rng = np.random.default_rng(6)
-    z = 300.0 + np.cumsum(rng.normal(size=(60, 2)), axis=0) + np.cos(2.0 * np.pi * np.arange(60) / 12)[:, None]
-    for numbers in (z, z[:, 0]):
-        fit = tuning.fit(numbers, model=name)
-        model = model_named(fit.text)(dt=1.0)
-        np.testing.assert_allclose(model.process_noise_cov, fit.q, rtol=5e-3, atol=1e-9)
-        np.testing.assert_allclose(model.matrices()[4], fit.model.matrices()[4], rtol=1e-9)
-
-
 def test_a_record_begins_at_the_mean_of_its_stationary_signal():
     z = simulated("ornstein-uhlenbeck", 60, noise=4.0) + 50.0
     fit = tuning.fit(z, 0.1, model="ornstein-uhlenbeck")
@@ -469,18 +304,6 @@ def test_the_memory_of_a_season_is_that_of_its_harmonics():
     np.testing.assert_allclose(fit.gain[:3], gain[:3], rtol=1e-6)
 
 
-def test_tune_names_fit_for_a_log_that_is_a_column_of_numbers(tmp_path):
-    file = tmp_path / "level.csv"
-    file.write_text("t,level [m]\n" + "".join(f"{k},{z!r}\n" for k, z in enumerate(map(float, NILE.split()))))
-    with pytest.raises(ValueError, match=r"level.csv has t, level \[m\]: `thruster fit .*level.csv`"):
-        tuning.tune(tuning.read_logs(file))
-    fit = tuning.fit(file, model="constant")
-    assert fit.r == pytest.approx(15098.5, rel=1e-4) and fit.numbers[1].unit == "m^2"
-    file.write_text("t,level\n" + "1,2\n2,3\n" * 30)
-    with pytest.raises(ValueError, match="times must increase"):
-        tuning.fit(file)
-
-
 def test_the_axes_of_a_track_have_the_same_numbers(position, tmp_path):
     z = position.column.values
     track = np.column_stack([z, simulated("constant-velocity", 600, seed=7) - 90.0])
@@ -497,10 +320,8 @@ def test_the_axes_of_a_track_have_the_same_numbers(position, tmp_path):
     assert fit.axes_differ() > 1e-3 and not fit.is_wrong
     noisy = track + [[0.0, 2.0]] * np.random.default_rng(3).normal(size=(600, 2))
     assert "The axes differ" in str(tuning.fit(noisy, 0.1, model="constant-velocity"))
-    file = tmp_path / "track.csv"
-    file.write_text(
-        "t,x [m],y [m]\n" + "".join(f"{0.1 * k:.1f},{a!r},{b!r}\n" for k, (a, b) in enumerate(track.tolist()))
-    )
+    file, rows = tmp_path / "track.csv", enumerate(track.tolist())
+    file.write_text("t,x [m],y [m]\n" + "".join(f"{0.1 * k:.1f},{a!r},{b!r}\n" for k, (a, b) in rows))
     assert tuning.fit(file, column="x [m],y [m]", model="constant-velocity").r == pytest.approx(fit.r, rel=1e-9)
 
 
@@ -533,9 +354,11 @@ def test_what_a_chosen_model_misses_is_tried_too():
     rng, z = np.random.default_rng(6), np.zeros(400)
     for k in range(2, 400):
         z[k] = 0.6 * z[k - 1] - 0.7 * z[k - 2] + rng.normal()
-    choice = choose(
-        column_of(z), ("constant",), further=lambda chosen, level: ["ar:2"] * (chosen.name == "constant")
-    )
+
+    def further(chosen, level):
+        return ["ar:2"] * (chosen.name == "constant")
+
+    choice = choose(column_of(z), ("constant",), further=further)
     assert choice.chosen.name == "ar:2" and len(choice.candidates) == 2
 
 
@@ -564,11 +387,9 @@ def test_narrow_intervals_have_digits_and_long_times_words():
     narrow = Number("period", "period", 86397.123, 86390.2, 86404.4, "s", True)
     assert _digits(narrow) == ("86397.12", "86390.2", "86404.4")
     assert _digits(narrow._replace(low=4e4, high=2e5))[:2] == ("8.64e+04", "4e+04")
-    texts = [
-        seconds_text(seconds) for seconds in (0.6428, 119.0, 150.0, 6647.8, 86400.0, 2156400.0, 1e9, math.inf)
-    ]
+    lengths = 0.6428, 119.0, 150.0, 6647.8, 86400.0, 2156400.0, 1e9, math.inf
     expected = ["0.643 s", "119 s", "150 s (2.5 min)", "6648 s (1.85 h)", "86400 s (24 h)", "2156400 s (25 days)"]
-    assert texts == [*expected, "1000000000 s (31.7 years)", "inf s"]
+    assert [*map(seconds_text, lengths)] == [*expected, "1000000000 s (31.7 years)", "inf s"]
 
 
 def test_a_season_an_autoregression_and_a_period_are_found():
@@ -584,9 +405,8 @@ def test_a_season_an_autoregression_and_a_period_are_found():
         z[k] = 1.2 * z[k - 1] - 0.6 * z[k - 2] + rng.normal()
     fit = tuning.fit(z + 7.0, model="ar:2")
     lows, highs = np.array([(number.low, number.high) for number in fit.numbers[:2]]).T
-    assert (
-        (lows < [0.75, -0.6]).all() and (highs > [0.75, -0.6]).all() and fit.level == pytest.approx([7.0], abs=0.3)
-    )
+    assert (lows < [0.75, -0.6]).all() and (highs > [0.75, -0.6]).all()
+    assert fit.level == pytest.approx([7.0], abs=0.3)
     z = 2.0 * np.cos(2.0 * np.pi * np.arange(400) / 23.7) + rng.normal(size=400)
     period = tuning.fit(z, model="harmonic").numbers[1]
     assert period.low < 23.7 < period.high and period.high - period.low < 0.5
@@ -594,82 +414,15 @@ def test_a_season_an_autoregression_and_a_period_are_found():
     assert "do not determine frequency" in str(noise) and "do not determine damping" in str(noise)
 
 
-@pytest.mark.parametrize(
-    ("z", "options", "message"),
-    [
-        ([1.0] * 30, {}, "must vary"),
-        ([1.0, 2.0], {}, "at least 20 numbers"),
-        ([math.nan] * 50, {}, "at least 20 numbers, but has 0"),
-        (["a"] * 30, {}, "z must be numbers"),
-        (np.zeros((30, 9)), {}, "a column of numbers"),
-        ([*range(30), math.inf], {}, "numbers must be finite"),
-        (np.arange(30.0), {"model": "seasonal"}, "must have period="),
-        (np.arange(30.0), {"model": "ar"}, "must have an order of 1 to 8, as ar:2, but got ''"),
-        (np.arange(30.0) % 7.0, {"model": "ar:1", "dt": 1.0 + 0.1 * np.arange(29.0)}, "must have equal steps"),
-        (
-            np.arange(30.0) ** 2 % 11.0,
-            {"model": "harmonic:period=7,harmonics=4"},
-            "two samples .* a period of 1.75 s",
-        ),
-        (np.arange(30.0), {"times": np.arange(30.0)[::-1]}, "times must increase"),
-        (np.arange(30.0), {"dt": np.ones(30)}, "a time for each number, so one step .* 30 numbers and 31 times"),
-        (np.arange(30.0), {"dt": np.ones(29), "times": np.arange(30.0)}, "but got both"),
-        ({"z": np.arange(30.0)}, {"dt": np.ones(29)}, "the times of a table or a file must be one of its columns"),
-        (1e-160 * np.arange(30.0), {}, "must vary by 1e-60 to 1e.60.* use another unit"),
-        (np.arange(30.0), {"model": "constant-speed"}, "a model must be one of"),
-        (np.arange(30.0), {"dt": -1.0}, "dt must be positive"),
-        (np.arange(30.0), {"model": ["constant"]}, "model .* must be auto, or a model's name, but got"),
-        ({"t": np.arange(30.0), "a": np.arange(30.0), "b": np.arange(30.0)}, {}, "one column of numbers beside"),
-    ],
-)
-def test_wrong_numbers_are_refused_in_one_line(z, options, message):
-    with pytest.raises(ValueError, match=message) as error:
-        tuning.fit(z, **options)
-    assert "\n" not in str(error.value)
-
-
 def test_every_start_lies_in_its_range():
-    sizes = (
-        (1e-6, 1e-7, 1e-3, 10.0, (80.0, 90.0)),
-        (5e4, 1e2, 3600.0, 1e8, (1e-4,)),
-        (1.0, 0.5, 1.0, 30.0, (0.5,)),
-    )
+    sizes = (1e-6, 1e-7, 1e-3, 10.0, (80.0, 90.0)), (5e4, 1e2, 3600.0, 1e8, (1e-4,)), (1.0, 0.5, 1.0, 30.0, (0.5,))
     for scales in (Scales(*size) for size in sizes):
         for number in (number for model in NAMED.values() for number in model.free):
             low, high = number.range(scales)
             assert 0.0 < low < high < math.inf and all(low <= value <= high for value in number.values(scales))
 
 
-def test_data_without_noise_are_called_that():
-    tiny = 1.0 + 1e-13 * np.random.default_rng(0).normal(size=100)
-    for exact in (tiny, 3.0 + 2.0 * (0.1 * np.arange(200))):
-        with pytest.raises(ValueError, match="z must have noise, .* lie on a smooth curve to"):
-            tuning.fit(exact, 0.1)
-
-
-def test_samples_that_are_no_measurements_do_not_change_q_and_r():
-    """Placeholders, a sensor that sticks, and one that is slower than the log."""
-    clean = simulated("constant", 600) + 20.0
-    missing, rows = clean.copy(), np.arange(600)
-    missing[(200 <= rows) & (rows < 240)] = np.nan
-    reference = tuning.fit(missing, 0.1, model="constant")
-    for number in (-999.0, 0.0, clean[199]):
-        fit = tuning.fit(np.where(np.isnan(missing), number, missing), 0.1, model="constant")
-        assert fit.r == pytest.approx(reference.r, rel=0.02) and fit.q == pytest.approx(reference.q, rel=0.02)
-        assert any("left out" in sentence for sentence in fit.sentences())
-    slow, held = (tuning.fit(*record, model="constant") for record in ((clean, 0.5), (np.repeat(clean, 5), 0.1)))
-    assert held.r == pytest.approx(slow.r, rel=1e-9) and held.q == pytest.approx(slow.q, rel=1e-9)
-    assert held.column.dt == pytest.approx(0.5) and "5 times" in " ".join(held.sentences())
-
-
-def test_an_angle_that_wraps_goes_on():
-    course = 40.0 * simulated("constant", 600)
-    straight, wrapped = (
-        tuning.fit({"t": 0.1 * np.arange(600), "heading[deg]": angle}, model="constant")
-        for angle in (course, np.mod(course, 360.0))
+def test_each_number_has_six_digits():
+    assert _matrix(np.array([[0.000151234567, 2.0], [1e-9 / 3.0, 12.3456789]]), "") == (
+        "[[0.000151235, 2],\n [3.33333e-10, 12.3457]]"
     )
-    assert wrapped.r == pytest.approx(straight.r, rel=1e-6) and wrapped.q == pytest.approx(straight.q, rel=1e-6)
-    assert any("wraps" in sentence for sentence in wrapped.sentences())
-    for language in LANGUAGES:
-        assert "z + 360 round((z_before - z)/360)" in wrapped.code(language)
-        assert "z_before" not in straight.code(language)

@@ -1,14 +1,12 @@
-"""Outliers of a column are left out of its fit and of the lines to paste; jumps, peaks and pulses are named."""
+"""Outliers of a column are left out of its fit and of the lines to paste; jumps and equal sensors are named."""
 
-import ctypes
 import math
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
 
 import tuning
+from tests.tuning.test_series_lines import in_c, with_cc
 
 ROWS = 600
 
@@ -147,19 +145,39 @@ def test_lines_for_filterpy_leave_out_what_a_session_with_a_gate_does(fit):
     assert session.mean == pytest.approx(100.0, rel=1e-3)
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="the lines of C need a compiler")
+@with_cc
 def test_lines_for_a_controller_leave_outliers_out_and_follow_a_jump(fit, tmp_path):
-    source = tmp_path / "filter.c"
-    source.write_text(fit.code("arduino") + "\ndouble state(void) { return x1; }\n")
-    subprocess.run(["cc", "-shared", "-fPIC", "-o", str(tmp_path / "filter.so"), str(source)], check=True)
-    library = ctypes.CDLL(str(tmp_path / "filter.so"))
-    library.filter.argtypes, library.state.restype = [ctypes.c_double], ctypes.c_double
-    states = []
+    library, states = in_c(fit, tmp_path), []
     for number in with_outliers(walk())[0]:
         library.filter(number)
-        states.append(library.state())
+        states.append(library.state(0))
     off = np.array(states[50:]) - fit.estimates.means[0, 50:, 0]
     assert math.sqrt(float(np.mean(off**2))) < 0.02  # the gain is constant; the deviation of an estimate is 0.16
     for number in [math.nan] * 20 + [100.0] * 60:
         library.filter(number)
-    assert library.state() == pytest.approx(100.0, rel=1e-3)
+    assert library.state(0) == pytest.approx(100.0, rel=1e-3)
+
+
+RNG = np.random.default_rng(4)
+LEVEL, OTHER = (np.cumsum(RNG.normal(0.0, 0.3, 300)) for _ in range(2))
+A, B = RNG.normal(0.0, 0.5, (2, 300))
+
+
+def sentences(*columns):
+    fit = tuning.fit(np.stack(columns, axis=1), dt=0.1, model="constant")
+    return " ".join(fit.sentences())
+
+
+def test_two_sensors_of_one_quantity_are_said():
+    text = sentences(LEVEL + A, LEVEL + B)
+    assert "z_1 and z_2 differ by their noise alone" in text and "filter both with one state" in text
+    assert "by their noise" in sentences(LEVEL + A, LEVEL + B + 7.0)  # with a bias
+
+
+def test_axes_with_signals_of_their_own_have_not():
+    missing = np.where(np.arange(300) % 2 == 0, np.nan, OTHER + B)
+    assert "by their noise" not in sentences(LEVEL + A, OTHER + B)
+    assert "by their noise" not in sentences(LEVEL + A, missing)
+    assert "by their noise" not in sentences(A, B)  # no signal
+    never = np.where(np.arange(300) % 2 == 1, np.nan, LEVEL + A)
+    assert "by their noise" not in sentences(never, missing)

@@ -1,4 +1,4 @@
-"""The smallest sufficient ensemble: on seeds of its own, by the end of an interval and not by its middle."""
+"""The smallest sufficient ensemble: on seeds of its own, by the end of an interval; few seeds leave some out."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,12 @@ import pytest
 from filters.consistency.nees import Interval
 from tuning.evaluation import sizes
 from tuning.evaluation.evaluate import evaluate
-from tuning.evaluation.sizes import SizeRow, ensemble_sizes, left_out, sufficient_size
+from tuning.evaluation.sizes import FEW, SIZE_TOLERANCE, SizeRow, ensemble_sizes, left_out, sufficient_size
 from tuning.plants.thruster import find_scenario
 from tuning.problems.data import size_seeds
+from tuning.search import plan as plans
 from tuning.search.plan import SIZE_SEEDS, Plan
-from tuning.search.space import untuned_choice
+from tuning.search.space import Choice, untuned_choice
 
 MISMATCH = find_scenario("mismatch")
 
@@ -74,3 +75,33 @@ def test_sizes_left_out_by_their_nis_are_told_and_count_again_where_leaving_them
     assert sufficient_size(cheap, consistent=True) == 20 and left_out(cheap, 20) == [5, 200]
     dear = rows((5, 1.4, 0.1), (20, 1.066, -0.1), (200, 1.0, 0.2))
     assert sufficient_size(dear, consistent=True) == 200 and left_out(dear, 200) == []
+
+
+NOMINAL = find_scenario("nominal")
+
+
+def rows_on(monkeypatch, large, consistent=False, q=1.0, ladder=(5, 8, 40, 80)):
+    monkeypatch.setattr(plans, "SIZE_SEEDS", 24)
+    monkeypatch.setattr(plans, "TRAINING_SEEDS", 4)
+    monkeypatch.setattr(sizes, "size_ladder", lambda name: ladder)
+    monkeypatch.setattr(sizes, "ALL_UP_TO", 0 if large else 12)
+    true = NOMINAL.true
+    model = {**true, "process_noise_cov": tuple(q * v for v in true["process_noise_cov"])}
+    plan, choice = Plan("enkf", (NOMINAL,)), Choice("enkf", model, {"ensemble_size": 40, "inflation": 1.0})
+    return ensemble_sizes(choice, plan, plan.training_data(), consistent)
+
+
+@pytest.mark.parametrize("consistent", [False, True])
+def test_the_sufficient_size_is_that_of_all_sizes_on_all_seeds(monkeypatch, consistent):
+    whole, few = (rows_on(monkeypatch, large, consistent) for large in (False, True))
+    assert sufficient_size(few, consistent) == sufficient_size(whole, consistent) == 80
+    assert [row.seeds for row in whole] == [24] * 4 and [row.seeds for row in few] == [FEW, FEW, 24, 24]
+    for one, other in zip(few, whole, strict=True):
+        np.testing.assert_array_equal(one.evaluation.mean_squares, other.evaluation.mean_squares[: one.seeds])
+    assert few[2].ratio == whole[2].ratio and few[2].outside == whole[2].outside
+    assert few[0].ratio.low > 1.0 + SIZE_TOLERANCE
+
+
+def test_where_no_size_is_consistent_all_count(monkeypatch):
+    rows = rows_on(monkeypatch, True, consistent=True, q=100.0, ladder=(5, 80))
+    assert all(row.outside > 0 for row in rows) and sufficient_size(rows, consistent=True) == 80

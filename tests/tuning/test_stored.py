@@ -1,14 +1,20 @@
-"""What a tuned file and a study keep of long work reads as it was; `verify` says whether a file's metrics hold."""
+"""What a tuned file and a study keep of long work reads as it was; digests, and numbers that are computed once."""
 
 import json
 import math
+import os
+import re
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import optuna
 import pytest
 
 from filters.consistency.nees import Interval
 from filters.tuned_file import read_tuned_file, sealed
+from tests.filters.checks import refused
 from tests.tuned_files import rewrite, write_untuned
 from tuning.api import report
 from tuning.api.held_out import HeldOut
@@ -20,6 +26,9 @@ from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.tuned import metrics, read_tuned, write_tuned
 from tuning.evaluation.worth import scaling_sentence, tuning_effect
 from tuning.plants.thruster import find_scenario
+from tuning.problems import model_problem
+from tuning.problems.find import find_problem
+from tuning.problems.model_problem import cached_numbers
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
@@ -151,9 +160,7 @@ def test_a_number_that_is_missing_or_none_differs(content, file):
     ],
 )
 def test_a_file_without_metrics_is_refused_in_one_line(content, file, held_out, rule):
-    with pytest.raises(ValueError, match=rule) as error:
-        verify(file({**content, "held_out": held_out}))
-    assert "\n" not in str(error.value)
+    refused(rule, verify, file({**content, "held_out": held_out}))
 
 
 def test_the_command_says_whether_they_hold_and_exits_so(content, file, thruster):
@@ -188,3 +195,166 @@ def test_a_file_from_before_the_scaled_default_holds(content, file):
     wrong = json.loads(json.dumps(content))
     wrong["held_out"]["mismatch"]["scaled_default"]["factor"] *= 2
     assert [one.place for one in verify(file(wrong)).differences] == ["mismatch: scaled_default factor"]
+
+
+class Code:
+    """What tells a folder, as compiled code does."""
+
+    def __init__(self, folder):
+        self.folder = folder and str(folder)
+
+
+@pytest.fixture
+def ask(monkeypatch, tmp_path):
+    """Ask for two numbers in a fresh process, so to speak; `ask.computed` counts."""
+    monkeypatch.setattr(model_problem, "_known", {})
+
+    def ask(follows_from=b"it", value=(0.1, 1e-300), folder=tmp_path / "cache", fresh=True):
+        if fresh:
+            model_problem._known.clear()
+
+        def compute():
+            ask.computed += 1
+            return np.array(value)
+
+        return cached_numbers("bound", 2, follows_from, Code(folder), compute)
+
+    ask.computed = 0
+    return ask
+
+
+def test_another_process_finds_the_same_digits(ask, tmp_path):
+    first, second = ask(), ask()
+    assert first.tolist() == second.tolist() == [0.1, 1e-300] and ask.computed == 1
+    (file,) = (tmp_path / "cache").iterdir()
+    assert re.fullmatch(r"bound-[0-9a-f]{32}\.json", file.name)
+    first[:] = 0.0  # of the caller alone
+    assert ask(fresh=False).tolist() == [0.1, 1e-300]
+
+
+def test_what_they_follow_from_and_the_processor_tell_them_apart(ask, monkeypatch):
+    ask(), ask(b"something else", (3.0, 4.0))
+    assert ask().tolist() == [0.1, 1e-300] and ask(b"something else").tolist() == [3.0, 4.0] and ask.computed == 2
+    monkeypatch.setattr("thruster_env.graphs.machine_code.host", lambda: "another processor")
+    assert ask(value=(5.0, 6.0)).tolist() == [5.0, 6.0]
+
+
+@pytest.mark.parametrize("content", [b"", b"[1.0]", b"[1.0, NaN]", b'{"a": 1}', b'["x", 1]', b"\xff", b"[1, [2]]"])
+def test_a_damaged_file_is_as_none(ask, tmp_path, content):
+    ask()
+    (file,) = (tmp_path / "cache").iterdir()
+    file.write_bytes(content)
+    assert ask().tolist() == [0.1, 1e-300] and ask.computed == 2
+
+
+def test_without_a_folder_they_last_as_long_as_the_process(ask, tmp_path):
+    ask(folder=None), ask(folder=None, fresh=False)
+    assert ask.computed == 1
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    assert ask(folder=blocked / "below").tolist() == [0.1, 1e-300] and os.path.isfile(blocked)
+
+
+def test_numbers_that_are_not_finite_are_not_kept(ask):
+    assert np.isnan(ask(value=(np.nan, 1.0))).any() and ask().tolist() == [0.1, 1e-300]
+
+
+REACTOR = '''
+import math
+from typing import NamedTuple
+
+from filters import StateSpaceModel
+from rates import ACTIVATION
+from tuning.problems.model_problem import ModelProblem
+
+
+class Constants(NamedTuple):
+    dt: float
+    exchange: float
+
+
+def move(x, u, p):
+    k = 7.2e10 * math.exp(-ACTIVATION / x[1])
+    return (
+        x[0] + p.dt * (1.0 - x[0] - k * x[0]),
+        x[1] + p.dt * (350.0 - x[1] + 209.2 * k * x[0] + p.exchange * (u[0] - x[1])),
+    )
+
+
+def look(x, p):
+    return (x[1],)
+
+
+def model(exchange):
+    return StateSpaceModel(
+        transition=move, observe=look, constants=Constants(0.02, exchange), process_noise_cov=[1e-6, 0.04],
+        measurement_noise_cov=[0.25], prior_mean=[0.9, 320.0], prior_cov=[0.01, 25.0], inputs=1,
+    )
+
+
+problem = ModelProblem(model(2.092), model(2.0), inputs=[[290.0]] * 120, dt=0.02)
+'''  # fmt: skip
+COUNTING = """
+import json, sys
+import tuning.problems.model_problem as bound
+from thruster_env.graphs import machine_code
+
+found = {"compiled": 0, "bounds": 0}
+of_llvm = machine_code._compiled
+def compiled(*given):
+    found["compiled"] += 1
+    return of_llvm(*given)
+machine_code._compiled = compiled
+computed = bound.posterior_variances
+def posterior_variances(*given, **named):
+    found["bounds"] += 1
+    return computed(*given, **named)
+bound.posterior_variances = posterior_variances
+import tuning.reporting.page as sketchbook
+from tuning.cli.main import main
+sketchbook.figure_svg = lambda *_: ("<svg></svg>", "")  # to draw takes most of a report's time
+for words in json.loads(sys.argv[1]):
+    sys.argv[:] = ["thruster", *words, "--problem", "reactor:problem"]
+    try:
+        main()
+    except SystemExit as stop:
+        assert not stop.code, (words, stop.code)
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture
+def reactor(tmp_path):
+    """A user's folder, and a process that runs commands in it and tells what was compiled and computed."""
+    (tmp_path / "reactor.py").write_text(REACTOR)
+    (tmp_path / "rates.py").write_text("ACTIVATION = 8750.0\n")
+
+    def run(*lines):
+        command = [sys.executable, "-c", COUNTING, json.dumps([line.split() for line in lines])]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout.splitlines()[-1])
+
+    return run
+
+
+@pytest.mark.slow
+def test_a_second_run_compiles_nothing_and_computes_no_bound_anew(reactor):
+    compare = "compare --filter ekf tuned.json"
+    reactor("tune --filter ekf --trials 2 --out tuned.json --seed 1", compare)
+    assert reactor("report tuned.json", compare) == {"compiled": 0, "bounds": 0}
+
+
+@pytest.mark.slow
+def test_a_number_that_the_model_imports_changes_the_bound(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "reactor.py").write_text(REACTOR)
+    scales = []
+    for activation in (8750.0, 8900.25):  # of other lengths: Python tells files of one second apart by these
+        (tmp_path / "rates.py").write_text(f"ACTIVATION = {activation}\n")
+        for name in ("reactor", "rates"):
+            sys.modules.pop(name, None)
+        scales.append(find_problem("reactor:problem").scale)
+    for name in ("reactor", "rates"):
+        sys.modules.pop(name, None)
+    assert abs(scales[1][0] / scales[0][0] - 1) > 0.01

@@ -9,6 +9,7 @@ import pytest
 from optuna.trial import TrialState
 
 from filters.tuned_file import sealed
+from tests.filters.checks import refused
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.plants.thruster import find_scenario
@@ -67,8 +68,7 @@ def test_a_resumed_study_counts_what_is_there_and_does_not_repeat_it(tmp_path):
 def test_a_study_for_something_else_is_refused(tmp_path):
     storage = open_storage(str(tmp_path / "j"))
     study_in(storage)
-    with pytest.raises(ValueError, match="study 's' must be for .*'seed': 3.* but it was made for .*'seed': 0"):
-        study_in(storage, seed=3)
+    refused("study 's' must be for .*'seed': 3.* but it was made for .*'seed': 0", study_in, storage, seed=3)
 
 
 def test_ctrl_c_keeps_finished_trials(tmp_path):
@@ -124,8 +124,7 @@ def test_a_torn_first_line_is_cut_off_and_another_file_is_left_alone(tmp_path, b
         storage = open_storage(str(path))
     assert len(run_study(study_in(storage), PLAN, 2).trials) == 2
     path.write_text("hello")
-    with pytest.raises(ValueError, match="it is no journal"):
-        open_storage(str(path))
+    refused("it is no journal", open_storage, str(path))
     assert path.read_text() == "hello"
 
 
@@ -164,8 +163,7 @@ def test_a_killed_process_loses_its_running_trial_only(tmp_path):
 def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(tmp_path, content, rule):
     path = tmp_path / "notes.txt"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=f"storage must be a journal file.*{rule}"):
-        open_storage(str(path))
+    refused(f"storage must be a journal file.*{rule}", open_storage, str(path))
     assert path.read_bytes() == content
 
 
@@ -203,8 +201,6 @@ def test_a_tuned_file_edited_by_hand_is_refused(tmp_path, change, rule):
     content = json.loads(path.read_text())
     content["filter"]["model"].update(change)
     path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match="a tuned file must be unchanged"):
-        read_tuned(path)
+    refused("a tuned file must be unchanged", read_tuned, path)
     path.write_text(json.dumps(sealed(content)))
-    with pytest.raises(ValueError, match=rule):
-        read_tuned(path)
+    refused(rule, read_tuned, path)

@@ -11,6 +11,7 @@ from filters.engine.batch import run
 from filters.estimators.foreign import ForeignFilter
 from filters.learned.estimator import Track, unit_scales
 from filters.learned.filters import LEARNED, read
+from tests.filters.checks import refused
 from tests.models import plane_model
 from tuning.evaluation.evaluate import values_of
 from tuning.learning import (
@@ -161,8 +162,7 @@ def test_the_function_trains_stores_compares_and_continues(tmp_path, runs):
     assert training.plot_training().axes[0].get_xlabel() == "updates of the weights"
     page = training.report(tmp_path / "page.html").read_text()
     assert "recursive-kalmannet trained on plane" in page and page.count("<svg") == 2
-    with pytest.raises(ValueError, match="must end in .html"):
-        training.report(tmp_path / "page.pdf")
+    refused("must end in .html", training.report, tmp_path / "page.pdf")
     comparison = tuning.compare(["ekf", path], PROBLEM, seeds=6)
     assert comparison.filters == ("ekf", "mine")
     score = comparison.boards[0].rows[1].evaluation.score

@@ -72,16 +72,13 @@ def test_fields_are_listed_and_sought(thruster, as_json, tmp_path):
     ]
     assert f"{name}.output[1]" in said and "a.ulg: ULog, 6 fields" in said
     data = as_json("log", "a.ulg", "--only", "OUTPUTS.OUT")
-    assert data["format"] == "ULog" and [one["name"] for one in data["fields"]] == [
-        f"actuator_outputs.output[{k}]" for k in range(3)
-    ]
+    assert data["format"] == "ULog"
+    assert [one["name"] for one in data["fields"]] == [f"actuator_outputs.output[{k}]" for k in range(3)]
     first = data["fields"][0]
     assert (first["samples"], first["least"], first["greatest"], len(first["course"])) == (100, 0.0, 99.0, 8)
     assert first["longest_gap_s"] == pytest.approx(1.01) and first["rate_hz"] == pytest.approx(99 / 1.99)
-    assert (
-        thruster("log", "a.ulg", "--json", "out.json").stdout.startswith("a.ulg: ULog")
-        and (tmp_path / "out.json").exists()
-    )
+    assert thruster("log", "a.ulg", "--json", "out.json").stdout.startswith("a.ulg: ULog")
+    assert (tmp_path / "out.json").exists()
     for arguments, message in (
         (("a.ulg", "--only", "rudder"), "a field whose name contains 'rudder', but a.ulg has none among 6 fields"),
         (("a.csv", "--only", "x"), "--only must go with a recorder's file, .ulg, "),
@@ -117,9 +114,8 @@ def test_the_columns_of_a_table_that_is_no_thrusters_are_listed(thruster, as_jso
     (tmp_path / "tank.csv").write_text(f"time_s,level [m],valve\n{rows}\n")
     said = thruster("log", "tank.csv").stdout
     (line,) = [one for one in said.splitlines() if "level" in one]
-    assert (
-        line.split()[-9:-1] == ["9", "2", "0.5", "0", "4", "m", "0", "8"] and "tank.csv: table, 2 columns" in said
-    )
+    assert line.split()[-9:-1] == ["9", "2", "0.5", "0", "4", "m", "0", "8"]
+    assert "tank.csv: table, 2 columns" in said
     assert "Not read: valve (columns must hold numbers, but got 'off' in line 2" in said
     data = as_json("log", "tank.csv")
     assert [one["name"] for one in data["fields"]] == ["time_s", "level [m]"] and [*data["not_read"]] == ["valve"]

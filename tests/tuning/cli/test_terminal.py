@@ -1,6 +1,7 @@
-"""How the command line presents itself: version, panels, names, tables at any width, colour, progress."""
+"""How the command line presents itself: version, panels, names, filters, tables at any width, colour, progress."""
 
 import io
+import json
 import os
 import signal
 from pathlib import Path
@@ -11,13 +12,14 @@ from rich.console import Console
 
 from docs.scripts import DOCS, PAGES, made_by
 from filters.consistency.nees import Interval
-from filters.registry import FILTERS
+from filters.registry import FILTERS, filter_type
 from tests.linear_problem import LinearProblem
 from thruster_env.core.checks import any_case, listening, meant, one_of
-from thruster_env.core.text_tables import Table
+from thruster_env.core.text_tables import Table, console
 from tuning.api.tune import file_name
 from tuning.cli import output
 from tuning.cli.app import COMMANDS
+from tuning.cli.filters import entry
 from tuning.evaluation.baselines import ORACLE, RULE, rule_of_thumb
 from tuning.experiments import EXPERIMENTS
 from tuning.reporting.tuning_report import way_out
@@ -158,10 +160,8 @@ def test_a_tuning_that_made_it_worse_says_what_to_do_next():
     alone = {"answer": ..., "method": "likelihood", "plan": plan, "result": result}
     by_method = SimpleNamespace(**{**vars(tuning), **alone})
     (said,) = way_out(by_method)
-    assert (
-        said.startswith("What to take: the scaled default (Q11 = ")
-        and "without --method likelihood runs a study" in said
-    )
+    assert said.startswith("What to take: the scaled default (Q11 = ")
+    assert "without --method likelihood runs a study" in said
     logs = SimpleNamespace(tuned=SimpleNamespace(has_truth=False))
     logs.likelihood_gains = {
         "given": Interval(-20, -30, -10),
@@ -172,3 +172,45 @@ def test_a_tuning_that_made_it_worse_says_what_to_do_next():
     assert said.startswith("What to take: the rule of thumb (Q11 = ")
     comparison.ratios["scaled default"] = Interval(0.9, 0.8, 0.95)
     assert way_out(tuning) == way_out(by_method) == []
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_the_list_names_every_filter_and_number_and_fits_the_terminal(thruster, monkeypatch, width):
+    monkeypatch.setattr(console, "width", width)
+    code, out, _ = thruster("filters")
+    assert code == 0 and "…" not in out
+    assert max(map(len, out.splitlines())) <= width
+    first_words = [line.split()[0] for line in out.splitlines() if line.split()]
+    for name in FILTERS:
+        assert name in first_words
+        assert set(filter_type(name).numbers) <= set(first_words)
+    assert out.split().count("ensemble_size") == 3  # of members, particles, and few: shared lines are told once
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("width", [80, 120])
+def test_one_filter_is_shown_in_full(thruster, monkeypatch, name, width):
+    monkeypatch.setattr(console, "width", width)
+    code, out, _ = thruster("filters", name)
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= width
+    words = out.split()
+    documentation = entry(name).documentation
+    told = documentation.split("Attributes:")[0].split() + documentation.partition("Source:")[2].split()
+    assert set(told) <= set(words)
+    for number in entry(name).numbers:
+        assert {number.name, str(number.default), *number.meaning.split()} <= set(words)
+
+
+@pytest.mark.slow
+def test_it_tells_which_filters_fit_a_problem_and_what_a_belief_takes(thruster):
+    code, out, _ = thruster("filters", "--problem", "tuning.experiments.lorenz96:problem", "--json", "-")
+    found = {one["name"]: one for one in json.loads(out)["filters"]}
+    assert code == 0 and list(found) == list(FILTERS)
+    assert "affine model" in found["kf"]["reason"] and found["kf"]["kilobytes"] is None
+    assert found["etkf"]["reason"] == "" and found["etkf"]["ensemble_size"] == 30
+    assert found["ekf"]["kilobytes"] > 8e-3 * 3 * 40**2 and found["pf"]["kilobytes"] > 8e-3 * 1000 * 40
+    code, out, _ = thruster("filters", "ukf", "--problem", "nominal")
+    assert code == 0 and "nominal: 2 states, 1 measurement, 1 input" in " ".join(out.split()) and "ekf" not in out
+    code, _, err = thruster("filters", "--problem", "nowhere:problem")
+    assert code == 2 and "must be 'module:object' that can be imported" in err

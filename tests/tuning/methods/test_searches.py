@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from tests.filters.checks import refused
 from tests.tuning.methods.problems import P0, A, C, Q, R, at, linear, task_of
 from tuning.evaluation.evaluate import values_of
 from tuning.likelihood.gradient import tune_by_gradient
@@ -45,8 +46,7 @@ def test_slopes_by_matrices_of_diagonals_are_those_of_coordinates():
     _, by_q, by_r = goal.by_noise(goal.choice_at(point))
     slopes = np.concatenate([np.diag(by_q), np.diag(by_r)]) * goal.untuned
     np.testing.assert_allclose(goal(point).gradient, slopes, rtol=1e-9)
-    with pytest.raises(ValueError, match="must not be 'score'"):
-        goal.with_changes(objective=SCORE).by_noise(task.start)
+    refused("must not be 'score'", goal.with_changes(objective=SCORE).by_noise, task.start)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Learning: every arm and algorithm, going on after an interruption, and saved policies."""
+"""Learning: every arm and algorithm; it goes on after an interruption, a kill or a full disk; saved policies."""
 # ruff: noqa: F811 - fixtures come by import and go by name
 
 import os
@@ -8,15 +8,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("sb3_contrib")
+from tests.filters.checks import refused
 
-from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures
+pytest.importorskip("sb3_contrib")
+pytest.importorskip("stable_baselines3")
+
+import errno
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.fuzz.checkpoints import kill_training
+from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures  # noqa: E402, F401 - one is a fixture  # noqa: F401 - some are fixtures
 from tuning.policies.algorithms import ALGORITHMS, OBSERVATION_SETS
 from tuning.policies.environments import make_environments
-from tuning.policies.learn import VALIDATION_EPISODES, _episodes_after
+from tuning.policies.learn import VALIDATION_EPISODES, _episodes_after, mend
 from tuning.policies.saved import (
+    BEST,
     CHECKPOINTS,
+    EVALUATIONS,
     FINAL,
+    SETUP,
     configuration_from_json,
     find_saved,
     load,
@@ -37,11 +51,8 @@ def test_a_policy_learns_on_every_arm_and_is_scored(observe, tmp_path):
     seeds = held_out_seeds(0, 3)
     policy = load(find_saved(run.folder), make_environments(setup, seeds))
     scores = score(policy, setup, seeds)
-    assert (
-        scores.returns.shape == (3,)
-        and (scores.returns < 0).all()
-        and scores.parts["all"].steps.sum() == 3 * LIMIT
-    )
+    assert scores.returns.shape == (3,) and (scores.returns < 0).all()
+    assert scores.parts["all"].steps.sum() == 3 * LIMIT
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
@@ -179,3 +190,95 @@ def test_the_learning_rate_never_falls_below_zero(tmp_path):
     model = load(learn(setup, tmp_path / "ekf").folder / FINAL, make_environments(setup, [0])).model
     assert model.num_timesteps == 256 and model.lr_schedule(1.0) == setup.hyperparameters["learning_rate"]
     assert model.policy.optimizer.param_groups[0]["lr"] == 0.0 == model.lr_schedule(-0.1)
+
+
+def test_evaluations_that_find_no_room_do_not_spoil_those_before(tmp_path, monkeypatch):
+    setup = setup_of("raw")
+    savez, written = np.savez, []
+
+    def full(path, **arrays):
+        written.append(path)
+        if len(written) == 2:
+            with open(f"{path}.npz", "wb") as file:
+                file.write(b"PK")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        savez(path, **arrays)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savez", full)
+        with pytest.raises(OSError, match="No space left"):
+            learn(setup, tmp_path / "p")
+    with np.load(tmp_path / "p" / f"{EVALUATIONS}.npz") as kept:
+        assert kept["timesteps"].tolist() == [128]
+    trained = learn(setup, tmp_path / "p")
+    assert [steps for steps, _ in trained.curve][0] == 128 and trained.steps >= 256
+
+
+class Killed(BaseException):
+    """Like SIGKILL, an end that nothing catches."""
+
+
+def test_what_was_being_written_is_cleared_away_and_what_was_being_replaced_is_put_back(copied):
+    before, saved = contents(copied), copied / BEST
+    shutil.copytree(saved, copied / CHECKPOINTS / ".000000300.x1y2z3")
+    shutil.copytree(saved, copied / ".final.gone")
+    (copied / f".{SETUP}.abc").write_text("{")
+    (copied / ".evaluations.npz").write_bytes(b"PK half")
+    os.replace(saved, copied / ".best.old")
+    mend(copied)
+    assert contents(copied) == before
+    shutil.copytree(saved, copied / ".best.old")
+    (copied / ".best.old" / SETUP).write_text("of before")
+    mend(copied)
+    assert contents(copied) == before
+
+
+def test_a_training_that_was_killed_before_its_setup_was_there_starts_anew(tmp_path):
+    (tmp_path / f".{SETUP}.abc").write_text("{")
+    assert learn(setup_of(steps=128), tmp_path).learnt == 128
+    assert not list(tmp_path.rglob(".*"))
+
+
+def test_a_folder_of_something_else_is_left_as_it_is(tmp_path):
+    (tmp_path / ".best.old").write_text("mine")
+    (tmp_path / "notes").write_text("mine")
+    before = contents(tmp_path)
+    refused("the folder must be new, empty or that of a training", learn, setup_of(steps=128), tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_an_end_while_evaluations_are_written_leaves_those_of_before(copied, monkeypatch):
+    before = (copied / "evaluations.npz").read_bytes()
+
+    def half(path, **arrays):
+        with open(f"{path}.npz".replace(".npz.npz", ".npz"), "wb") as stream:
+            stream.write(b"PK")
+        raise Killed
+
+    longer = setup_of(steps=512)
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(np, "savez", half)
+        learn(longer, copied)
+    assert (copied / "evaluations.npz").read_bytes() == before
+    assert learn(longer, copied).steps == 512
+
+
+def test_an_end_while_a_policy_is_removed_leaves_none_that_is_half_there(copied, monkeypatch):
+    def half(path, **options):
+        if path.exists():
+            (path / "normalisation.pkl").unlink()
+            raise Killed
+
+    longer = setup_of(steps=512)
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(shutil, "rmtree", half)
+        learn(longer, copied)  # whose final policy becomes a checkpoint that is there already
+    assert not (copied / FINAL).exists() and steps_of(find_saved(copied)) == 256
+    assert learn(longer, copied).learnt == 256
+
+
+@pytest.mark.slow
+def test_a_training_that_is_killed_loses_no_more_than_the_steps_since_its_checkpoint(monkeypatch):
+    monkeypatch.setattr("tests.fuzz.checkpoints.STEPS", 1024)
+    monkeypatch.setattr("tests.fuzz.checkpoints.BETWEEN", 16)  # with 64 checkpoints
+    assert kill_training(np.random.default_rng(0), 1, 600).startswith("1 kills")

@@ -4,6 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from tests.filters.checks import refused
+
 pytest.importorskip("stable_baselines3")
 
 from gymnasium.wrappers import TimeLimit
@@ -97,8 +99,7 @@ def test_attributes_and_methods_are_those_of_all_copies():
     assert [model.n for model in venv.env_method("state_space_model", operating_voltage=3.0)] == [2] * COPIES
     assert venv.env_is_wrapped(TimeLimit) == [False] * COPIES and not is_wrapped(venv, TimeLimit)
     assert venv.render_mode is None
-    with pytest.raises(ValueError, match="indices must be None, for the copies are one object, but got 0"):
-        venv.set_attr("mark", 5, indices=0)
+    refused("indices must be None, for the copies are one object, but got 0", venv.set_attr, "mark", 5, indices=0)
 
 
 def test_only_envs_that_reset_within_the_step_are_taken():
@@ -106,8 +107,7 @@ def test_only_envs_that_reset_within_the_step_are_taken():
         ValueError, match="make_vec.*autoreset_mode='SameStep'.*, but got one with autoreset mode 'NextStep'"
     ):
         native(autoreset_mode="NextStep")
-    with pytest.raises(ValueError, match="env must be a vector env, of gym.make_vec"):
-        NativeVecEnv(gym.make("BowThruster-v0"))
+    refused("env must be a vector env, of gym.make_vec", NativeVecEnv, gym.make("BowThruster-v0"))
 
 
 class Still:

@@ -62,9 +62,8 @@ def tab(bench, monkeypatch):
 
 def test_a_tab_begins_with_every_knob_and_the_figures(tab, bench):
     told = tab.ask("hello", width=600, dark=True)
-    assert told["answers"] == 1 and [knob["name"] for knob in told["spec"]["knobs"]] == [
-        one.name for one in bench.knobs
-    ]
+    assert told["answers"] == 1
+    assert [knob["name"] for knob in told["spec"]["knobs"]] == [one.name for one in bench.knobs]
     assert told["values"] == pytest.approx(bench.start) and "NIS" in told["figures"]
     assert tab.session.pictures.nis.figure.yaxis[0].major_label_text_color == DARK.axis
 

@@ -1,16 +1,39 @@
-"""The study on standard errors of identified parameters, in a quick form."""
+"""Delays of alarms and standard errors of identified parameters, in the quick forms of their studies."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from filters.monitoring import cusum_threshold
+from tests.filters.checks import refused
 from thruster_env.thruster.model import Recorder
 from thruster_env.thruster.plant import make_plant
+from tuning.experiments.faults import BIASES, LOST_BLADES, PLANTS, best_delay, delays
 from tuning.experiments.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study
 from tuning.likelihood.recorded import likelihood_of
 from tuning.plants.thruster_logs import ThrusterFamily
 from tuning.problems.problem import Coordinates
+
+
+def test_larger_faults_of_the_thruster_are_found_sooner_and_none_without_one():
+    found = delays(PLANTS[0], runs=12)
+    steps = [found[f"bias of {size:g} sigma"].median for size in BIASES]
+    assert steps == sorted(steps, reverse=True) and steps[-1] <= 3
+    assert found["none"].found <= 1 / 12 and found["stuck"].found == 1.0 and found[LOST_BLADES].found == 1.0
+    assert found["noise doubled"].first == "variance" and math.isfinite(found["stuck"].median)
+
+
+def test_the_best_delay_is_that_of_simulated_cusums():
+    rng, shift = np.random.default_rng(0), 1.5
+    h, total = cusum_threshold(1000.0, 0.5 * shift, sides=1), 0
+    for _ in range(4000):
+        g, steps = 0.0, 0
+        while g < h:
+            g, steps = max(0.0, g + shift + rng.standard_normal() - 0.5 * shift), steps + 1
+        total += steps
+    assert best_delay(shift, 1000.0) == pytest.approx(total / 4000, rel=0.04)
 
 
 @pytest.mark.slow
@@ -28,8 +51,7 @@ def test_estimates_lie_within_their_standard_errors_of_the_truth():
 
 
 def test_one_repetition_is_refused():
-    with pytest.raises(ValueError, match="repetitions must be a whole number of at least 2, but got 1"):
-        study(1)
+    refused("repetitions must be a whole number of at least 2, but got 1", study, 1)
 
 
 def test_a_clock_that_is_ahead_is_found_where_it_is_and_not_where_interpolation_hides_noise():

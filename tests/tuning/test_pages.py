@@ -1,14 +1,17 @@
-"""Which filter, which N for the vehicle: claims of docs/auv.md in a quick form, and by its tables."""
+"""Tables of docs/appendix on filters of the vehicle and a wrong model: what pages claim, in a quick form."""
 
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from docs.scripts import main
 from docs.scripts.auv import EKF, FILTERS, MOTION, NAVIGATION, TABLES, about, restless, rows_of, small
+from docs.scripts.tuning import LIFT, RIGHT, SLOPES, UNKNOWNS, bought, lifted, plans
 from filters.consistency.nees import Interval
-from tuning.plants.auv import find_scenario
+from tuning.plants import auv
+from tuning.plants.thruster import find_scenario
 
 PAGE = (Path(__file__).parents[2] / "docs" / "appendix" / "auv.md").read_text()
 BAND = (0.8, 1.25)  # of the mean NIS over what is right, as a study holds it
@@ -66,7 +69,7 @@ def test_there_nothing_cures_50_members_at_1_khz():
 @pytest.mark.slow
 def test_fifty_members_claim_too_much_and_relaxation_with_inflation_cures_it():
     """With 6 runs of 25 s the NEES of 50 members, of some 21, is known to within 1.5 at 95 %."""
-    scenario = find_scenario("auv:papers_20hz").replace(steps=500)
+    scenario = auv.find_scenario("auv:papers_20hz").replace(steps=500)
     cured = small("enkf", inflation=1.05, relaxation=0.3)
     ekf, few, cure = (row.evaluation for row in rows_of(scenario, [EKF, small("enkf"), cured], 6))
     assert ekf.nees.high < 9 and few.nees.low > 16 and cure.nees.high < 10
@@ -75,7 +78,7 @@ def test_fifty_members_claim_too_much_and_relaxation_with_inflation_cures_it():
 
 
 def test_restless_angles_are_the_model_s_and_no_other_number_changes():
-    scenario = find_scenario("auv:papers_20hz")
+    scenario = auv.find_scenario("auv:papers_20hz")
     known, changed = small("enkf").filter(scenario), restless(small("enkf"), 1e-6).filter(scenario)
     before, after = known.model.process_noise_cov.diagonal(), changed.model.process_noise_cov.diagonal()
     assert after[6:].tolist() == [1e-6, 1e-6] and after[:6].tolist() == before[:6].tolist()
@@ -96,3 +99,36 @@ def test_only_the_table_that_is_asked_for_is_made(tmp_path, monkeypatch):
     assert page.read_text() == (
         "<!-- table filters_fast -->\n<!-- end -->\n<!-- table filters_drag -->\nnew\n<!-- end -->\n"
     )
+
+
+MISMATCH = find_scenario("mismatch")
+
+
+def test_the_factor_on_the_lift_is_that_of_the_parameters():
+    model = lifted(MISMATCH, measurement_noise_cov=0.3)
+    plain = MISMATCH.model(parameter_factors={"lift_coefficient": 1.15 * 0.8, "voltage_gain": 0.95})
+    constants = model.constants._replace(**{LIFT: 0.8})
+    state, voltage = np.array([150.0, 1.2]), np.array([7.0])
+    for name, arguments in (("observe", (state,)), ("transition", (state, voltage))):
+        ours, known = (
+            getattr(model, name)(*arguments, constants),
+            getattr(plain, name)(*arguments, plain.constants),
+        )
+        np.testing.assert_allclose(ours, known, rtol=1e-12)
+    assert len(SLOPES) == 8 and model.measurement_noise_cov[0, 0] == 0.3
+
+
+@pytest.mark.slow
+def test_lift_and_voltage_gain_as_states_buy_what_no_q_can():
+    names = "`ekf`, Q and R", "`ekf` + lift and K2", RIGHT
+    lines = bought(trials=1, rows=names, seeds=20).splitlines()[2:]
+    rows = [line.strip("| ").split(" | ") for line in lines]
+    ratios = [float(row[1].split()[0]) for row in rows]
+    assert [row[0] for row in rows] == ["`ekf`, scaled default", *names]
+    assert ratios[0] == 1.0 and 0.25 < ratios[3] < ratios[2] < 0.6 < ratios[1] < 1.0  # by the baselines alone
+    assert float(rows[2][4]) < 3.0 < 10.0 < float(rows[0][4])  # the NEES says that no covariance holds a bias
+
+
+def test_a_full_q_is_searched_where_the_table_says_so():
+    assert [plan.full_q for plan in plans().values()] == [False, True, False, False, False, False]
+    assert all("`ekf` + " not in name for name in plans()) and len(UNKNOWNS) == 5
