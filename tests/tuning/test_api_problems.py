@@ -11,11 +11,11 @@ import thruster_env  # noqa: F401 - registers the env
 import tuning
 from filters import EstimateState
 from tests.filters.checks import refused
+from tests.models import affine
 from tests.pendulum_problem import problem as pendulum
 from tests.small_problems import pair
 from thruster_env.logs.log import Log
 from thruster_env.logs.write import write_log
-from thruster_env.model.affine import affine_model
 from thruster_env.model.simulate import simulate
 from tuning.api.problems import problem_of, problems_of
 from tuning.problems.assumed import may_estimate_constants
@@ -25,17 +25,10 @@ from tuning.problems.log_problem import LogProblem
 
 
 def cart(dt=0.1):
-    return affine_model(
-        A=[[1.0, dt], [0.0, 0.9]],
-        B=[[0.0], [dt]],
-        C=[[1.0, 0.0]],
-        Q=[1e-4, 1e-3],
-        R=[1e-2],
-        P0=[1.0, 1.0],
-        states=[("place", "p", "m"), ("speed", "v", "m/s")],
-        input_quantities=[("push", "F", "N")],
-        measurements=[("tape", "z", "m")],
-    )
+    quantities = {"states": [("place", "p", "m"), ("speed", "v", "m/s")], "measurements": [("tape", "z", "m")]}
+    noise = {"q": [1e-4, 1e-3], "r": [1e-2], "mean": [0.0, 0.0], "cov": [1.0, 1.0]}
+    of_input = {"input_quantities": [("push", "F", "N")]}
+    return affine([[1.0, dt], [0.0, 0.9]], [[0.0], [dt]], [[1.0, 0.0]], **noise, **quantities, **of_input)
 
 
 @pytest.fixture(scope="module")
@@ -74,10 +67,8 @@ def test_recorded_runs_are_the_same_in_any_form(logs, tmp_path):
         np.testing.assert_allclose(got.inputs, wanted.inputs, rtol=1e-12)
     assert [log.name for log in problem_of((cart(), columns)).logs] == ["run1", "run2"]
     assert [log.name for log in problem_of((cart(), logs)).logs] == ["log 0", "log 1"]
-    assert (
-        problem_of(tuning.read_logs(frames, model=cart(), held_out="run2")).parts.held_out
-        != problem_of((cart(), frames)).parts.held_out
-    )
+    named = problem_of(tuning.read_logs(frames, model=cart(), held_out="run2"))
+    assert named.parts.held_out != problem_of((cart(), frames)).parts.held_out
 
 
 def test_tuning_on_a_model_and_frames_finds_a_filter(logs):

@@ -47,7 +47,6 @@ from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import Parameter
 from tuning.reporting.choice_words import gains
 from tuning.reporting.tuning_report import consistency_sentence
-from tuning.search.parameters import correlations_of, full_covariance
 from tuning.search.plan import TRAINING_SEEDS, nis_ratio
 from tuning.search.space import oracle_choice, untuned_choice
 
@@ -183,15 +182,6 @@ def test_residuals_are_those_of_the_model_step_by_step():
     np.testing.assert_allclose(found.process[k], data.states[0, late + k + 1] - x, rtol=1e-9, atol=1e-12)
     seen = model.observe(tuple(data.states[0, late + k]), model.constants)
     np.testing.assert_allclose(found.measurement[k], data.measurements[0, late + k] - seen, rtol=1e-9)
-
-
-def test_correlations_of_a_singular_covariance_are_none():
-    g = np.array([1.0, 2.0, 0.0])
-    singular = np.outer(g, g) + np.diag([0.0, 0.0, 3.0])
-    assert np.isfinite(correlations_of(singular)).all() and np.isfinite(correlations_of(np.zeros((2, 2)))).all()
-    np.testing.assert_allclose(full_covariance(np.diag(singular), correlations_of(singular)), singular, rtol=1e-2)
-    regular = np.array([[2.0, 0.3, -0.1], [0.3, 1.0, 0.4], [-0.1, 0.4, 0.5]])
-    np.testing.assert_allclose(full_covariance(np.diag(regular), correlations_of(regular)), regular, rtol=1e-12)
 
 
 def test_equal_filters_are_known_as_equal():

@@ -90,11 +90,6 @@ def test_a_study_cannot_be_run_on_a_task():
         find_method("tpe").run("tpe", Task("kf", problem, problem.data([0])))
 
 
-def test_an_unknown_method_is_refused_in_one_line(thruster):
-    unknown = thruster("methods", "magic")
-    assert unknown.returncode == 2 and "method must be one of" in unknown.stderr and "'magic'" in unknown.stderr
-
-
 @pytest.mark.slow
 def test_the_command_follows_a_method(as_json, thruster):
     told = as_json("tune", "--filter", "enkf", "--problem", "nominal", "--method", "desroziers", "--trials", 4)

@@ -95,14 +95,6 @@ def test_parameters_of_the_users_own_give_way_to_a_noise_that_they_cannot_give()
         assert not _wins(slightly, _met((1.0, 1.0, 1.0), name=name), plan, True)
 
 
-def test_consistency_alone_wins_only_where_nothing_can_be_lost():
-    wrong = _met((1.0, 1.0, 1.0), consistent=False)
-    assert _wins(_met((1.00001, 0.99998, 1.00004)), wrong, PLAN, True)
-    assert not _wins(_met((1.00001, 0.999, 1.001)), wrong, PLAN, True)
-    assert not _wins(_met((1.00001, 0.99998, 1.00004), consistent=False), wrong, PLAN, True)
-    assert not _wins(_met((1.00001, 0.99998, 1.00004)), wrong, PLAN._replace(consistent=False), True)
-
-
 def _blocks(*logs):
     """Filters by their differences in blocks of logs, (B,) each, and one with none."""
     values, numbers = np.concatenate(logs), np.repeat(range(len(logs)), [len(one) for one in logs])

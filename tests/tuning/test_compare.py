@@ -168,19 +168,6 @@ def test_the_command_ranks_filters_on_scenarios(command, tmp_path):
     assert len(row["rmse_over_first"]) == 2 and row["microseconds_a_step"] > 0
 
 
-@pytest.mark.slow
-def test_the_command_takes_sizes_augmentation_and_scenario_files(command, tmp_path):
-    (tmp_path / "my.toml").write_text('base = "ambient"\nsteps = 100\nscale = [1.0, 0.05]\n')
-    options = ("--filter", "ekf", "--filter", "enkf", "--filter", "low-pass", "--ensemble-size", "enkf=12")
-    code, out, _ = command(
-        *options, "--augment", "ambient_velocity:0.4:0.01", "--scenario", "my.toml", "--seeds", 4, "--json", "-"
-    )
-    labels = ["ekf", "ekf + U_0", "enkf 12", "enkf 12 + U_0", "low-pass"]
-    filters = json.loads(out)["scenarios"]["my.toml"]["filters"]
-    assert code == 0 and list(filters) == labels
-    assert filters["low-pass"]["nees"] is None and filters["low-pass"]["median_nees"] is None
-
-
 def test_the_command_takes_tuned_files(command, tmp_path):
     scenario = find_scenario("mismatch")
     choice = untuned_choice("enkf", scenario)
@@ -223,27 +210,6 @@ def test_by_default_a_filter_without_a_scaled_default_has_what_its_model_came_wi
     line = "Q and R: those that the model came with (--knows given). There is no scaled default: no factor on Q"
     assert line in " ".join(out.split())
     assert refused == 2 and "ekf must have a scaled default on of_their_own:problem, but no factor on Q" in rule
-
-
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (("--scenario", "no.toml"), "a scenario file must be readable, but no.toml is not"),
-        (("--ensemble-size", "many"), "ensemble_size (--ensemble-size) must be a finite number, but got 'many'"),
-        (("--ensemble-size", "ekf=5"), "(--ensemble-size) must be for a filter with an ensemble, but got ekf: 5"),
-        (("--augment", "ambient_velocity:x"), "--augment) must be NAME, NAME:STD, NAME:STD:WALK or"),
-        (("--filter", "ekf", "--augment", "colour"), "a constant to estimate must be one of motor_damping"),
-        (("--filter", "ekf", "--augment", "load_gain:-1"), "std of load_gain must be positive, but got -1.0"),
-        (
-            ("auv:navigation",),
-            "must be a name or a file, but got the problem auv:navigation: use problem (--problem)",
-        ),
-        (("missing.safetensors", "--filter", "ekf"), "a trained estimator must be a file, but there is none"),
-    ],
-)
-def test_a_users_mistake_is_one_clear_line_and_exit_code_2(arguments, line, command):
-    code, _, errors = command(*arguments)
-    assert code == 2 and line in errors and "Traceback" not in errors
 
 
 def ranked(name, contenders, seeds=24):

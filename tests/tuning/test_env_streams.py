@@ -7,8 +7,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from filters import EstimateState, StateSpaceModel
+from filters import EstimateState
 from tests.filters.checks import refused
+from tests.models import state_space
 from tests.pendulum_problem import model as pendulum_model
 from tests.thruster_env.core.test_streams import largest_correlation
 from thruster_env.env.model_env import ModelEnv
@@ -21,15 +22,8 @@ BAND = 5.0  # standard deviations of a correlation of independent draws: level 1
 
 
 def model(gain=1.0, noise=0.04):
-    return StateSpaceModel(
-        transition=lambda x, u, c: (0.5 * x[0] + gain * u[0],),
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[1.0 / 3.0],
-        measurement_noise_cov=[noise],
-        prior_mean=[0.0],
-        prior_cov=[1.0],
-        inputs=1,
-    )
+    move, look = (lambda x, u, c: (0.5 * x[0] + gain * u[0],)), (lambda x, c: (x[0],))
+    return state_space(move, look, q=[1.0 / 3.0], r=[noise], mean=[0.0], cov=[1.0])
 
 
 class Leaky(gym.Env):
@@ -156,9 +150,7 @@ class Seeded(Forgetful):
 
 
 def test_a_policy_that_remembers_is_reset_with_each_episode_or_refused():
-    rule = (
-        "runs of problem an env must be a function of the seed, but in two of seed 0 the inputs differ from step 0"
-    )
+    rule = "an env must be a function of the seed, but in two of seed 0 the inputs differ from step 0"
     refused(rule, problem(Forgetful()).data, [0, 1])
     for policy in (Reset(), Reset().__call__):
         data = problem(policy).data([0, 1])
@@ -220,7 +212,8 @@ class Buffered(Leaky):
     def step(self, action):
         super().step(action)
         action *= 7.0
-        return self.shown()[0], 0.0, False, False, self.told
+        seen, told = self.shown()
+        return seen, 0.0, False, False, told
 
     def shown(self):
         for array in (self.seen, self.told["state"], self.told["measurement"]):
@@ -229,22 +222,11 @@ class Buffered(Leaky):
 
 
 class BufferedObservation(Buffered):
+    """What it measures is its observation alone."""
+
     def shown(self):
-        super().shown()
-        self.told.pop("measurement", None)
-        return self.seen, self.told
-
-    def __init__(self):
-        super().__init__()
-        self.told = {"state": np.zeros(1), "measurement": np.zeros(1)}
-
-    def step(self, action):
-        self.told["measurement"] = np.zeros(1)
-        return super().step(action)
-
-    def reset(self, *, seed=None, options=None):
-        self.told["measurement"] = np.zeros(1)
-        return super().reset(seed=seed)
+        seen, told = super().shown()
+        return seen, {"state": told["state"]}
 
 
 @pytest.mark.parametrize("env", [Buffered, BufferedObservation])

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import tuning
-from filters import affine_model, make_filter, run
+from filters import make_filter, run
 from filters.augmented import Unknown
 from filters.consistency.nees import Interval
 from tests.filters.checks import refused
 from tests.linear_problem import LinearProblem
+from tests.models import affine, state_space
 from thruster_env.core.text_tables import plain_text
-from thruster_env.model.state_space import StateSpaceModel
 from tuning.api.report import _plan
 from tuning.evaluation.baselines import baselines, rule_of_thumb, same_filter
 from tuning.evaluation.evaluate import NOTHING
@@ -43,16 +43,8 @@ class Drag(NamedTuple):
 
 def cart(q=0.0):
     """A cart whose position is measured to 20 mm and which nothing disturbs."""
-    return affine_model(
-        a=[[1.0, DT], [0.0, 1.0]],
-        b=[[0.0], [DT]],
-        c=[[1.0, 0.0]],
-        process_noise_cov=[q, q],
-        measurement_noise_cov=4e-4,
-        prior_mean=[0.0, 0.0],
-        prior_cov=[1.0, 1.0],
-        states=["position", "velocity"],
-    )
+    noise = {"q": [q, q], "r": 4e-4, "mean": [0.0, 0.0], "cov": [1.0, 1.0]}
+    return affine([[1.0, DT], [0.0, 1.0]], [[0.0], [DT]], [[1.0, 0.0]], **noise, states=["position", "velocity"])
 
 
 @pytest.fixture(scope="module")
@@ -106,16 +98,12 @@ def test_a_filter_that_sleeps_as_the_oracle_does_is_a_fact_and_one_that_must_for
 
 
 def test_a_constant_without_a_random_walk_is_not_asked_to_forget():
-    model = StateSpaceModel(
-        transition=lambda x, u, c: (x[0] + DT * (u[0] - c.drag * x[0]),),
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[1e-5],
-        measurement_noise_cov=[1e-4],
-        prior_mean=[0.0],
-        prior_cov=[0.1],
-        constants=Drag(),
-        states=["speed"],
-    )
+
+    def move(x, u, c):
+        return (x[0] + DT * (u[0] - c.drag * x[0]),)
+
+    noise = {"q": [1e-5], "r": [1e-4], "mean": [0.0], "cov": [0.1]}
+    model = state_space(move, lambda x, c: (x[0],), **noise, constants=Drag(), states=["speed"])
     push = np.sin(np.arange(STEPS) / 7.0)[:, None]
     inner = ModelProblem(model, inputs=push, scale=[0.01], dt=DT, name="drag")
     for walk, sleeps in ((0.0, False), (1e-5, True)):
@@ -161,15 +149,11 @@ def test_of_logs_a_run_is_the_shortest_log_however_they_are_cut_into_blocks():
 
 def spring(observe, r=1e-4):
     """A softening spring of which a function of the position is measured, seen for 1.5 s."""
-    model = StateSpaceModel(
-        transition=lambda x, u, c: (x[0] + DT * x[1], x[1] + DT * (u[0] - 9.0 * x[0] + x[0] ** 3)),
-        observe=observe,
-        process_noise_cov=[1e-8, 1e-8],
-        measurement_noise_cov=r,
-        prior_mean=[0.5, 0.0],
-        prior_cov=[0.01, 0.01],
-        inputs=1,
-    )
+
+    def move(x, u, c):
+        return (x[0] + DT * x[1], x[1] + DT * (u[0] - 9.0 * x[0] + x[0] ** 3))
+
+    model = state_space(move, observe, q=[1e-8, 1e-8], r=r, mean=[0.5, 0.0], cov=[0.01, 0.01])
     push = np.sin(np.arange(30) / 9.0)[:, None]
     return ModelProblem(model, inputs=push, scale=[0.1, 0.1], dt=DT, name="spring", first_scored_step=5)
 

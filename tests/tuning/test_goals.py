@@ -10,10 +10,11 @@ from rich.console import Console
 
 import thruster_env  # noqa: F401 - registers the env
 import tuning
-from filters import EstimateState, StateSpaceModel, run
+from filters import EstimateState, run
 from filters.tuned_file import read_tuned_file, sealed
 from tests.filters.checks import refused
 from tests.linear_problem import LinearProblem
+from tests.models import state_space
 from tests.slow import slow_but
 from tuning.api.tune import run_tuning
 from tuning.api.verify import verify
@@ -45,15 +46,9 @@ def both(x, c):
 
 def vessel(drag=0.5, noise=0.05, offset=0.2):
     """A model whose constants, noise and prior have parameters, one of them on a linear scale."""
-    return StateSpaceModel(
-        transition=decay,
-        observe=both,
-        constants=(drag, offset),
-        process_noise_cov=[noise**2, 1e-3],
-        measurement_noise_cov=[[0.01, 0.002 * drag], [0.002 * drag, 0.02]],
-        prior_mean=[1.0 + offset, 0.0],
-        prior_cov=[drag, 1.0],
-    )
+    q, r = [noise**2, 1e-3], [[0.01, 0.002 * drag], [0.002 * drag, 0.02]]
+    mean, cov = [1.0 + offset, 0.0], [drag, 1.0]
+    return state_space(decay, both, q=q, r=r, mean=mean, cov=cov, constants=(drag, offset))
 
 
 def of_own_numbers(first_scored_step):
@@ -187,15 +182,9 @@ def test_problems_of_a_list_have_one_optimum():
 
 def of_two_sensors(**assumed):
     """A walk measured by two sensors, whose noise is correlated; filters assume that it is not."""
-    truth = StateSpaceModel(
-        transition=lambda x, u, c: (x[0], 0.9 * x[1]),
-        observe=lambda x, c: (x[0] + x[1], x[1]),
-        process_noise_cov=[0.01, 0.04],
-        measurement_noise_cov=[[1.0, 1.2], [1.2, 4.0]],
-        prior_mean=[0.0, 0.0],
-        prior_cov=[1.0, 1.0],
-        inputs=0,
-    )
+    noise = {"q": [0.01, 0.04], "r": [[1.0, 1.2], [1.2, 4.0]], "mean": [0.0, 0.0], "cov": [1.0, 1.0]}
+    functions = (lambda x, u, c: (x[0], 0.9 * x[1])), (lambda x, c: (x[0] + x[1], x[1]))
+    truth = state_space(*functions, **noise, inputs=0)
     return ModelProblem(truth, truth.replace(measurement_noise_cov=[1.0, 4.0]), steps=200, **assumed)
 
 
@@ -258,10 +247,7 @@ def test_the_minimum_is_the_objectives_and_lower_than_other_ways_lead(objective)
         for factor in (0.7, 1.4):
             moved = found.best.parameters.copy()
             moved[at] *= factor
-            model = dict(found.choice.model) | {
-                "process_noise_cov": tuple(moved[:2]),
-                "measurement_noise_cov": tuple(moved[2:]),
-            }
+            model = {"process_noise_cov": tuple(moved[:2]), "measurement_noise_cov": tuple(moved[2:])}
             assert least <= value_of(objective, found.choice._replace(model=model), MISMATCH, data) * (1 + 1e-9)
 
 
@@ -383,9 +369,8 @@ def test_a_consistent_twin_has_the_same_correlation():
     for rescaled in twins:
         trial = result.trials[rescaled.user_attrs[f"{RESCALED} of"]]
         assert rescaled.params["correlation_12"] == trial.params["correlation_12"]
-        assert rescaled.params["R"] / trial.params["R"] == pytest.approx(
-            rescaled.params["Q11"] / trial.params["Q11"]
-        )
+        of_q, of_r = (rescaled.params[name] / trial.params[name] for name in ("Q11", "R"))
+        assert of_r == pytest.approx(of_q)
 
 
 def test_the_gradient_refuses_a_budget_with_one_clear_line():

@@ -1,4 +1,4 @@
-"""Runs that begin elsewhere than the prior says, effects that are not there, gates: values stay those of the truth."""
+"""Runs that begin elsewhere than the prior says, effects that are not there, gates: values stay the truth's."""
 
 import math
 

@@ -210,11 +210,6 @@ def test_models_made_of_rates_can_be_sent_to_another_process():
         assert again.transition(*given, one.constants) == one.transition(*given, one.constants)
 
 
-def test_a_filter_that_knows_one_step_only_is_refused():
-    with pytest.raises(ValueError, match="a filter on a log's own stamps must know .*, but 'pf' does not"):
-        make_filter("pf", in_any_steps(smooth(), DT))
-
-
 def test_a_study_on_stamps_of_a_grid_has_the_numbers_of_the_grid():
     model, logs = smooth(), [recorded(np.arange(200) * DT, seed) for seed in range(3)]
     by_grid = [

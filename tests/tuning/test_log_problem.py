@@ -12,6 +12,7 @@ import tuning
 from filters import run
 from filters.sensitivity import likelihood
 from tests.filters.checks import refused
+from tests.models import state_space
 from thruster_env.env.model_env import ReplayEnv
 from thruster_env.logs.log import Log
 from thruster_env.model.affine import affine_model
@@ -227,16 +228,8 @@ def look(x, c):
 
 
 def model(dt=0.02):
-    return filters.StateSpaceModel(
-        transition=move,
-        observe=look,
-        constants=Constants(dt),
-        process_noise_cov=[1e-3, 1.0],
-        measurement_noise_cov=[0.1],
-        prior_mean=[0.0, 0.0],
-        prior_cov=[1.0, 1.0],
-        measurements=["z"],
-    )
+    noise = {"q": [1e-3, 1.0], "r": [0.1], "mean": [0.0, 0.0], "cov": [1.0, 1.0]}
+    return state_space(move, look, **noise, constants=Constants(dt), measurements=["z"], inputs=None)
 
 
 def of_one_dt():

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import tuning.cli
+from tests.models import state_space
 from thruster_env.model.affine import AffineModel
-from thruster_env.model.state_space import StateSpaceModel
 from tuning.problems.find import find_problem
 from tuning.reporting.matlab import function_name, lines_of, matlab_function
 from tuning.search.space import Choice, untuned_choice
@@ -131,14 +131,7 @@ def test_an_affine_model_is_its_matrices():
 
 
 def test_a_model_that_cannot_be_written_out_says_so():
-    model = StateSpaceModel(
-        transition=truncating,
-        observe=lambda x, c: (x[0],),
-        process_noise_cov=[1.0],
-        measurement_noise_cov=[1.0],
-        prior_mean=[0.0],
-        prior_cov=[1.0],
-    )
+    model = state_space(truncating, lambda x, c: (x[0],), q=[1.0], r=[1.0], mean=[0.0], cov=[1.0])
     text = matlab_function(Choice("ekf", {}, {}), model, "mine", None)
     assert "%   Why: a function that is written out must" in text and "test_matlab.py, line" in text
     assert "m.f and m.h are yours to add" in text and "@transition" not in text and "m.dt" not in text

@@ -72,13 +72,6 @@ def test_a_seed_s_data_depend_on_that_seed_alone_and_survive_a_pickle(make):
 
 
 @every_problem
-def test_a_digest_is_the_same_for_the_same_and_another_for_another(make):
-    problem = make()
-    assert problem.digest == make().digest and len(problem.digest) in (12, 16)
-    assert problem.digest not in {other().digest for other in MAKERS.values() if other is not make}
-
-
-@every_problem
 def test_each_parameter_is_what_was_set_and_the_untuned_choice_is_within_all_ranges(make):
     problem = make()
     choice = untuned_choice("enkf", problem)

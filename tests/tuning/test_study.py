@@ -71,16 +71,22 @@ def test_a_study_for_something_else_is_refused(tmp_path):
     refused("study 's' must be for .*'seed': 3.* but it was made for .*'seed': 0", study_in, storage, seed=3)
 
 
-def test_ctrl_c_keeps_finished_trials(tmp_path):
-    study = study_in(open_storage(str(tmp_path / "j")))
+def interrupt_at_once():
+    raise KeyboardInterrupt
 
-    def interrupt(study, finished):
-        if finished == 4:
-            raise KeyboardInterrupt
 
-    result = run_study(study, PLAN, 50, interrupt)
+def interrupt_by_a_signal():
+    """After which the running trial may finish."""
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("interrupt", [interrupt_at_once, interrupt_by_a_signal])
+def test_ctrl_c_keeps_finished_trials(tmp_path, interrupt):
+    study, handler = study_in(open_storage(str(tmp_path / "j"))), signal.getsignal(signal.SIGINT)
+    result = run_study(study, PLAN, 50, lambda study, finished: interrupt() if finished == 4 else None)
     assert result.interrupted and finished_trials(study) == 4
     assert not [t for t in study.trials if t.state == TrialState.RUNNING]
+    assert signal.getsignal(signal.SIGINT) is handler
 
 
 def test_a_trial_of_a_dead_process_is_failed_and_tried_once_more(tmp_path):
@@ -128,34 +134,6 @@ def test_a_torn_first_line_is_cut_off_and_another_file_is_left_alone(tmp_path, b
     assert path.read_text() == "hello"
 
 
-@pytest.mark.slow
-def test_a_killed_process_loses_its_running_trial_only(tmp_path):
-    path = tmp_path / "j"
-    program = (
-        "import optuna; optuna.logging.set_verbosity(optuna.logging.WARNING)\n"
-        "from tuning.plants.thruster import find_scenario\n"
-        "from tuning.search.storage import open_storage\n"
-        "from tuning.search.plan import Plan\n"
-        "from tuning.search.study import open_study, run_study\n"
-        f"s = find_scenario('mismatch'); storage = open_storage({str(path)!r})\n"
-        "plan = Plan('ekf', (s,))\n"
-        "study = open_study('s', plan, storage)\n"
-        "run_study(study, plan, 100000, lambda study, n: print(n, flush=True))\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
-    for line in process.stdout:
-        if int(line) >= 4:
-            break
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    study = study_in(open_storage(str(path)))
-    done = finished_trials(study)
-    assert done >= 4
-    result = run_study(study, PLAN, done + 2)
-    assert finished_trials(study) == done + 2
-    assert not [t for t in result.trials if t.state == TrialState.RUNNING]
-
-
 @pytest.mark.parametrize(
     ("content", "rule"),
     [(b"hello\n", "journal"), (b"hello", "journal"), (b'{"op_code": 0}\nx\n{"op_code": 1}\n', "line 2")],
@@ -170,19 +148,6 @@ def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(tmp_path, conten
 def test_a_database_that_cannot_be_reached_is_one_clear_line():
     with pytest.raises(ValueError, match="storage must be a database that can be reached, but got sqlite:"):
         open_storage("sqlite:////no/such/folder/x.db")
-
-
-def test_the_first_ctrl_c_lets_the_running_trial_finish(tmp_path):
-    study = study_in(open_storage(str(tmp_path / "j")))
-    handler = signal.getsignal(signal.SIGINT)
-
-    def interrupt(study, finished):
-        if finished == 3:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    result = run_study(study, PLAN, 50, interrupt)
-    assert result.interrupted and finished_trials(study) == 3
-    assert signal.getsignal(signal.SIGINT) is handler
 
 
 @pytest.mark.parametrize(

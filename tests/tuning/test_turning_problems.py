@@ -13,6 +13,7 @@ from filters.logs.findings import alarms_of
 from filters.monitoring import Monitor
 from filters.registry import make_filter
 from tests.filters.checks import refused
+from tests.models import state_space
 from thruster_env.core.streams import episode_keys
 from thruster_env.env.model_env import ModelEnv
 from thruster_env.logs.read import read_log
@@ -46,17 +47,13 @@ def look(x, c):
     return *rotations.to_body(x[:4], UP), *rotations.to_body(x[:4], NORTH)
 
 
+BIASES = "b_x", "b_y", "b_z"
+MEAN, PRIOR = [1.0] + [0.0] * 6, [np.deg2rad(5.0) ** 2] * 3 + [0.02**2] * 3
+
+
 def turning(side="body"):
-    return filters.StateSpaceModel(
-        transition=turn,
-        observe=look,
-        states=(Rotation("attitude", side=side), "b_x", "b_y", "b_z"),
-        inputs=3,
-        prior_mean=[1.0] + [0.0] * 6,
-        prior_cov=[np.deg2rad(5.0) ** 2] * 3 + [0.02**2] * 3,
-        process_noise_cov=[0.01**2 * DT] * 3 + [0.001**2 * DT] * 3,
-        measurement_noise_cov=[0.05**2] * 6,
-    )
+    noise = {"q": [0.01**2 * DT] * 3 + [0.001**2 * DT] * 3, "r": [0.05**2] * 6, "mean": MEAN, "cov": PRIOR}
+    return state_space(turn, look, **noise, states=(Rotation("attitude", side=side), *BIASES), inputs=3)
 
 
 def rates(seeds, steps):
@@ -119,17 +116,6 @@ def test_the_bound_of_small_errors():
             make_filter("ekf", model), inputs=np.repeat(u, 20, 0), measurements=truth.measurements
         ).covs
         np.testing.assert_allclose(np.diag(bound), np.diag(covs[:, -1].mean(0)), rtol=0.1)
-
-
-@pytest.mark.slow
-def test_a_study_of_what_turns(undrawn, tmp_path):
-    study = tuning.tune(problem(), filter="ekf", method="gradient", out=tmp_path / "tuned.json")
-    comparison = (
-        study.result.held_out.comparison if hasattr(study.result, "held_out") else study.held_out.comparison
-    )
-    assert comparison.tuned.score.value < 1.02 * comparison.true.score.value
-    tuning.report(str(tmp_path / "tuned.json"), problem=problem(), out=tmp_path / "report")
-    assert "q_angle" in (tmp_path / "report" / "tuned.html").read_text(encoding="utf-8")
 
 
 def table(columns):
@@ -272,32 +258,20 @@ TRACKED_SCALE = (0.005, 0.008, 0.014, 0.005, 0.005, 0.005)
 
 def tracker(q=Q, r=R, side="body", across=SENSOR[:2]):
     """Attitude, a bias of the gyroscope, and a star tracker with deviations `across` its third axis."""
-    return filters.StateSpaceModel(
-        transition=turn,
-        observe=lambda x, c: x[:4],
-        states=(Rotation("attitude"), "b_x", "b_y", "b_z"),
-        measurements=(Rotation("star tracker", "s", side),),
-        inputs=3,
-        prior_mean=[1.0] + [0.0] * 6,
-        prior_cov=[np.deg2rad(5.0) ** 2] * 3 + [0.02**2] * 3,
-        process_noise_cov=[Q, Q, q] + [0.001**2 * DT] * 3,
-        measurement_noise_cov=[*np.square(across), r],
-    )
+    noise = {"q": [Q, Q, q] + [0.001**2 * DT] * 3, "r": [*np.square(across), r], "mean": MEAN, "cov": PRIOR}
+    quantities = {
+        "states": (Rotation("attitude"), *BIASES),
+        "measurements": (Rotation("star tracker", "s", side),),
+    }
+    return state_space(turn, lambda x, c: x[:4], **noise, **quantities, inputs=3)
 
 
 def about_z(q=Q, r=R):
     """The same of an angle."""
-    return filters.StateSpaceModel(
-        transition=lambda x, u, c: (x[0] + (u[0] - x[1]) * DT, x[1]),
-        observe=lambda x, c: (x[0],),
-        states=(Quantity("yaw", "yaw", "rad", angle=True), "b_z"),
-        measurements=(Quantity("tracked yaw", "s", "rad", angle=True),),
-        inputs=1,
-        prior_mean=[0.0, 0.0],
-        prior_cov=[np.deg2rad(5.0) ** 2, 0.02**2],
-        process_noise_cov=[q, 0.001**2 * DT],
-        measurement_noise_cov=[r],
-    )
+    yaw, tracked = (Quantity(*name, "rad", angle=True) for name in (("yaw", "yaw"), ("tracked yaw", "s")))
+    noise = {"q": [q, 0.001**2 * DT], "r": [r], "mean": [0.0, 0.0], "cov": [PRIOR[0], 0.02**2]}
+    functions = (lambda x, u, c: (x[0] + (u[0] - x[1]) * DT, x[1])), (lambda x, c: (x[0],))
+    return state_space(*functions, **noise, states=(yaw, "b_z"), measurements=(tracked,))
 
 
 def of_third_axis(q=Q, r=R):
@@ -435,10 +409,10 @@ def test_alarms_of_a_log():
 def test_a_study_of_a_measured_rotation(undrawn, tmp_path):
     file = tmp_path / "tuned.json"
     study = tuning.tune(tracked_problem(), filter="ekf", method="likelihood", out=file)
-    comparison = study.held_out.comparison if hasattr(study, "held_out") else study.result.held_out.comparison
+    comparison = study.held_out.comparison
     assert comparison.tuned.score.value < 1.03 * comparison.true.score.value
     assert tuning.verify(str(file), problem=tracked_problem())
     tuning.report(str(file), problem=tracked_problem(), out=tmp_path / "report")
     page = (tmp_path / "report" / "tuned.html").read_text(encoding="utf-8")
-    assert "s_3" in page
+    assert "s_3" in page and "q_angle" in page
     tuning.compare(["ekf", "ukf"], problem=tracked_problem(), seeds=4)

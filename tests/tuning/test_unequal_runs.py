@@ -247,14 +247,6 @@ def test_a_consistency_report_has_as_many_lags_as_its_steps_allow(scored, lags):
     assert len(found.whiteness.correlations) == lags and np.isnan(found.whiteness.p_value) == (scored == 1)
 
 
-@pytest.mark.slow
-def test_the_page_of_runs_of_sixty_steps_is_written(tmp_path):
-    problem = LinearProblem(steps=60, first_scored=50)
-    study = tuning.tune(problem, "kf", trials=3, progress=False)
-    page = tuning.report(study, tmp_path / "short.html").page
-    assert "Is the covariance consistent?" in page.read_text()
-
-
 def chain(n):
     """A stable chain of n states, the first of which is measured."""
     a = 0.9 * np.eye(n) + 0.05 * np.eye(n, k=1)

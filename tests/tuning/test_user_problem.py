@@ -210,8 +210,8 @@ def test_a_file_on_an_object_of_the_users_says_how_to_give_it(tuned, tmp_path):
     study = tuning.tune(problem, trials=1, progress=False)
     file = study.save(tmp_path / "motor.json")
     said = r"motor.json was tuned on 'motor', an object of yours: pass problem=... \(--problem module:object\)"
-    for refused in (tuning.evaluate, tuning.report, verify):
-        refused(said, refused, file)
+    for call in (tuning.evaluate, tuning.report, verify):
+        refused(said, call, file)
     assert tuning.evaluate(file, problem, seeds=2).choice == study.choice
 
 

@@ -127,9 +127,11 @@ def test_what_is_not_significantly_better_gives_way_unless_it_is_equal_and_alone
     plan = Plan("kf", (LinearProblem(),))
     assert _wins(_met("trial 1", 0.9, 0.8, 0.99), _met(RULE, 1.0, 1.0, 1.0), plan, True)
     assert not _wins(_met("trial 1", 0.9, 0.8, 1.01), _met(RULE, 1.0, 1.0, 1.0), plan, True)
-    even = _met("trial 1", 1.00001, 0.99998, 1.00004)
-    assert _wins(even, _met(RULE, 1.0, 1.0, 1.0, consistent=False), plan, True)
-    assert not _wins(even, _met(RULE, 1.0, 1.0, 1.0), plan, True)
+    even, wrong = _met("trial 1", 1.00001, 0.99998, 1.00004), _met(RULE, 1.0, 1.0, 1.0, consistent=False)
+    assert _wins(even, wrong, plan, True) and not _wins(even, _met(RULE, 1.0, 1.0, 1.0), plan, True)
+    assert not _wins(_met("trial 1", 1.00001, 0.999, 1.001), wrong, plan, True)
+    assert not _wins(_met("trial 1", 1.00001, 0.99998, 1.00004, consistent=False), wrong, plan, True)
+    assert not _wins(even, wrong, plan._replace(consistent=False), True)
     assert _wins(_met("trial 1", -5.0, -9.0, -1.0), _met(RULE, 0.0, 0.0, 0.0), plan, False)
 
 

@@ -14,14 +14,12 @@ from pathlib import Path
 import numpy as np
 import optuna
 import pytest
-import typer
 from optuna.trial import TrialState
 
 import tuning
 from tests.filters.checks import refused
 from tests.hosts import Refused, database, two_hosts
 from tests.tuning.test_study import PLAN
-from tuning.cli.app import app
 from tuning.plants.thruster import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.space import distributions
@@ -382,11 +380,3 @@ def test_workers_share_a_study_in_mysql():
     run_in_workers(study, ENSEMBLE._replace(filter="kf"), [], 40, lambda *_: None, storage=url, workers=THREE)
     assert {trial.state for trial in study.get_trials()} <= {TrialState.COMPLETE, TrialState.WAITING}
     assert 40 <= finished_trials(study) < 40 + THREE
-
-
-def test_the_page_names_options_that_there_are():
-    page = (Path(__file__).parents[2] / "docs" / "workers.md").read_text()
-    tune = typer.main.get_command(app).get_command(None, "tune")
-    known = {option for parameter in tune.params for option in parameter.opts}
-    named = set(re.findall(r"(?<=\s)--[a-z]+", " ".join(re.findall(r"^ *thruster tune.*", page, re.MULTILINE))))
-    assert {"--workers", "--storage", "--trials"} <= named <= known

@@ -226,26 +226,3 @@ def test_a_preset_is_a_thruster(new, as_json):
         assert one == (pytest.approx(other, rel=1e-6) if isinstance(other, float) else other)
     assert as_json("inspect", "--preset", f"{name}.toml")["preset"] == f"{name}.toml"
     assert gym.make("BowThruster-v0", preset=f"{name}.toml").unwrapped.plant.parameters == found
-
-
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (
-            ("modle", "x"),
-            "what is new must be one of problem, model, env, filter, preset, but got 'modle'; did you mean",
-        ),
-        (("model", "there"), "a new model must not replace a file, but there.py is there"),
-        (("preset", "x.py"), "a new preset must end in .toml, but got 'x.py'"),
-        (("env", "my-env"), "a module must have a name of letters, digits and _, but got 'my-env'"),
-        (("problem", "numpy"), "a new module must not hide one that is installed, but got 'numpy'"),
-        (("problem", "none/x"), "must be where it can be written"),
-    ],
-)
-def test_what_cannot_be_new_is_refused(thruster, tmp_path, arguments, line):
-    (tmp_path / "there.py").write_text("mine\n")
-    (tmp_path / "none").write_text("a file\n")
-    done = thruster("new", *arguments)
-    assert done.returncode == 2 and line in done.stderr
-    assert {path.name for path in tmp_path.iterdir()} == {"there.py", "none"}
-    assert (tmp_path / "there.py").read_text() == "mine\n"

@@ -81,29 +81,6 @@ def test_where_a_log_has_no_truth_the_estimate_moves_the_propeller(thruster, tmp
         assert np.abs(np.asarray(picture.convert("RGB"), dtype=int) - first).sum() > 1e5
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (("--policy", "pi", "--voltage", 3), "but got --policy and --voltage"),
-        (("--policy", "ip"), "policy must be one of pi, but got 'ip'"),
-        (("--excitation", "stebs"), "but got 'stebs'; did you mean 'steps'?"),
-        (("--voltage", 99), "voltage must be within plus and minus 24, but got 99.0"),
-        (("--voltage", 3, "--out", "x.avi"), "--out must end in .mp4 or .gif, but got 'x.avi'"),
-        (("--voltage", 3, "--steps", 0), "steps must be a whole number of at least 1"),
-        (("--policy", "pi", "--column", "thrust=x"), "--column must come with --log, but got it with --policy"),
-        (("--size", "640"), "--size must be WIDTHxHEIGHT in pixels, as 640x400, but got '640'"),
-        (("--size", "640x10"), "the height of --size must be a whole number of at least 64, but got 10"),
-        (("--size", "9000x400"), "the width of --size must be at most 4096, but got 9000"),
-        (("--size", "640x401"), "the height of --size must be even for an .mp4, but got 401"),
-        (("some/folder", "--filter", "ekf"), "--filter must come with --policy or --voltage or"),
-        (("--voltage", 3, "--filter", "ekf", "--tuned", "t.json"), "but got both, t.json and ekf"),
-    ],
-)
-def test_a_mistake_is_one_line(thruster, tmp_path, arguments, line):
-    done = thruster("play", *arguments)
-    assert done.returncode == 2 and line in done.stderr and not list(tmp_path.glob("*.gif"))
-
-
 def test_torch_is_not_imported():
     code = "import sys, tuning.cli.play, tuning.cli.play; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

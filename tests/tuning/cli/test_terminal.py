@@ -4,13 +4,11 @@ import io
 import json
 import os
 import signal
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
-from docs.scripts import DOCS, PAGES, made_by
 from filters.consistency.nees import Interval
 from filters.registry import FILTERS, filter_type
 from tests.linear_problem import LinearProblem
@@ -38,41 +36,11 @@ def test_what_is_random_has_a_seed_and_all_write_json(thruster):
         assert "--json " in thruster(*name.split(), "--help").stdout
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_tables_and_pictures_of_scripts_and_experiments_stand_on_their_page(page):
-    files = [file for file in (DOCS / f"{page}.md", DOCS / "appendix" / f"{page}.md") if file.exists()]
-    text = "\n".join(file.read_text() for file in files) or (DOCS.parent / "README.md").read_text()
-    missing = [name for name in made_by(page, "TABLES") if f"<!-- table {name} -->" not in text]
-    assert not missing + [name for name in made_by(page, "FIGURES") if f"{Path(name).name})" not in text]
-
-
 def test_names_are_taken_in_any_case(as_json):
     found = as_json("inspect", "--preset", "T200")
     assert found["preset"] == "t200"
     assert as_json("filters", "EnKF")["filters"][0]["name"] == "enkf"
     assert as_json("filters", "ekf", "--problem", "MisMatch")["problem"] == "mismatch"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "end"),
-    [
-        (
-            ("evaluate", "--filter", "EFK"),
-            f"and {len(FILTERS) - 4} more (thruster filters lists all), but got 'EFK'; did you mean 'ekf'?",
-        ),
-        (("compare", "--scenario", "mismach"), "but got 'mismach'; did you mean 'mismatch'?"),
-        (("inspect", "--preset", "tunel"), "but got 'tunel'; did you mean 'tunnel'?"),
-        (("reproduce", "lorenz36"), "No such command 'lorenz36'. Did you mean 'lorenz96'"),
-        (("train", "--scenario", "ambiant"), "but got 'ambiant'; did you mean 'ambient'?"),
-        (("tunne",), "Did you mean 'tune'?"),
-        (("tune", "--trails", "3"), "--trials"),
-        (("evaluate", "--filter", "zzz"), "but got 'zzz'\n"),
-        (("evaluate",), "give either a tuned file or a filter (--filter NAME), but got none"),
-    ],
-)
-def test_a_misspelt_name_comes_with_the_nearest_one(thruster, arguments, end):
-    done = thruster(*arguments)
-    assert done.returncode == 2 and end in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_names_in_python_are_told_apart_by_case():

@@ -7,7 +7,6 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
-from tuning.experiments import policies_report
 from tuning.experiments.policies import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
 from tuning.experiments.policies_report import GOAL, HEADER, NOT_ON_PAGE, name_of
 from tuning.plants.thruster import find_scenario
@@ -57,12 +56,6 @@ def test_the_page_tells_every_arm_and_the_task():
     (reference,) = TASKS[TASK].arguments["reference"]
     assert f"between {reference['low']} and {reference['high']}" in PAGE and reference["hold_time"] == 0.5
     assert all(f"`{name}`" in PAGE for name in NOISES.values())
-
-
-def test_the_command_that_makes_the_page_is_there():
-    assert "    thruster reproduce policies\n    python -m docs.scripts policies\n" in PAGE
-    assert set(policies_report.TABLES) == set(re.findall(r"<!-- table (\w+) -->", PAGE))
-    assert all((DOCS / name).is_file() for name in policies_report.FIGURES)
 
 
 def test_filtered_state_closes_the_gap_and_noise_costs():

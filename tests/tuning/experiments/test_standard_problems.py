@@ -211,27 +211,6 @@ class TestReproduce:
         alike = near._replace(run_median=1.01 * near.theirs)
         assert alike.why.startswith("the median run agrees within 5 %")
 
-    @pytest.mark.parametrize(
-        ("arguments", "rule"),
-        [
-            (("lorenz63", "--members", 5), "No such option: --members"),
-            (("lorenz63", "--runs", 1), "runs must be a whole number of at least 2"),
-            (("lorenz84",), "No such command 'lorenz84'"),
-            (("thruster-papers", "--runs", 1), "runs must be a whole number of at least 2"),
-            (("thruster-papers", "--members", 1), "members must be a whole number of at least 2"),
-            (("thruster-papers", "--runs", "many"), "Invalid value for '--runs'"),
-            (("ngatini2019", "--members", 5), "No such option: --members"),
-            (("nurhadi2022", "--steps", 5), "No such option: --steps"),
-            (("ngatini2017", "--runs", 1), "runs must be a whole number of at least 2"),
-            (("ngatini2017", "--steps", 1), "steps must be a whole number of at least 2"),
-            (("ngatini2017", "--series", "a.tex"), "--series must end in .png, .svg or .pdf"),
-        ],
-    )
-    def test_a_wrong_argument_is_one_line(self, thruster, arguments, rule):
-        done = thruster("reproduce", *arguments)
-        assert done.returncode == 2 and rule in " ".join(done.stderr.split())
-        assert not done.stdout and "Traceback" not in done.stderr
-
     def test_a_package_that_is_not_installed_is_asked_for_before_anything_is_compiled(self, monkeypatch):
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
         monkeypatch.setattr(range_bearing, "problem", None)  # whose data would be drawn first

@@ -133,21 +133,6 @@ def test_the_quick_study_goes_on_where_it_was(as_json, thruster, tmp_path, monke
         run_panel(Panel(users.PANEL[:2], ("ekf",), 3), tmp_path)
 
 
-@pytest.mark.slow
-def test_ctrl_c_keeps_what_is_done(monkeypatch, tmp_path):
-    real = users.tuned_case
-
-    def second_is_interrupted(problem, name, trials, seed):
-        if "battery" in problem.name:
-            raise KeyboardInterrupt
-        return real(problem, name, trials, seed)
-
-    monkeypatch.setattr(users, "tuned_case", second_is_interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run_panel(Panel(users.PANEL[:2], ("ekf",), 2), tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["altitude-ekf-2-seed0.json"]
-
-
 def test_problems_that_do_not_fit_are_refused(tmp_path, monkeypatch):
     with pytest.raises(
         ValueError, match="a problem of the panel must have true states, but tests.tuning.experiments"

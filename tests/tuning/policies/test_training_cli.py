@@ -227,30 +227,24 @@ def test_drawing_names_its_extra(package, monkeypatch, copied):
 
 
 BAD = [
-    (("train", "--observe", "none"), "observe must be one of raw, raw+action"),
-    (("train", "--algo", "none"), "algo must be one of ppo"),
-    (("train", "--controller", "pi"), "controller must be one of one-step, mpc, but got 'pi'"),
-    (("train", "--observe", "raw", "--controller", "mpc"), "mpc must observe a state, but got observe='raw'"),
-    (("train", "--task", "none"), "task must be one of tracking"),
-    (("train", "--scenario", "none"), "scenario must be one of nominal"),
-    (("train", "--steps", "0"), "steps must be"),
-    (("train", "--untuned", "--tuned", "x.json"), "give either --tuned FILE or --untuned, but got both"),
-    (("train", "--tuned", "no.json"), "a tuned file must be readable, but no.json is not"),
-    (
-        ("train", "--observe", "raw", "--untuned"),
-        "must come with an observation set that has a filter, but got 'raw'",
-    ),
-    (("train", "--out", "full"), "must be new, empty or that of a training, but full contains other files"),
-    (("play", "full"), "a policy must be a folder that `thruster train` made, but full holds none"),
-    (("play", "ekf", "--out", "x.avi"), "--out must end in .mp4 or .gif, but got 'x.avi'"),
-    (("play", "ekf", "--out", "x.gif", "--window"), "give either --window or --out FILE, but got both"),
-    (("score", "ekf", "full"), "a policy must be a folder that `thruster train` made, but full holds none"),
-    (("score", "ekf", "--classical", "pid"), "classical must be one of pi, lqr, one-step, mpc, but got 'pid'"),
-    (
-        ("score", "ekf", "--scenario", "dropout"),
-        "trained on observe='ekf' must see 4 numbers, but the env shows 5",
-    ),
-    (("score", "ekf", "--scenario", "published_tunnel"), "'published_tunnel' is linear"),
+    ("train --observe none", "observe must be one of raw, raw+action"),
+    ("train --algo none", "algo must be one of ppo"),
+    ("train --controller pi", "controller must be one of one-step, mpc, but got 'pi'"),
+    ("train --observe raw --controller mpc", "mpc must observe a state, but got observe='raw'"),
+    ("train --task none", "task must be one of tracking"),
+    ("train --scenario none", "scenario must be one of nominal"),
+    ("train --steps 0", "steps must be"),
+    ("train --untuned --tuned x.json", "give either --tuned FILE or --untuned, but got both"),
+    ("train --tuned no.json", "a tuned file must be readable, but no.json is not"),
+    ("train --observe raw --untuned", "must come with an observation set that has a filter, but got 'raw'"),
+    ("train --out full", "must be new, empty or that of a training, but full contains other files"),
+    ("play full", "a policy must be a folder that `thruster train` made, but full holds none"),
+    ("play ekf --out x.avi", "--out must end in .mp4 or .gif, but got 'x.avi'"),
+    ("play ekf --out x.gif --window", "give either --window or --out FILE, but got both"),
+    ("score ekf full", "a policy must be a folder that `thruster train` made, but full holds none"),
+    ("score ekf --classical pid", "classical must be one of pi, lqr, one-step, mpc, but got 'pid'"),
+    ("score ekf --scenario dropout", "trained on observe='ekf' must see 4 numbers, but the env shows 5"),
+    ("score ekf --scenario published_tunnel", "'published_tunnel' is linear"),
 ]
 
 

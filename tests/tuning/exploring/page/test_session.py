@@ -3,7 +3,6 @@
 import base64
 import json
 import math
-import pickle
 import queue
 import urllib.request
 from types import SimpleNamespace
@@ -213,10 +212,6 @@ def test_names_of_a_problem_are_text_on_the_page():
         text = answer.read().decode()
     server.stop()
     assert "<script>alert" not in text and "&lt;script&gt;alert" in text and 'lang="en"' in text
-
-
-def test_a_bench_can_be_pickled(bench):
-    assert pickle.loads(pickle.dumps(bench)).filter == "kf"
 
 
 def test_a_short_run_is_drawn_whole():
