@@ -108,9 +108,8 @@ def test_without_truth_the_innovations_stay(comparisons):
     assert loss.low < loss.high < 0
     size = f"{-loss.value:.2f} [{-loss.high:.2f}, {-loss.low:.2f}]"
     signed = f"{loss.value:.2f} [{loss.low:.2f}, {loss.high:.2f}]"
-    assert tuning_effect(worse).startswith(
-        f"changes the log-likelihood of a run by {signed} against the rule of thumb"
-    )
+    begins = f"changes the log-likelihood of a run by {signed} against the rule of thumb"
+    assert tuning_effect(worse).startswith(begins)
     assert f"{size} below that of the rule of thumb" in " ".join(gains(worse, "runs"))
 
 
@@ -120,9 +119,8 @@ def test_without_a_bound_nothing_is_said_to_be_above_it(comparisons):
     shown = printed(comparison_table(without.evaluations, without.bound, "here", problem.scale_about))
     assert "above" not in shown and "bound " not in shown and "expected" in shown
     assert "No bound; the score is RMSE over the scale given with the problem." in " ".join(shown.split())
-    assert "above" in printed(
-        comparison_table(comparison.evaluations, comparison.bound, "here", problem.scale_about)
-    )
+    table = comparison_table(comparison.evaluations, comparison.bound, "here", problem.scale_about)
+    assert "above" in printed(table)
     assert score_label([problem]) == "score: mean RMSE over scale [-]"
     assert score_label([find_scenario("outliers")]) == "score: mean RMSE over bound [-]"
     assert score_label([find_scenario("outliers"), problem]) == "score: mean RMSE over scale [-]"
@@ -200,9 +198,8 @@ def test_objectives_say_what_they_need(comparisons):
 def test_a_report_without_truth_says_so_and_has_no_errors(comparisons):
     problem, comparison = comparisons[3, False]
     plan, choice = Plan("kf", (problem,), objectives=("likelihood",)), oracle_choice("kf", problem)
-    assert advice(choice, plan, [comparison]).endswith(
-        "the covariance is consistent (mean NIS 1.76, expected 1.81)."
-    )
+    said = advice(choice, plan, [comparison])
+    assert said.endswith("the covariance is consistent (mean NIS 1.76, expected 1.81).")
     tables = HeldOut(choice, problem, comparison).tables()
     subject = Subject("s", plan, choice, None, 8, True)
     numbers, errors, words = held_out_section(None, subject, [comparison], [tables]).parts
@@ -220,17 +217,7 @@ def test_numbers_of_a_filter_have_the_units_of_their_states(comparisons):
     assert "R22 [(m/s)²]" in table.html()
 
 
-ODD = [
-    r"$\frac$",
-    "[/]",
-    "[bold]x[/bold]",
-    "a|b",
-    "<b>x</b>",
-    "[x](http://y)",
-    r"$\alpha$ and $",
-    "&lt;",
-    "n" * 400,
-]
+ODD = [r"$\frac$", "[/]", "[bold]x[/bold]", "a|b", "<b>x</b>", "[x](http://y)", r"$\alpha$ $", "&lt;", "n" * 400]
 
 
 def model(name, unit="N"):

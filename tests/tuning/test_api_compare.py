@@ -79,9 +79,8 @@ def test_a_comparison_shows_itself(comparison):
 def test_rows_have_the_labels_of_a_mapping_and_their_numbers_from_any_executor(comparison):
     with ThreadPoolExecutor(2) as pool:
         own = tuning.compare({"mine": "kf", "theirs": "ekf"}, SHORT, seeds=6, executor=pool, progress=False)
-    mine, theirs = (
-        dict(zip(one["filter"], one["score"], strict=True)) for one in (own.to_frame(), comparison.to_frame())
-    )
+    tables = own.to_frame(), comparison.to_frame()
+    mine, theirs = (dict(zip(one["filter"], one["score"], strict=True)) for one in tables)
     assert mine == {"mine": theirs["kf"], "theirs": theirs["ekf"]}
 
 

@@ -73,9 +73,8 @@ def test_identify_is_the_command_in_one_call(as_json, runs, tmp_path):
     options = ("--free", ",".join(FREE), "--hold-noise", "--starts", 2, "--range", "voltage_gain=100:5000")
     told = as_json("identify", *runs, *OF_LOGS, *options, "--out", "theirs.toml")
     ranges = {"voltage_gain": (100, 5000)}
-    mine = tuning.identify(
-        tuning.read_logs(runs, **WHOSE), FREE, noise=False, starts=2, ranges=ranges, progress=False
-    )
+    options = {"noise": False, "starts": 2, "ranges": ranges, "progress": False}
+    mine = tuning.identify(tuning.read_logs(runs, **WHOSE), FREE, **options)
     assert mine.values == told["values"] and mine.standard_errors == told["standard_errors"]
     assert plain({name: one._asdict() for name, one in mine.validation.items()}) == told["validation"]
     assert mine.save("mine.toml").read_text() == (tmp_path / "theirs.toml").read_text()
@@ -95,9 +94,8 @@ def test_what_was_identified_shows_itself(found):
 
 def test_runs_that_are_held_out_only_validate(recorded):
     options = {"noise": False, "starts": 1, "progress": False}
-    mine = tuning.identify(
-        tuning.read_logs([recorded[0]], **WHOSE, held_out=[recorded[1]]), "voltage_gain", **options
-    )
+    reading = tuning.read_logs([recorded[0]], **WHOSE, held_out=[recorded[1]])
+    mine = tuning.identify(reading, "voltage_gain", **options)
     assert [log.name for log in mine.held_out] == [recorded[1].name] and len(mine.runs) == 1
     assert set(mine.validation) == {"start", "identified"}
 
@@ -196,9 +194,8 @@ NAME = "constant-velocity"
 @pytest.fixture
 def log(tmp_path):
     file = tmp_path / "acc.csv"
-    np.savetxt(
-        file, np.column_stack([TRACK["time"], Z]), delimiter=",", header="t,pos [m]", comments="", fmt="%.17g"
-    )
+    rows = np.column_stack([TRACK["time"], Z])
+    np.savetxt(file, rows, delimiter=",", header="t,pos [m]", comments="", fmt="%.17g")
     return file
 
 
@@ -277,10 +274,9 @@ def test_a_clock_offset_of_all_columns_moves_no_number():
 
 
 def test_columns_of_axes_are_those_that_are_named_or_as_many():
-    runs = [
-        tuning.read_logs(TRACK, model=f"{NAME}:axes=2,acceleration=1,R=1"),
-        tuning.read_logs(TRACK, model=f"{NAME}:acceleration=1,R=1", columns=["x,y"]),
-    ]
+    numbers = "acceleration=1,R=1"
+    by_axes = tuning.read_logs(TRACK, model=f"{NAME}:axes=2,{numbers}")
+    runs = [by_axes, tuning.read_logs(TRACK, model=f"{NAME}:{numbers}", columns=["x,y"])]
     for each in runs:
         recorded, maker = each.read()
         assert [quantity.symbol for quantity in recorded.measured] == ["x", "y"] and maker(dt=0.1).n == 4
@@ -343,9 +339,8 @@ def table(model, size, rows, seed):
 
 
 def found_in(run, make, free, hold_gaps=False, **options):
-    return tuning.identify(
-        tuning.read_logs(run, model=make, hold_gaps=hold_gaps), free, starts=1, use_all=True, **options
-    )
+    reading = tuning.read_logs(run, model=make, hold_gaps=hold_gaps)
+    return tuning.identify(reading, free, starts=1, use_all=True, **options)
 
 
 def test_a_late_actuator_has_a_negative_clock_offset_that_its_file_takes_off(tmp_path):
@@ -393,10 +388,7 @@ def test_outliers_name_the_gate_and_with_it_the_constant_is_nearer():
     unaware, said = (" ".join(one.sentences()) for one in (plain, gated))
     assert "--gate 5" in unaware and "--gate 5" not in said
     assert "within the gate: a filter" not in unaware
-    assert (
-        "needs a gate (session(gate=5)), or to be robust (ekf-robust). Figures of the runs it has seen are "
-        in said
-    )
+    assert "needs a gate (session(gate=5)), or to be robust (ekf-robust). Figures of the runs it has seen" in said
     whole = validate(gated.found, gated.runs)
     assert gated.validation["identified"].log_likelihood > whole["identified"].log_likelihood + 100.0
     proven = remarks(gated.runs, gated.runs, gated.found)

@@ -87,11 +87,8 @@ def test_columns_with_true_states_are_the_truth():
     problem = find_problem("nominal")
     data = problem.data([5])
     states, inputs = data.states[0], np.append(data.inputs[0, :, 0], np.nan)
-    table = {
-        "time_s": 0.01 * np.arange(len(states)),
-        "V_s": inputs,
-        "measured_thrust_N": data.measurements[0, :, 0],
-    }
+    table = {"time_s": 0.01 * np.arange(len(states)), "V_s": inputs}
+    table["measured_thrust_N"] = data.measurements[0, :, 0]
     table |= {"omega_m": states[:, 0], "U_a": states[:, 1]}
     found = problem_of(("tunnel", table))
     assert found.scale is not None and found.data([0]).states is not None
@@ -174,9 +171,8 @@ def test_a_reset_without_info_is_said():
         def reset(self, **options):
             return super().reset(**options)[0]
 
-    problem = pendulum().__class__(
-        Bare(gym.make("Pendulum-v1").unwrapped), "random", pendulum().model(), steps=60, has_truth=False
-    )
+    bare, options = Bare(gym.make("Pendulum-v1").unwrapped), {"steps": 60, "has_truth": False}
+    problem = pendulum().__class__(bare, "random", pendulum().model(), **options)
     refused(r"must return \(observation, info\), but returned", problem.data, [1])
 
 

@@ -20,9 +20,8 @@ from tuning.logs.allan import allan_deviation, flicker_noise, noise_of
 def table_of(trial):
     """A recording as a table, and its reference quaternions."""
     columns = broad(trial)
-    parts = {
-        f"{name}_{axis}": columns[name][:, i] for name in ("gyr", "acc", "mag") for i, axis in enumerate("xyz")
-    }
+    axes = [(name, i, axis) for name in ("gyr", "acc", "mag") for i, axis in enumerate("xyz")]
+    parts = {f"{name}_{axis}": columns[name][:, i] for name, i, axis in axes}
     return {"time": np.arange(len(columns["gyr"])) / RATE, **parts}, columns["quat"]
 
 

@@ -24,9 +24,8 @@ quiet = {"progress": False}
 
 @pytest.fixture(scope="module")
 def study():
-    return tuning.tune(
-        tuning.find_problem("ambient", augment={"ambient_velocity": (0.4, 0.01)}), trials=4, **quiet
-    )
+    problem = tuning.find_problem("ambient", augment={"ambient_velocity": (0.4, 0.01)})
+    return tuning.tune(problem, trials=4, **quiet)
 
 
 @pytest.fixture(scope="module")

@@ -59,9 +59,11 @@ COSTS = {"ekf": lambda n: 0.1, "kf": lambda n: 0.07, "enkf": lambda n: 0.05 * n,
 def priced(monkeypatch):
     """Few kinds, and costs that do not depend on the machine."""
     monkeypatch.setattr("tuning.search.plan.AUTO_FILTER_TYPES", FEW)
-    monkeypatch.setattr(
-        tuning_trials, "microseconds_a_step", lambda filter_, data: COSTS[filter_.name](filter_.size)
-    )
+
+    def price(filter_, data):
+        return COSTS[filter_.name](filter_.size)
+
+    monkeypatch.setattr(tuning_trials, "microseconds_a_step", price)
 
 
 @cache

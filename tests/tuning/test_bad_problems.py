@@ -181,9 +181,8 @@ def test_what_is_wrong_with_held_out_data_is_said_before_the_search(tmp_path, mo
 
 
 def model(factor, r=1e9):
-    return affine_model(
-        A=[[factor]], B=[[1.0]], C=[[1.0]], Q=[1e-2], R=[r], P0=[1.0], measurements=[("log speed", "z", "m/s")]
-    )
+    log_speed = [("log speed", "z", "m/s")]
+    return affine_model(A=[[factor]], B=[[1.0]], C=[[1.0]], Q=[1e-2], R=[r], P0=[1.0], measurements=log_speed)
 
 
 def problem(factor):

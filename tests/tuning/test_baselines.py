@@ -103,9 +103,8 @@ def test_own_numbers_are_within_their_ranges_always():
     assert far.untuned == altitude_problem.GIVEN and [one.low for one in far.parameters] == [1.0, 0.01, 0.2, 3e-4]
     told = altitude_problem.problem(untuned={"sigma_a": 500.0})
     assert told.given["sigma_a"] == 500.0 == told.parameters[0].high
-    none = altitude_problem.problem(
-        parameters=[Parameter("x", 0.1, 10.0)], assumed=lambda x: altitude_problem.model(sigma_a=x)
-    )
+    free, assumed = [Parameter("x", 0.1, 10.0)], (lambda x: altitude_problem.model(sigma_a=x))
+    none = altitude_problem.problem(parameters=free, assumed=assumed)
     assert none.given is None and none.untuned == {"x": pytest.approx(1.0)} and rule_label(none) == RULE
 
 
@@ -221,12 +220,12 @@ def test_where_there_is_no_scaled_default_it_says_why():
     assert found.reason.startswith("no factor on Q from 0.0001 to 10000 brings the mean NIS of ekf to 1: it is 4.")
     comparison = evaluate_held_out(untuned_choice("ekf", startup), startup, 0, 4)
     assert comparison.scaled is None and list(comparison.evaluations) == [RULE, NOISE, TUNED, ORACLE]
-    assert scaling_sentence(comparison).startswith(
-        "There is no scaled default, so the rule of thumb comes first: no factor"
-    )
-    assert tuning_effect(comparison) == (
+    said = scaling_sentence(comparison)
+    assert said.startswith("There is no scaled default, so the rule of thumb comes first: no factor")
+    nothing = (
         "makes no significant difference on 4 seeds against the rule of thumb and against the noise estimation"
     )
+    assert tuning_effect(comparison) == nothing
     with pytest.raises(ValueError, match="ekf must have a scaled default on startup, but no factor on Q from"):
         contender("ekf", "scaled").filter(startup)
 
@@ -260,14 +259,8 @@ def test_a_proof_holds_all_baselines_on_the_same_seeds_and_names_the_one_that_co
     data = MISMATCH.data(held_out_seeds(0, 40))
     default = evaluate(scaled_default("ekf", MISMATCH, 0).choice.filter(MISMATCH), data, MISMATCH.scale)
     assert comparison.ratios[SCALED] == score_ratio(comparison.tuned, default)
-    assert comparison.ratios[ORACLE] == (
-        1.0,
-        1.0,
-        1.0,
-    )
-    assert (
-        comparison.ratios[RULE].high < comparison.ratios[SCALED].low
-    )  # the rule of thumb is the easier one to beat
+    assert comparison.ratios[ORACLE] == (1.0, 1.0, 1.0)
+    assert comparison.ratios[RULE].high < comparison.ratios[SCALED].low  # the rule of thumb is easier to beat
     said = tuning_effect(comparison, "the error")
     assert said.startswith("lowers the error by ") and " against the scaled default, by " in said
     assert " against the rule of thumb and raises the error by " in said and said.endswith("noise estimation")

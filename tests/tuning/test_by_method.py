@@ -103,9 +103,8 @@ def test_the_command_follows_a_method(as_json, thruster):
 
 @pytest.mark.slow
 def test_gradients_of_full_matrices_begin_at_noise_estimation():
-    study = tuning.tune(
-        "deadband", "ekf", method="log-score", space=tuning.SearchSpace(full_q=True), trials=6, progress=False
-    )
+    options = {"space": tuning.SearchSpace(full_q=True), "trials": 6, "progress": False}
+    study = tuning.tune("deadband", "ekf", method="log-score", **options)
     ratios = study.held_out.ratios
     assert ratios["noise estimation"].high < 0.85 and ratios["scaled default"].high < 0.5
     assert study.held_out.evaluation.nees.value == pytest.approx(2.0, rel=0.1)
@@ -143,9 +142,7 @@ def singular(first_scored_step=0, runs=6, steps=60):
 
 @pytest.mark.parametrize("method", ["em", "squarem", "als", "mehra"])
 def test_methods_of_q_and_r_alone_say_how_p0_is_left_out(method):
-    with pytest.raises(
-        ValueError, match="P0 is tuned.*first_scored_step=50 of RunsProblem.*method 'likelihood'"
-    ) as said:
+    with pytest.raises(ValueError, match="P0 is tuned.*first_scored_step=50 of RunsProblem.*'likelihood'") as said:
         tuning.tune(singular(), "kf", method=method, trials=3, progress=False)
     assert "\n" not in str(said.value)
     problem = singular(first_scored_step=50)
@@ -195,9 +192,8 @@ def test_em_leaves_the_variance_of_a_channel_that_is_never_measured(method, opti
     problem = RunsProblem(runs, model, held_out=[2, 3], name="half of it")
     task = Task("kf", problem, problem.data([0, 1]), options={"prior": False, **options}, budget=Budget(runs=400))
     METHODS[method].run(method, task)
-    before, after = (
-        np.asarray(one.filter(problem).model.measurement_noise_cov) for one in (task.start, task.best)
-    )
+    models = (one.filter(problem).model for one in (task.start, task.best))
+    before, after = (np.asarray(model.measurement_noise_cov) for model in models)
     assert after[1, 1] == pytest.approx(before[1, 1]) and after[0, 0] > 2 * before[0, 0]
 
 

@@ -52,10 +52,8 @@ def _rates(candidates, baselines):
     generator, levels, count = np.random.default_rng(7), UNIT * np.array([*baselines, *candidates]), len(baselines)
     taken = by_trial = by_any = 0
     for _ in range(STUDIES):
-        met, held_out = (
-            [_measured(one) for one in _squares(levels, runs, generator)]
-            for runs in (VALIDATION_SEEDS, HELD_OUT_SEEDS)
-        )
+        drawn = (_squares(levels, runs, generator) for runs in (VALIDATION_SEEDS, HELD_OUT_SEEDS))
+        met, held_out = ([_measured(one) for one in squares] for squares in drawn)
         of = {str(at): one for at, one in enumerate(met)}
         trials = {name: of.pop(name) for name in list(of)[count:]}
         choosing = Choosing(PLAN, of, trials)
@@ -156,14 +154,8 @@ def test_of_the_worst_problem_alone_runs_are_compared():
 
     def filter_(a, b):
         parts = [measured_of(some, True) for some in (a, b)]
-        return Measured(
-            parts[1].value,
-            (parts[1].left_out[0],) * 2,
-            0.0,
-            (1.0,),
-            runs=(*parts[0].runs, *parts[1].runs),
-            decisive=(1,),
-        )
+        left_out, runs = (parts[1].left_out[0],) * 2, (*parts[0].runs, *parts[1].runs)
+        return Measured(parts[1].value, left_out, 0.0, (1.0,), runs=runs, decisive=(1,))
 
     one, other = filter_(easy * 4.0, hard * 0.8), filter_(easy, hard)
     assert signed_rank(one, other, ratio=True) < 1e-5

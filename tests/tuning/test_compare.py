@@ -42,16 +42,14 @@ def test_a_row_is_the_filter_s_evaluation_beside_the_first_one_s():
     assert first.score_ratio == (1.0, 1.0, 1.0) and first.verdict == "tie"
     assert second.score_ratio == score_ratio(ukf, ekf) and second.verdict == "worse"
     np.testing.assert_allclose(board.bound, NOMINAL.bound(data))
-    np.testing.assert_allclose(
-        first.above_bound, [e.value / b - 1 for e, b in zip(ekf.rmse, board.bound, strict=True)]
-    )
+    expected = [e.value / b - 1 for e, b in zip(ekf.rmse, board.bound, strict=True)]
+    np.testing.assert_allclose(first.above_bound, expected)
     assert first.microseconds > 0 and first.nees == ekf.nees.value and not first.nees_is_median
 
 
 def test_particle_filters_have_a_thousand_particles_and_are_judged_by_the_median():
-    (board,), _ = compare(
-        [contender("ekf"), contender("pf"), contender("enkf", ensemble_size=7)], [NOMINAL], SEEDS
-    )
+    contenders = [contender("ekf"), contender("pf"), contender("enkf", ensemble_size=7)]
+    (board,), _ = compare(contenders, [NOMINAL], SEEDS)
     ekf, pf, enkf = board.rows
     assert (pf.label, enkf.label) == ("pf 1000", "enkf 7")
     assert pf.nees_is_median and pf.nees == pf.evaluation.median_nees

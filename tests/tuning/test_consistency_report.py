@@ -107,10 +107,7 @@ def test_where_errors_last_a_constant_as_a_state_comes_first_and_nothing_is_call
 def test_of_the_right_filter_every_sentence_is_good_news(scalar_truth):
     said = sentences(scalar_report(scalar_truth))
     assert len(said) == 8
-    for sentence, beginning in zip(
-        said, ("Consistent: mean NEES", "The distribution of NEES is that"), strict=False
-    ):
-        assert sentence.startswith(beginning)
+    assert said[0].startswith("Consistent: mean NEES") and said[1].startswith("The distribution of NEES is that")
     assert said[4].startswith("Innovations are white")
     assert said[5].endswith("as it should.") and said[-1] == "No run diverged."
 
@@ -118,9 +115,8 @@ def test_of_the_right_filter_every_sentence_is_good_news(scalar_truth):
 def test_a_report_has_the_numbers_of_its_parts(scalar_truth):
     report = scalar_report(scalar_truth)
     with interpreted():
-        estimates = run(
-            KalmanFilter(model=scalar()), np.zeros((40, 2)), np.zeros((40, 150, 0)), scalar_truth.measurements
-        )
+        given = np.zeros((40, 2)), np.zeros((40, 150, 0)), scalar_truth.measurements
+        estimates = run(KalmanFilter(model=scalar()), *given)
     errors, covs = (estimates.means - scalar_truth.states)[:, 20:], estimates.covs[:, 20:]
     assert report.nees.mean.value == pytest.approx(normalized_squares(errors, covs).mean())
     deviations = np.sqrt(covs[..., 0, 0])
@@ -144,9 +140,8 @@ def test_missing_measurements_lower_the_right_mean_of_no_check(scalar_truth):
 
 def test_a_report_refuses_what_does_not_fit(scalar_truth):
     with interpreted():
-        estimates = run(
-            KalmanFilter(model=scalar()), np.zeros((40, 2)), np.zeros((40, 150, 0)), scalar_truth.measurements
-        )
+        given = np.zeros((40, 2)), np.zeros((40, 150, 0)), scalar_truth.measurements
+        estimates = run(KalmanFilter(model=scalar()), *given)
     with pytest.raises(ValueError, match="states must have the shape of the estimates"):
         consistency_report(estimates, scalar_truth.states[:, 1:])
     one = Estimates(*(part[:1] for part in estimates))
@@ -197,20 +192,17 @@ def test_sentences_follow_their_numbers():
     assert confidence(Interval(2.05, 1.95, 2.1), 2) == "consistent"
     assert confidence(Interval(2.2, 2.1, 2.3), 2) == "slightly overconfident"
     assert confidence(Interval(1.0, 0.9, 1.1), 2) == "underconfident"
-    assert mean_sentence("NEES", Interval(5.1, 4.9, 5.3), 2) == (
-        "Overconfident: mean NEES 5.1 [4.9, 5.3] where 2 is right."
-    )
+    said = mean_sentence("NEES", Interval(5.1, 4.9, 5.3), 2)
+    assert said == "Overconfident: mean NEES 5.1 [4.9, 5.3] where 2 is right."
     assert mean_sentence("NIS", Interval(np.nan, np.nan, np.nan), 1).startswith("No NIS")
     assert coverage_sentence("x", Interval(0.9, 0.89, 0.91)).endswith("90.0 % [89.0, 91.0] of cases: too rarely.")
     assert coverage_sentence("x", Interval(0.98, 0.97, 0.99)).endswith("more often than stated.")
-    assert crps_sentence("x [m]", Interval(0.6, 0.5, 0.7), 0.3) == (
-        "CRPS of x [m]: 0.6 [0.5, 0.7], 2 times its expected value under the covariance."
-    )
+    said = crps_sentence("x [m]", Interval(0.6, 0.5, 0.7), 0.3)
+    assert said == "CRPS of x [m]: 0.6 [0.5, 0.7], 2 times its expected value under the covariance."
     assert comparison_sentence("x", "ekf", "kf", Interval(0.9, 0.8, 0.95)).endswith("ekf is better.")
     assert comparison_sentence("x", "ekf", "kf", Interval(1.0, 0.9, 1.1)).endswith("a tie.")
-    assert divergence_sentence(5, 3, 200) == (
-        "3 of 200 runs diverged and restarted from the prior, 5 times in all."
-    )
+    said = divergence_sentence(5, 3, 200)
+    assert said == "3 of 200 runs diverged and restarted from the prior, 5 times in all."
     assert [rounded(value) for value in (3460.4, 0.012345, 2e9)] == ["3460", "0.0123", "2e+09"]
 
 
@@ -249,14 +241,8 @@ def test_an_ensemble_s_overconfidence_shrinks_like_one_over_its_size(nominal):
 def test_the_figure_is_drawn(scalar_truth, kind, tmp_path):
     report = exchangeable(size=30, runs=20) if kind == "ensemble" else scalar_report(scalar_truth)
     if kind == "without covariance":
-        nothing = Estimates(
-            scalar_truth.states + 1.0,
-            np.zeros((40, 151, 1, 1)),
-            np.zeros((40, 151, 1)),
-            np.zeros((40, 151, 1, 1)),
-            np.zeros((40, 151)),
-            np.zeros(40),
-        )
+        steps, covs = np.zeros((40, 151)), np.zeros((40, 151, 1, 1))
+        nothing = Estimates(scalar_truth.states + 1.0, covs, np.zeros((40, 151, 1)), covs, steps, np.zeros(40))
         report = consistency_report(nothing, scalar_truth.states)
         assert sentences(report) == [
             "No NEES: the filter gives no covariance, or a singular one.",
@@ -298,17 +284,15 @@ def test_channels_that_are_never_measured_twice_in_a_row_have_no_memory():
     runs = drawn(np.eye(2), np.eye(2), np.eye(2), np.eye(2), np.eye(2), 600, 8, 1)
     for one in runs:
         one["measurements"][::2, 1] = np.nan
-    problem = RunsProblem(
-        runs, linear(a=np.eye(2), c=np.eye(2)).model(), held_out=[6, 7], scale=(1.0, 1.0), name="by turns"
-    )
+    model, options = linear(a=np.eye(2), c=np.eye(2)).model(), {"held_out": [6, 7], "scale": (1.0, 1.0)}
+    problem = RunsProblem(runs, model, **options, name="by turns")
     assert "look like white noise" in residual_sentences(problem)[0]
 
 
 def comparison_of(model, runs, filter_q=None):
     """A tuned filter on logs without truth: the model with a Q, beside its baselines."""
-    problem = RunsProblem(
-        [{"measurements": one["measurements"]} for one in runs], model, held_out=[6, 7], name="logs"
-    )
+    without_truth = [{"measurements": one["measurements"]} for one in runs]
+    problem = RunsProblem(without_truth, model, held_out=[6, 7], name="logs")
     q = model.process_noise_cov if filter_q is None else np.diag(filter_q)
     rows = tuple(map(tuple, q.tolist())), tuple(map(tuple, model.measurement_noise_cov.tolist()))
     choice = Choice("kf", dict(zip(NOISE, rows, strict=True)), {})
@@ -330,18 +314,15 @@ def test_a_regression_has_the_densities_of_least_squares():
     past = np.column_stack([np.ones(z[:, 8:].size), z[:, 7:-1].ravel()])  # BIC chooses the true order, 1
     weights, squares, *_ = np.linalg.lstsq(past, z[:, 8:].ravel(), rcond=None)
     s = np.sqrt(squares[0] / (z[:, 8:].size - 2))
-    np.testing.assert_allclose(
-        found[:, 1:], norm.logpdf(others[:, 1:], weights[0] + weights[1] * others[:, :-1], s), rtol=1e-6
-    )
+    predicted = weights[0] + weights[1] * others[:, :-1]
+    np.testing.assert_allclose(found[:, 1:], norm.logpdf(others[:, 1:], predicted, s), rtol=1e-6)
     np.testing.assert_allclose(found[:, 0], norm.logpdf(others[:, 0], z.mean(), z.std()), rtol=1e-9)
-    missing = data._replace(
-        measurements=np.where(np.arange(others.shape[1])[:, None] % 3 == 2, np.nan, data.measurements)
-    )
+    gone = np.arange(others.shape[1])[:, None] % 3 == 2
+    missing = data._replace(measurements=np.where(gone, np.nan, data.measurements))
     without = log_densities(training, missing, np.array([False]))[..., 0]
     assert np.isnan(without[:, 2::3]).all()
-    held = norm.logpdf(
-        others[:, 3::3], weights[0] + weights[1] * others[:, 1:-2:3][:, : others[:, 3::3].shape[1]], s
-    )
+    before = others[:, 1:-2:3][:, : others[:, 3::3].shape[1]]
+    held = norm.logpdf(others[:, 3::3], weights[0] + weights[1] * before, s)
     np.testing.assert_allclose(without[:, 3::3], held, rtol=1e-6)  # from the last value before the gap
     short = data._replace(measurements=data.measurements[:, :4], inputs=data.inputs[:, :3])  # fewer rows than lags
     np.testing.assert_allclose(log_densities(training, short, np.array([False]))[..., 0], found[:, :4], rtol=1e-9)
@@ -367,9 +348,8 @@ def test_a_wrong_model_is_asked_for_and_never_called_consistent():
     assert doubt == f"Is this model the right one? A {regression}."
     own = comparison._replace(tuned=comparison.tuned._replace(nis=comparison.given.nis))
     (doubt,) = model_doubts(problem, own)
-    assert doubt == (
-        f"Is this model the right one? With its own Q and R the mean NIS is 16.2 where 1 is right; a {regression}."
-    )
+    begins = "Is this model the right one? With its own Q and R the mean NIS is 16.2 where 1 is right; a "
+    assert doubt == f"{begins}{regression}."
     assert consistency_of(comparison)[-1] == MADE_UP
     stored = comparison_as_data(comparison)["over_regression"]
     assert stored == list(comparison.over_regression)

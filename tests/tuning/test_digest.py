@@ -149,8 +149,6 @@ problem = EnvProblem("Pendulum-v1", policy, model(), steps=60, state_of=lambda e
 print(problem.digest, problem.data([1, 2]).inputs.tobytes().hex())
 """
     root = str(Path(__file__).parents[2])
-    printed = [
-        subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=True).stdout
-        for _ in range(2)
-    ]
+    process = {"cwd": root, "capture_output": True, "text": True, "check": True}
+    printed = [subprocess.run([sys.executable, "-c", script], **process).stdout for _ in range(2)]
     assert printed[0] == printed[1]

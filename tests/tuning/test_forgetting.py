@@ -57,10 +57,8 @@ def problem():
 @pytest.fixture(scope="module")
 def studies(problem):
     """A study as it was asked for, and one that must forget."""
-    return [
-        tuning.tune(problem, "kf", trials=8, space=tuning.SearchSpace(forget=one), progress=False)
-        for one in (None, FORGET)
-    ]
+    spaces = (tuning.SearchSpace(forget=one) for one in (None, FORGET))
+    return [tuning.tune(problem, "kf", trials=8, space=space, progress=False) for space in spaces]
 
 
 def after_a_push(filter_, steps=60):
@@ -139,10 +137,8 @@ def test_of_logs_a_run_is_the_shortest_log_however_they_are_cut_into_blocks():
     for i, steps in enumerate((900, 700)):
         z = 0.02 * generator.standard_normal((steps + 1, 1))
         logs.append(log_of((np.zeros((steps, 1)), z), cart(), DT, f"log {i}"))
-    found = [
-        time_constants_on(make_filter("kf", cart(1e-8)), LogProblem(logs, cart(1e-4), blocks=blocks))
-        for blocks in (3, 8)
-    ]
+    problems = (LogProblem(logs, cart(1e-4), blocks=blocks) for blocks in (3, 8))
+    found = [time_constants_on(make_filter("kf", cart(1e-8)), problem) for problem in problems]
     assert found[0] == found[1] and found[0].length == 700 and not found[0].is_slow
     assert found[0].steps[0] > 0.2 * 700 / 8  # a block would have been called short
 
@@ -161,10 +157,8 @@ def spring(observe, r=1e-4):
 def test_the_floor_holds_for_the_gain_that_a_nonlinear_filter_has():
     problem = spring(lambda x, c: (x[0] ** 2,))
     choice = rule_of_thumb("ekf", problem)
-    roughly, exactly = (
-        time_constants_on(forgetting(choice, [problem], 0, 0.1, exact=exact).filter(problem), problem)
-        for exact in (False, True)
-    )
+    choices = (forgetting(choice, [problem], 0, 0.1, exact=exact) for exact in (False, True))
+    roughly, exactly = (time_constants_on(one.filter(problem), problem) for one in choices)
     assert DT * roughly.steps[0] > 0.101 and 0.099 < DT * exactly.steps[0] <= 0.1
 
 
@@ -188,9 +182,8 @@ def test_all_that_is_chosen_among_forgets_in_time_and_the_plan_is_kept(studies, 
     assert plan.identity["forget"] == FORGET and "forget0.5" in awake.name
     assert "forget" not in Plan("kf", (problem,)).identity
     choice, *_ = read_tuned(awake.save(tmp_path / "awake.json"), [problem])
-    np.testing.assert_allclose(
-        choice.filter(problem).model.process_noise_cov, awake.filter.model.process_noise_cov, rtol=1e-12
-    )
+    covs = [one.model.process_noise_cov for one in (choice.filter(problem), awake.filter)]
+    np.testing.assert_allclose(*covs, rtol=1e-12)
     assert _plan(plan.identity, "x", lambda name: problem).forget == FORGET
     assert choice_from(awake.result.choice._asdict()) == awake.choice
 
@@ -215,9 +208,8 @@ def test_the_numbers_on_validation_seeds_are_those_of_the_filter_that_is_handed_
 
 @pytest.mark.parametrize("options", [{"method": name} for name in ("likelihood", "gradient", "noise-estimation")])
 def test_it_holds_on_other_methods_of_tuning(options, problem):
-    found = tuning.tune(
-        problem, "kf", trials=2, space=tuning.SearchSpace(forget=FORGET), progress=False, **options
-    )
+    space = tuning.SearchSpace(forget=FORGET)
+    found = tuning.tune(problem, "kf", trials=2, space=space, progress=False, **options)
     assert DT * found.held_out.evaluation.time_constants.steps[0] <= FORGET
 
 

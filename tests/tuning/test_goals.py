@@ -204,9 +204,9 @@ def test_a_full_r_is_read_back_wherever_a_tuned_file_is(tmp_path):
     result = run_tuning(plan, 8, Console(quiet=True), out=file, method="gradient")
     choice, *_ = read_tuned(file, plan.scenarios)
     assert np.array(choice.model["measurement_noise_cov"])[0, 1] > 0.5 and choice == result.result.choice
-    assert choice_of("ekf", parameters_of(choice), plan.scenarios[0]).filter(plan.scenarios[0]).model.digest == (
-        choice.filter(plan.scenarios[0]).model.digest
-    )
+    again = choice_of("ekf", parameters_of(choice), plan.scenarios[0])
+    digests = {one.filter(plan.scenarios[0]).model.digest for one in (choice, again)}
+    assert len(digests) == 1
     ratios = result.comparison.ratios
     assert result.comparison.true is not None and abs(ratios["oracle"].value - 1.0) < 0.01
     assert plan.identity["full_r"] and "full_r" not in plan._replace(full_r=False).identity
@@ -265,9 +265,7 @@ def test_objectives_on_true_states_need_them():
     data = MISMATCH.data(range(2))
     with pytest.raises(ValueError, match="must be 'likelihood' without true states, but got 'mse'"):
         tune_by_gradient("ekf", MISMATCH, data._replace(states=None), objective="mse")
-    with pytest.raises(
-        ValueError, match="objective must be one of likelihood, score, mse, log-score, but got 'nees'"
-    ):
+    with pytest.raises(ValueError, match="objective must be one of likelihood, score, mse, .*, but got 'nees'"):
         tune_by_gradient("ekf", MISMATCH, data, objective="nees")
 
 

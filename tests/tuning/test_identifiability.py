@@ -35,21 +35,18 @@ def likelihood_of(c, seed=0, count=24, steps=100):
 
     def model(logarithms):
         q11, q22, r = np.exp(logarithms)
-        return affine_model(
-            A=[[0.9, 0.0], [0.0, 0.6]],
-            B=[[0.5], [1.0]],
-            C=c,
-            Q=[[q11, 0.0], [0.0, q22]],
-            R=r * np.eye(len(c)),
-            P0=[1.0, 1.0],
-        )
+        noise = {"Q": [[q11, 0.0], [0.0, q22]], "R": r * np.eye(len(c)), "P0": [1.0, 1.0]}
+        return affine_model(A=[[0.9, 0.0], [0.0, 0.6]], B=[[0.5], [1.0]], C=c, **noise)
 
     keys = episode_keys(range(seed, seed + count))
     inputs = np.random.default_rng(seed).normal(size=(count, steps, 1))
     measurements = simulate.simulate(model(TRUE), keys, inputs).measurements
-    return lambda logarithms: run(
-        KalmanFilter(model=model(logarithms)), keys, inputs, measurements
-    ).log_likelihoods.sum(axis=1)
+
+    def log_likelihoods(logarithms):
+        filter_ = KalmanFilter(model=model(logarithms))
+        return run(filter_, keys, inputs, measurements).log_likelihoods.sum(axis=1)
+
+    return log_likelihoods
 
 
 def known(log_likelihoods, starts=(TRUE,)):
@@ -122,9 +119,8 @@ def test_an_ekf_has_the_intervals_of_the_gradient_method_from_a_bad_choice():
     np.testing.assert_allclose(errors, right.standard_errors, rtol=0.6)
     assert found.tuned.tolist() == [bad.model["process_noise_cov"][0], own["Q22"] / 100, own["R"] * 100]
     assert all(number["determined"] for number in as_data(found).values())
-    assert sentences(found)[0].startswith(
-        "The innovations of the training runs determine Q11 within a factor of 1."
-    )
+    said = sentences(found)[0]
+    assert said.startswith("The innovations of the training runs determine Q11 within a factor of 1.")
 
 
 def test_the_published_tunnel_tells_nothing_of_its_small_r():

@@ -140,9 +140,8 @@ def test_outliers_beyond_a_gate_are_left_out(data, found):
     outliers = rng.random(spoilt.shape) < 0.02
     spoilt[outliers] += 3.0
     spoilt = data._replace(measurements=spoilt)
-    normal, gated = (
-        identify(spoilt, pendulum, FREE, start=TRUTH, starts=1, gate=gate) for gate in (math.inf, 4.5)
-    )
+    options = {"start": TRUTH, "starts": 1}
+    normal, gated = (identify(spoilt, pendulum, FREE, gate=gate, **options) for gate in (math.inf, 4.5))
     left_out = gated.objective.parts[0].data.outliers
     assert (left_out & outliers).sum() > 0.97 * outliers.sum() and (left_out & ~outliers).sum() < 5
     for name in ("offset", "r"):

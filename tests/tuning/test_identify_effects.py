@@ -32,9 +32,8 @@ PRESET = "tunnel_physical"
 def thruster_logs(sensors=("thrust", "speed"), first=0, speeds=((120.0, 160.0),) * 4, steps=400, gap=None):
     """Runs of a thruster that begin at speeds within pairs of ends [rad/s], or at rest for None."""
     noise = [NOISE["R11"] if sensor == "thrust" else NOISE["R22"] for sensor in sensors]
-    model = logged_model(
-        preset=PRESET, sensors=sensors, process_noise_cov=[1.0, 4e-4], measurement_noise_cov=noise
-    )
+    noise = {"process_noise_cov": [1.0, 4e-4], "measurement_noise_cov": noise}
+    model = logged_model(preset=PRESET, sensors=sensors, **noise)
     rng, keys = np.random.default_rng(first), episode_keys(range(first, first + len(speeds)))
     inputs = held_levels(keys, 12.0, 25, steps)[..., None]
     made = []
@@ -68,10 +67,8 @@ def test_logs_that_begin_at_speed_give_the_noise_and_constants_of_the_truth():
     check(found, NOISE)
     assert found.standard_errors["R22"] < 0.4 and found.standard_errors["Q11"] < 0.5
     (said,) = [one for one in found.sentences() if "begin" in one]
-    assert said == (
-        "4 of 4 runs (1, 2, 3, 4) do not begin as the model's prior says: "
-        "the first 50 rows only determine the initial state and are not scored."
-    )
+    begins = "4 of 4 runs (1, 2, 3, 4) do not begin as the model's prior says: "
+    assert said == f"{begins}the first 50 rows only determine the initial state and are not scored."
     checked = validate(found, thruster_logs(first=50, speeds=((150.0, 150.0), None, (-140.0, -120.0))))
     assert checked["identified"].nis == pytest.approx(1.0, abs=0.1)
     assert checked["identified"].fit["speed"] > 95
@@ -125,9 +122,8 @@ def test_a_model_of_a_user_whose_runs_begin_elsewhere():
 def test_a_first_state_is_that_of_the_normal_equations():
     """For a linear model and a wide prior it is the least-squares estimate from the first rows."""
     model = random_affine()
-    model = model.replace(
-        process_noise_cov=1e-12 * np.eye(3), measurement_noise_cov=[0.5, 2.0], prior_cov=1e-6 * np.eye(3)
-    )
+    noise = {"process_noise_cov": 1e-12 * np.eye(3), "measurement_noise_cov": [0.5, 2.0]}
+    model = model.replace(**noise, prior_cov=1e-6 * np.eye(3))
     rng = np.random.default_rng(3)
     truth, steps = 30.0 * rng.normal(size=model.n), 80
     inputs = rng.normal(size=(1, steps, model.inputs))
@@ -159,9 +155,8 @@ def test_a_lead_in_is_left_out_of_the_likelihood_and_its_slopes():
     begun = Starts(np.array([True, False]), means, np.tile(np.eye(2), (2, 1, 1)), np.array([20, 0]))
     found = sensitivity(model, data.inputs, data.measurements, slopes, starts=begun)
     own = model.replace(prior_mean=means[0], prior_cov=np.eye(2))
-    first, all_rows = (
-        sensitivity(own, data.inputs[:1, : end - 1], data.measurements[:1, :end], slopes) for end in (20, 61)
-    )
+    parts = ((data.inputs[:1, : end - 1], data.measurements[:1, :end]) for end in (20, 61))
+    first, all_rows = (sensitivity(own, *part, slopes) for part in parts)
     for name in ("values", "gradients", "information"):
         expected = getattr(all_rows, name)[0] - getattr(first, name)[0]
         np.testing.assert_allclose(getattr(found, name)[0], expected, rtol=1e-9)
@@ -178,16 +173,8 @@ def test_a_prior_that_is_free_stays_what_the_model_says():
     assert found.begun_elsewhere == () and found.values["spread"] > 5.0
 
 
-EFFECTS = (
-    "lag_speed",
-    "lag_thrust",
-    "dead_band_low",
-    "dead_band_high",
-    "bias_thrust",
-    "bias_speed",
-    "thrust_asymmetry",
-    "ambient_velocity",
-)
+EFFECTS = "lag_speed", "lag_thrust", "dead_band_low", "dead_band_high", "bias_thrust", "bias_speed"
+EFFECTS += "thrust_asymmetry", "ambient_velocity"
 
 
 def with_effects(logs, effects, **options):
@@ -202,9 +189,7 @@ def test_effects_that_are_not_there_lower_no_likelihood_and_bias_nothing():
     plain = with_effects(logs, (), against=False)
     found = with_effects(logs, EFFECTS)
     assert found.log_likelihood >= plain.log_likelihood - 1e-3
-    assert (
-        found.log_likelihood < plain.log_likelihood + 15.0
-    )  # chi-squared with 8 degrees of freedom at 1e-4: 31.8/2
+    assert found.log_likelihood < plain.log_likelihood + 15.0  # chi-squared, 8 degrees of freedom, 1e-4: 31.8/2
     truth = {name: getattr(make_plant(PRESET).parameters, name) for name in OWN[:2]} | NOISE
     for name, value in truth.items():
         assert abs(found.values[name] - value) < 3.9 * found.standard_errors[name], name

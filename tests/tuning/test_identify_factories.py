@@ -17,11 +17,8 @@ from tuning.problems.data import Data
 from tuning.problems.problem import Coordinates, Parameter
 
 DT = 0.1
-FREE = (
-    Parameter("gain", 0.2, 20.0, default=1.5),
-    Parameter("rate", 0.1, 10.0, default=0.8),
-    Parameter("r", 1e-3, 1.0, default=0.05),
-)
+FREE = Parameter("gain", 0.2, 20.0, default=1.5), Parameter("rate", 0.1, 10.0, default=0.8)
+FREE += (Parameter("r", 1e-3, 1.0, default=0.05),)
 REST = {"process_noise_cov": [1e-4], "prior_mean": [0.0], "prior_cov": [1.0], "inputs": 1}
 
 
@@ -34,9 +31,8 @@ def observe(x, c):
 
 
 def of_module(gain=2.0, rate=1.0, r=0.04):
-    return StateSpaceModel(
-        transition=transition, observe=observe, measurement_noise_cov=[r], constants=(gain, rate), **REST
-    )
+    arguments = {"measurement_noise_cov": [r], "constants": (gain, rate), **REST}
+    return StateSpaceModel(transition=transition, observe=observe, **arguments)
 
 
 def of_factory(gain=2.0, rate=1.0, r=0.04):
@@ -45,9 +41,7 @@ def of_factory(gain=2.0, rate=1.0, r=0.04):
     def move(x, u, c):
         return (x[0] + step * (c[0] * u[0] - c[1] * x[0]),)
 
-    return StateSpaceModel(
-        transition=move, observe=lambda x, c: (x[0],), measurement_noise_cov=[r], constants=(gain, rate), **REST
-    )
+    return of_module(gain, rate, r).replace(transition=move, observe=lambda x, c: (x[0],))
 
 
 def with_one_lambda(gain=2.0, rate=1.0, r=0.04):
@@ -164,13 +158,9 @@ class StepAndNumbers(NamedTuple):
 
 def continuous(rates, constants, r):
     arguments = {name: value for name, value in REST.items() if name != "process_noise_cov"}
-    return ContinuousModel(
-        rates=rates,
-        observe=observe,
-        densities=[1e-3],
-        constants=constants,
-        arguments={**arguments, "measurement_noise_cov": [r]},
-    ).at(DT)
+    arguments["measurement_noise_cov"] = [r]
+    numbers = {"densities": [1e-3], "constants": constants, "arguments": arguments}
+    return ContinuousModel(rates=rates, observe=observe, **numbers).at(DT)
 
 
 def in_continuous_time(gain=2.0, rate=1.0, r=0.04):
@@ -202,10 +192,8 @@ def recorded(runs=2, steps=60):
     return Data(tuple(range(runs)), inputs, measured, filter_keys(range(runs)), 0)
 
 
-CAPTURED = [
-    *(in_closure, with_jacobians, complex_steps, of_an_object, of_a_method, of_a_partial, of_an_array),
-    *(of_a_local_class, of_a_callable, of_a_callable_without_hash),
-]
+CAPTURED = [in_closure, with_jacobians, complex_steps, of_an_object, of_a_method, of_a_partial, of_an_array]
+CAPTURED += [of_a_local_class, of_a_callable, of_a_callable_without_hash]
 PAIRS = [*((of_module, one) for one in CAPTURED), (of_constants_in_continuous_time, in_continuous_time)]
 
 

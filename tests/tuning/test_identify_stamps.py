@@ -111,10 +111,8 @@ def test_rows_with_step_ratios_have_the_numbers_of_live(name, make, request):
         assert value[0] == pytest.approx(expected.log_likelihoods.sum(), rel=1e-9)
         for slope, direction in zip(slopes[0], q_slopes, strict=True):
             ends = [model.replace(process_noise_cov=Q + sign * 1e-7 * direction) for sign in (1, -1)]
-            above, below = (
-                by_the_clock(make_filter(name, one), filter_keys([0])[0], log, None)[0].log_likelihoods.sum()
-                for one in ends
-            )
+            estimates = (by_the_clock(make_filter(name, one), filter_keys([0])[0], log, None)[0] for one in ends)
+            above, below = (one.log_likelihoods.sum() for one in estimates)
             assert slope == pytest.approx((above - below) / 2e-7, rel=1e-5, abs=1e-3)
 
 
@@ -143,10 +141,8 @@ def test_gradients_along_constants_and_the_numbers_of_the_grid():
 def test_a_jittering_clock_does_not_move_what_is_identified():
     """On a grid 0.4 of a step's motion passes for noise of the sensors."""
     logs = [recorded(stamps_of(250, seed), seed) for seed in (3, 4)]
-    own, on_grid = (
-        tuning.identify(tuning.read_logs(logs, model=plant(), dt=DT, grid=grid), FREE, starts=1, start=START)
-        for grid in (False, True)
-    )
+    readings = (tuning.read_logs(logs, model=plant(), dt=DT, grid=grid) for grid in (False, True))
+    own, on_grid = (tuning.identify(reading, FREE, starts=1, start=START) for reading in readings)
     truth = {"stiffness": 4.0, "damping": 0.6, "R11": 1e-4, "R22": 4e-4}
     for name, value in truth.items():
         assert abs(own.values[name] - value) < 3.5 * own.standard_errors[name], name
@@ -193,9 +189,8 @@ def test_what_needs_a_grid_is_refused(changes, rule):
 
 def test_logs_are_all_on_grids_or_none():
     model = plant().at(DT)
-    logs = [
-        read_log(recorded(DT * np.arange(30), seed), model, grid=grid) for seed, grid in ((6, True), (7, False))
-    ]
+    recordings = [(recorded(DT * np.arange(30), seed), grid) for seed, grid in ((6, True), (7, False))]
+    logs = [read_log(recording, model, grid=grid) for recording, grid in recordings]
     logs = [dataclasses.replace(log, name=name) for log, name in zip(logs, ("even", "own"), strict=True)]
     assert all(isinstance(log, Log) for log in logs)
     with pytest.raises(ValueError, match="logs must all lie on grids or none, but own does not and even does"):
@@ -212,10 +207,11 @@ def test_models_made_of_rates_can_be_sent_to_another_process():
 
 def test_a_study_on_stamps_of_a_grid_has_the_numbers_of_the_grid():
     model, logs = smooth(), [recorded(np.arange(200) * DT, seed) for seed in range(3)]
-    by_grid = [
-        LogProblem([read_log(log, model, dt=DT, name=f"{k}", **how) for k, log in enumerate(logs)], model)
+    of_both = (
+        [read_log(log, model, dt=DT, name=f"{k}", **how) for k, log in enumerate(logs)]
         for how in ({}, {"grid": False})
-    ]
+    )
+    by_grid = [LogProblem(each, model) for each in of_both]
     choice = untuned_choice("ekf", by_grid[0])
     found = [evaluate(choice.filter(one), one.data(one.parts.held_out), None) for one in by_grid]
     assert found[1].log_likelihood == pytest.approx(found[0].log_likelihood, rel=1e-9)

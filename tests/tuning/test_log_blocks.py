@@ -211,9 +211,8 @@ def test_each_run_begins_where_a_kalman_update_with_the_wide_prior_has_it():
     z = data.measurements[:, 0, 0]
     np.testing.assert_allclose(found.means[:, 0, 0], wide / (wide + 0.04) * z, rtol=1e-9)
     np.testing.assert_allclose(found.means[:, 0, 1], 0.5, rtol=1e-12)
-    np.testing.assert_allclose(
-        found.covs[:, 0], np.diag([1 / (1 / wide + 25.0), 0.09])[None].repeat(9, 0), rtol=1e-9
-    )
+    cov = np.diag([1 / (1 / wide + 25.0), 0.09])
+    np.testing.assert_allclose(found.covs[:, 0], cov[None].repeat(9, 0), rtol=1e-9)
 
 
 def test_short_runs_far_from_the_prior_are_estimated_from_the_first_row_on():

@@ -182,9 +182,8 @@ def test_true_states_in_the_logs_give_a_scale_and_runs_of_their_own_for_the_ense
 def test_an_ensemble_without_a_truth_is_the_smallest_whose_estimates_are_close_to_the_largest_one_s():
     problem = LogProblem(logs_of(300), MODEL, blocks=8)
     plan, data = Plan("enkf", (problem,), objectives=("likelihood",)), problem.data(problem.parts.training)
-    choice = untuned_choice("enkf", problem)._replace(
-        model={"process_noise_cov": (Q,), "measurement_noise_cov": R}
-    )
+    noise = {"process_noise_cov": (Q,), "measurement_noise_cov": R}
+    choice = untuned_choice("enkf", problem)._replace(model=noise)
 
     def means_of(size):
         filter_ = choice.with_size(size).filter(problem)

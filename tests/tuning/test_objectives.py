@@ -55,9 +55,8 @@ def test_reports_have_log_l_and_not_its_negative(objective, name, said):
     assert best.get_ydata().tolist() == values and f"has {values[1]:g}." in of_history(trials, objective)
     low, high = axis.get_ylim()
     assert low < min(values) < max(values) < high
-    assert of_front([create_trial(values=[56.0, 2.0])], (objective, "nis")).endswith(
-        f"to {name} {values[1]:g} and nis 2."
-    )
+    front = of_front([create_trial(values=[56.0, 2.0])], (objective, "nis"))
+    assert front.endswith(f"to {name} {values[1]:g} and nis 2.")
     assert TypeResult("ekf", 2, 0, 0, 56.0, True, None).best(objective) == f"{values[1]:g}"
 
 
@@ -175,8 +174,7 @@ def test_a_study_of_the_log_score_needs_no_band_and_is_validated():
     plan = Plan("kf", (PROBLEM,), objectives=("log-score",)).checked()
     assert not plan.is_constrained and Plan("kf", (PROBLEM,)).is_constrained
     result = run_study(open_study("proper", plan), plan, 12)
-    known = -evaluate(
-        oracle_choice("kf", PROBLEM).filter(PROBLEM), plan.training_data()[0], PROBLEM.scale
-    ).log_score.value
+    oracle = oracle_choice("kf", PROBLEM).filter(PROBLEM)
+    known = -evaluate(oracle, plan.training_data()[0], PROBLEM.scale).log_score.value
     assert result.best_value < known + 0.02 and result.validation is not None
     assert plan.identity == plan._replace(worst=False).identity != plan._replace(worst=True).identity

@@ -96,9 +96,8 @@ def test_only_the_table_that_is_asked_for_is_made(tmp_path, monkeypatch):
     page = tmp_path / "auv.md"
     page.write_text("<!-- table filters_fast -->\n<!-- end -->\n<!-- table filters_drag -->\n<!-- end -->\n")
     main(["auv", "--out", str(tmp_path), "--table", "filters_drag"])
-    assert page.read_text() == (
-        "<!-- table filters_fast -->\n<!-- end -->\n<!-- table filters_drag -->\nnew\n<!-- end -->\n"
-    )
+    begins = "<!-- table filters_fast -->\n<!-- end -->\n"
+    assert page.read_text() == f"{begins}<!-- table filters_drag -->\nnew\n<!-- end -->\n"
 
 
 MISMATCH = find_scenario("mismatch")
@@ -110,10 +109,8 @@ def test_the_factor_on_the_lift_is_that_of_the_parameters():
     constants = model.constants._replace(**{LIFT: 0.8})
     state, voltage = np.array([150.0, 1.2]), np.array([7.0])
     for name, arguments in (("observe", (state,)), ("transition", (state, voltage))):
-        ours, known = (
-            getattr(model, name)(*arguments, constants),
-            getattr(plain, name)(*arguments, plain.constants),
-        )
+        ours = getattr(model, name)(*arguments, constants)
+        known = getattr(plain, name)(*arguments, plain.constants)
         np.testing.assert_allclose(ours, known, rtol=1e-12)
     assert len(SLOPES) == 8 and model.measurement_noise_cov[0, 0] == 0.3
 

@@ -53,9 +53,8 @@ def test_the_critical_sum_of_ranks_is_that_of_scipys_test(count):
     for shift in np.linspace(-0.2, 1.0, 40):
         differences = rng.normal(shift, 1.0, count)
         p = stats.wilcoxon(differences, alternative="greater", zero_method="zsplit").pvalue
-        assert (positive_rank_sum(differences.tolist()) >= critical_rank_sum(count, P_THRESHOLD)) == (
-            p < P_THRESHOLD
-        )
+        is_critical = positive_rank_sum(differences.tolist()) >= critical_rank_sum(count, P_THRESHOLD)
+        assert is_critical == (p < P_THRESHOLD)
 
 
 def test_it_decides_as_optunas_pruner():
@@ -101,9 +100,7 @@ def test_the_best_trial_is_a_feasible_one():
         return float(trial.number)
 
     study.optimize(objective, n_trials=2)
-    trial = trial_of(
-        np.linspace(0.5, 0.6, 8), optuna.trial.TrialState.RUNNING
-    )  # worse than trial 0, better than 1
+    trial = trial_of(np.linspace(0.5, 0.6, 8), TrialState.RUNNING)  # worse than trial 0, better than 1
     assert not PairedPruner().prune(study, trial)
     assert not pruner_of_optuna().prune(study, trial)
 

@@ -175,9 +175,8 @@ def test_without_base_and_scale_it_is_nominal_and_the_scale_is_computed_and_a_tu
 
 @pytest.mark.slow
 def test_a_file_says_whose_scenario_it_is(file):
-    scenario = file(
-        'plant = "auv"\nbase = "auv:navigation"\nsteps = 60\nfirst_scored_step = 10\ncurrent = [0.1, 0.0, 0.0]\n'
-    )
+    of_vehicle = 'plant = "auv"\nbase = "auv:navigation"\nsteps = 60\nfirst_scored_step = 10\n'
+    scenario = file(f"{of_vehicle}current = [0.1, 0.0, 0.0]\n")
     assert scenario.states == "navigation"
     assert 0.3 < scenario.scale[9] / VEHICLES["auv:navigation"].scale[9] < 1
     refused("scenario must be one of nominal, .* but got 'auv:motion'", file, 'base = "auv:motion"')

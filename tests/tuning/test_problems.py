@@ -257,11 +257,8 @@ def test_a_closed_loop_is_that_of_the_tracking_env_under_pi(name):
     loop = ClosedLoop(low=-0.4, high=0.6, hold_time=0.3)
     scenario = find_scenario(name).replace(excitation=loop, steps=80)
     data = scenario.data([3, 4])
-    env = gym.make(
-        "BowThrusterTracking-v0",
-        reference=[{"name": "steps", "low": -0.4, "high": 0.6, "hold_time": 0.3}],
-        **scenario.plant_arguments,
-    )
+    reference = [{"name": "steps", "low": -0.4, "high": 0.6, "hold_time": 0.3}]
+    env = gym.make("BowThrusterTracking-v0", reference=reference, **scenario.plant_arguments)
     controller, state = PIController.for_env(env), None
     observation, info = env.reset(seed=4)
     for k in range(80):

@@ -130,9 +130,8 @@ def test_the_reported_values_are_the_scores_of_single_seeds():
 
 def test_several_scenarios_are_averaged():
     plan = PLAN._replace(scenarios=(MISMATCH, OUTLIERS), prune=False)
-    values = [
-        studied(PLAN._replace(scenarios=(one,), prune=False), 1).trials[0].values[0] for one in plan.scenarios
-    ]
+    plans = [PLAN._replace(scenarios=(one,), prune=False) for one in plan.scenarios]
+    values = [studied(one, 1).trials[0].values[0] for one in plans]
     assert studied(plan, 1).trials[0].values[0] == pytest.approx(np.mean(values), rel=1e-12)
 
 
@@ -213,13 +212,9 @@ def test_a_trial_whose_nis_is_not_finite_is_inconsistent_and_has_no_twin(monkeyp
 
 def test_a_trial_that_there_is_already_is_not_enqueued_again():
     study = optuna.create_study()
-    study.add_trial(
-        optuna.trial.create_trial(
-            params={"R": 0.25, "N": 30},
-            distributions={"R": FloatDistribution(0.01, 1.0), "N": IntDistribution(5, 200)},
-            value=1.0,
-        )
-    )
+    distributions = {"R": FloatDistribution(0.01, 1.0), "N": IntDistribution(5, 200)}
+    params = {"R": 0.25, "N": 30}
+    study.add_trial(optuna.trial.create_trial(params=params, distributions=distributions, value=1.0))
     for r, size, count in ((0.25, 30, 1), (0.25 + 1e-7, 30, 1), (0.2501, 30, 2), (0.25, 31, 3), (0.2501, 30, 3)):
         enqueue_new(study, {"R": r, "N": size}, {})
         assert len(study.trials) == count

@@ -107,10 +107,8 @@ def test_a_sum_has_the_parts_side_by_side():
     both = named_model("ornstein-uhlenbeck + oscillator")
     stds = [number.name for number in both.free if "std" in number.name]
     assert stds == ["ornstein_uhlenbeck_std", "oscillator_std"]
-    for name, rule in (
-        ("oscillator + oscillator", "parts of a sum must differ"),
-        ("constant + constant-velocity", "at most one part with a level"),
-    ):
+    two_levels = "constant + constant-velocity", "at most one part with a level"
+    for name, rule in (("oscillator + oscillator", "parts of a sum must differ"), two_levels):
         refused(rule, named_model, name)
 
 
@@ -423,6 +421,5 @@ def test_every_start_lies_in_its_range():
 
 
 def test_each_number_has_six_digits():
-    assert _matrix(np.array([[0.000151234567, 2.0], [1e-9 / 3.0, 12.3456789]]), "") == (
-        "[[0.000151235, 2],\n [3.33333e-10, 12.3457]]"
-    )
+    text = _matrix(np.array([[0.000151234567, 2.0], [1e-9 / 3.0, 12.3456789]]), "")
+    assert text == "[[0.000151235, 2],\n [3.33333e-10, 12.3457]]"

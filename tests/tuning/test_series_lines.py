@@ -99,10 +99,8 @@ def test_the_text_of_an_answer_makes_its_model_elsewhere(name):
 
 def test_an_angle_that_wraps_goes_on():
     course = 40.0 * simulated("constant", 600)
-    straight, wrapped = (
-        tuning.fit({"t": 0.1 * np.arange(600), "heading[deg]": angle}, model="constant")
-        for angle in (course, np.mod(course, 360.0))
-    )
+    tables = ({"t": 0.1 * np.arange(600), "heading[deg]": angle} for angle in (course, np.mod(course, 360.0)))
+    straight, wrapped = (tuning.fit(table, model="constant") for table in tables)
     assert wrapped.r == pytest.approx(straight.r, rel=1e-6) and wrapped.q == pytest.approx(straight.q, rel=1e-6)
     assert any("wraps" in sentence for sentence in wrapped.sentences())
     for language in LANGUAGES:

@@ -57,9 +57,11 @@ def test_the_table_is_of_those_seeds_and_paired(monkeypatch):
 
 def test_where_it_has_to_be_consistent_the_best_is_that_of_the_consistent_sizes(monkeypatch):
     monkeypatch.setattr(sizes, "size_ladder", lambda name: (5, 40))
-    monkeypatch.setattr(
-        sizes, "_outside", lambda choice, plan, data: -(choice.numbers["ensemble_size"] < 40) or 1.0
-    )
+
+    def outside(choice, plan, data):
+        return -1.0 if choice.numbers["ensemble_size"] < 40 else 1.0
+
+    monkeypatch.setattr(sizes, "_outside", outside)
     plan, choice = Plan("enkf", (MISMATCH,)), untuned_choice("enkf", MISMATCH)
     free, held = (ensemble_sizes(choice, plan, plan.training_data(), consistent) for consistent in (False, True))
     assert free[2].ratio.value == 1.0 < free[1].ratio.value

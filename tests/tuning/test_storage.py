@@ -135,19 +135,14 @@ def test_patience_has_an_end(flaky, monkeypatch):
 
 
 def test_a_driver_that_is_missing_is_named_with_the_extra_that_brings_it():
-    with pytest.raises(
-        ValueError, match=r"but got postgresql\+pg8000://host/s: .*: pip install '\.\[db\]' in the"
-    ):
+    with pytest.raises(ValueError, match=r"but got postgresql\+pg8000://host/s: .*: pip install '\.\[db\]' in"):
         open_storage("postgresql+pg8000://host/s")
 
 
 def test_several_workers_on_sqlite_are_warned(monkeypatch):
     monkeypatch.setattr("tuning.api.tune.checked", lambda plan: open_storage(""))  # ends here
     plan, console = Plan("ekf", (find_problem("nominal"),)), Console(quiet=True)
-    with (
-        pytest.warns(UserWarning, match="so 2 workers wait for each other"),
-        pytest.raises(ValueError, match="stor"),
-    ):
+    with pytest.warns(UserWarning, match="so 2 workers wait"), pytest.raises(ValueError, match="stor"):
         run_tuning(plan, 3, console, "sqlite:///s.db", workers=2)
 
 
@@ -259,10 +254,7 @@ def test_a_sign_of_life_that_gets_lost_ends_no_thread(storage, refuse, clock):
     storage.record_heartbeat(number)
     refuse("set_study_user_attr")
     before = clock.now
-    with (
-        pytest.warns(UserWarning, match="no answer"),
-        pytest.raises(ValueError, match="a database must answer within 60 s"),
-    ):
+    with pytest.warns(UserWarning, match="no answer"), pytest.raises(ValueError, match="must answer within 60 s"):
         study.set_user_attr("a", 1)  # the outage of before is over
     assert clock.now > before + PATIENCE_SECONDS
 
@@ -361,9 +353,8 @@ def test_a_storage_that_cannot_be_reached_tells_no_password(url, tmp_path, monke
     pytest.importorskip("grpc")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(database, "PROXY_SECONDS", 0.01)
-    with pytest.raises(
-        ValueError, match=f"storage must be .* but got {url.partition(':')[0].replace('+', '.')}:"
-    ) as e:
+    scheme = url.partition(":")[0].replace("+", ".")
+    with pytest.raises(ValueError, match=f"storage must be .* but got {scheme}:") as e:
         open_storage(url)
     assert "secret" not in str(e.value) and "tuner:" not in str(e.value) and "\n" not in str(e.value)
     assert not list(tmp_path.iterdir())

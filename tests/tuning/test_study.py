@@ -42,9 +42,8 @@ def test_a_study_starts_untuned_never_sees_the_truth_and_improves_on_held_out_se
     path = tmp_path / "tuned.json"
     write_tuned(path, PLAN, result, [comparison], "s")
     assert read_tuned(path) == (result.choice, SCENARIO, 0)
-    assert json.loads(path.read_text())["held_out"]["mismatch"]["tuned"]["rmse"][0] == list(
-        comparison.tuned.rmse[0]
-    )
+    stored = json.loads(path.read_text())["held_out"]["mismatch"]["tuned"]
+    assert stored["rmse"][0] == list(comparison.tuned.rmse[0])
 
 
 def test_the_same_seed_gives_the_same_study_and_another_seed_another():

@@ -136,9 +136,8 @@ def test_a_training_that_gets_worse_returns_the_first_weights_and_one_that_is_st
     assert all(one.score > checks[0].score for one in checks[1:])
     assert all(torch.equal(before[name], one) for name, one in estimator.state_dict().items())
     steps = []
-    checks = train(
-        estimator, data, validation, PROBLEM.scale, SETTINGS, on_step=steps.append, stopped=lambda: len(steps) == 3
-    )
+    ends = {"on_step": steps.append, "stopped": lambda: len(steps) == 3}
+    checks = train(estimator, data, validation, PROBLEM.scale, SETTINGS, **ends)
     assert steps == [1, 2, 3] and [one.step for one in checks] == [0, 2]
 
 

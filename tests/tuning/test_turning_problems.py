@@ -112,9 +112,8 @@ def test_the_bound_of_small_errors():
         model, u = turning(side), rates([0], 30)
         bound = posterior_bound(model, u, truths=20)[0, -1]
         truth = simulate(model, episode_keys(range(20)), np.repeat(u, 20, 0))
-        covs = filters.run(
-            make_filter("ekf", model), inputs=np.repeat(u, 20, 0), measurements=truth.measurements
-        ).covs
+        ekf = make_filter("ekf", model)
+        covs = filters.run(ekf, inputs=np.repeat(u, 20, 0), measurements=truth.measurements).covs
         np.testing.assert_allclose(np.diag(bound), np.diag(covs[:, -1].mean(0)), rtol=0.1)
 
 
@@ -204,9 +203,8 @@ def test_the_trap_of_a_free_gyroscope():
 
 def of_oracle(scenario, runs):
     """The EKF that knows Q and R, on the seeds 0, 1, ..."""
-    return evaluate(
-        make_filter("ekf", scenario.model(**scenario.true)), scenario.data(range(runs)), scenario.scale
-    )
+    ekf = make_filter("ekf", scenario.model(**scenario.true))
+    return evaluate(ekf, scenario.data(range(runs)), scenario.scale)
 
 
 def test_the_vehicle_loops_in_a_scenario():
@@ -259,10 +257,8 @@ TRACKED_SCALE = (0.005, 0.008, 0.014, 0.005, 0.005, 0.005)
 def tracker(q=Q, r=R, side="body", across=SENSOR[:2]):
     """Attitude, a bias of the gyroscope, and a star tracker with deviations `across` its third axis."""
     noise = {"q": [Q, Q, q] + [0.001**2 * DT] * 3, "r": [*np.square(across), r], "mean": MEAN, "cov": PRIOR}
-    quantities = {
-        "states": (Rotation("attitude"), *BIASES),
-        "measurements": (Rotation("star tracker", "s", side),),
-    }
+    quantities = {"states": (Rotation("attitude"), *BIASES)}
+    quantities["measurements"] = (Rotation("star tracker", "s", side),)
     return state_space(turn, lambda x, c: x[:4], **noise, **quantities, inputs=3)
 
 
@@ -325,10 +321,12 @@ def test_about_one_axis_it_is_the_angle(of_angle, flips):
 def test_innovations_about_one_axis():
     """To 1e-9: innovations and NIS, and the log-likelihood but for the two other axes."""
     runs = [fixed_axis(model) for model in (about_z(), tracker())]
-    angle, turned = (
-        filters.run(make_filter("ekf", model), inputs=log.inputs, measurements=log.measurements)
-        for model, log in zip((about_z(), tracker()), runs, strict=True)
+    both = zip(
+        (about_z(), tracker()),
+        ({"inputs": log.inputs, "measurements": log.measurements} for log in runs),
+        strict=True,
     )
+    angle, turned = (filters.run(make_filter("ekf", model), **log) for model, log in both)
     np.testing.assert_allclose(turned.innovations[:, 2], angle.innovations[:, 0], atol=1e-9)
     S = turned.innovation_covs
     np.testing.assert_allclose(S[:, 2, 2], angle.innovation_covs[:, 0, 0], rtol=1e-9)
@@ -354,10 +352,8 @@ def test_a_simulated_study_is_consistent(side):
     v = residuals(tracked.model(), data).measurement
     deviations = np.sqrt([*SENSOR[:2] ** 2, R])
     np.testing.assert_allclose(np.cov((v / deviations).T), np.eye(3), atol=0.08)
-    x, z = (
-        Turned.from_quat(values[:, data.late, :4].reshape(-1, 4), scalar_first=True)
-        for values in (data.states, data.measurements)
-    )
+    late = (values[:, data.late, :4].reshape(-1, 4) for values in (data.states, data.measurements))
+    x, z = (Turned.from_quat(values, scalar_first=True) for values in late)
     error = (x.inv() * z if side == "body" else z * x.inv()).as_rotvec()
     np.testing.assert_allclose(v, error, atol=1e-12)
     report = check_consistency(ekf, tracked.data(range(20)), DT)
@@ -384,11 +380,8 @@ def test_parameters_are_of_the_tangent():
     names = {parameter.name: parameter.unit for parameter in model_parameters(tracked_problem())}
     assert [name for name in names if name.startswith("R")] == ["R11", "R22", "R33"]
     assert names["R33"] == "rad^2"
-    assert [quantity.short_label for quantity in tracked_problem().innovations] == [
-        "s_1 [rad]",
-        "s_2 [rad]",
-        "s_3 [rad]",
-    ]
+    labels = [quantity.short_label for quantity in tracked_problem().innovations]
+    assert labels == ["s_1 [rad]", "s_2 [rad]", "s_3 [rad]"]
 
 
 def test_alarms_of_a_log():

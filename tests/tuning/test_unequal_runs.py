@@ -173,9 +173,8 @@ def test_a_list_of_runs_is_a_problem_in_which_each_run_counts_in_full():
     named = [dict(zip(("inputs", "measurements", "states"), one, strict=True)) for one in runs]
     same = RunsProblem(named, MODEL, first_scored_step=3, held_out=[2, 5])
     assert same.digest == problem.digest and problem.counts_start_up
-    scored = np.concatenate(
-        [problem.data([seed]).states[0][problem.data([seed]).scored[0]] for seed in problem.parts.training]
-    )
+    training = [problem.data([seed]) for seed in problem.parts.training]
+    scored = np.concatenate([one.states[0][one.scored[0]] for one in training])
     np.testing.assert_allclose(problem.scale, scored.std(axis=0), rtol=1e-12)
     assert RunsProblem([one[:2] for one in runs], MODEL).scale is None
 
@@ -250,9 +249,8 @@ def test_a_consistency_report_has_as_many_lags_as_its_steps_allow(scored, lags):
 def chain(n):
     """A stable chain of n states, the first of which is measured."""
     a = 0.9 * np.eye(n) + 0.05 * np.eye(n, k=1)
-    return affine_model(
-        A=a, B=np.ones((n, 1)), C=np.eye(n)[:1], Q=0.1 * np.eye(n), R=[0.2], x0=np.zeros(n), P0=np.eye(n)
-    )
+    noise = {"Q": 0.1 * np.eye(n), "R": [0.2], "x0": np.zeros(n), "P0": np.eye(n)}
+    return affine_model(A=a, B=np.ones((n, 1)), C=np.eye(n)[:1], **noise)
 
 
 @pytest.mark.parametrize("same", [True, False])
@@ -360,9 +358,7 @@ def test_problems_of_other_states_share_parameters_of_their_own():
     found = tuning.tune(both, "kf", trials=3, progress=False)
     assert [len(one.evaluation.rmse) for one in found.evaluations] == [2, 3]
     assert [one.name for one in found.problems] == ["some runs", "some runs (2)"]
-    with pytest.raises(
-        ValueError, match="have the same numbers of states and measurements, or .*, but linear-2 and"
-    ):
+    with pytest.raises(ValueError, match="have the same numbers of states and measurements, or .*, but linear-2"):
         Plan("kf", (LinearProblem(n=2), LinearProblem(n=3))).checked()
     with pytest.raises(ValueError, match="must have different names, but got linear-3, linear-3"):
         Plan("kf", (LinearProblem(), LinearProblem())).checked()

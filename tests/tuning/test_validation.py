@@ -118,9 +118,8 @@ def test_all_baselines_but_the_oracle_are_trials_and_so_is_the_likeliest_noise()
 
 
 def _met(name, value, low, high, consistent=True, proper=0.0):
-    return Met(
-        name, untuned_choice("kf", LinearProblem()), value, Interval(value, low, high), proper, 1.0, consistent
-    )
+    choice, over_baseline = untuned_choice("kf", LinearProblem()), Interval(value, low, high)
+    return Met(name, choice, value, over_baseline, proper, 1.0, consistent)
 
 
 def test_what_is_not_significantly_better_gives_way_unless_it_is_equal_and_alone_consistent():
@@ -186,9 +185,9 @@ def test_trials_are_rescaled_and_validated_with_the_size_that_they_end_with_and_
     problem, size = LinearProblem(2, 1, steps=30), 60
     plan, data = Plan("enkf", (problem,)), [problem.data(range(16))]
     values = {"Q11": 1e-3, "Q22": 1e-3, "R": 1e-2, "N": 6, "inflation": 1.2, "relaxation": 0.0}
+    given = [{**values, "N": 6 + i} for i in range(2)]
     trials = [
-        optuna.trial.create_trial(values=[1.0 + i], params={**values, "N": 6 + i}, distributions=plan.space())
-        for i in range(2)
+        optuna.trial.create_trial(values=[1.0 + i], params=given[i], distributions=plan.space()) for i in (0, 1)
     ]
     asked = []
     finalists = finalists_of(plan, trials, lambda one, _: asked.append(one) or one.with_size(size))
@@ -198,9 +197,8 @@ def test_trials_are_rescaled_and_validated_with_the_size_that_they_end_with_and_
     assert measured(first, plan, data).nees > 3.0
     found = _baselines_of(plan, first, data)
     assert {one.numbers["ensemble_size"] for one in found.values()} == {size}
-    assert (
-        found[SCALED] == scaled_default("enkf", problem, 0, size).choice != scaled_default("enkf", problem).choice
-    )
+    of_size = scaled_default("enkf", problem, 0, size).choice
+    assert found[SCALED] == of_size != scaled_default("enkf", problem).choice
     assert (baseline_size(first), baseline_size(first.with_size(6))) == (size, 30)
     monkeypatch.setattr(validation, "cost_of", lambda one, *_: one.numbers["ensemble_size"])
     for budget, member in ((60.0, 60), (59.0, 30)):
@@ -312,16 +310,13 @@ def test_the_report_says_where_what_was_given_fails_and_why_a_trial_is_taken_or_
     lost = trial._replace(worse_in=("run1.csv",))
     said = choice_sentences(as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
     assert (
-        "no trial is significantly better without being worse in a log (trial 3's log-likelihood of a run is "
-        in said[0]
+        "no trial is significantly better without being worse in a log (trial 3's log-likelihood of a" in said[0]
     )
     assert said[0].endswith("of a run is 610 [-523, 1740] higher, but it is worse in run1.csv).")
     lost = lost._replace(over=Interval(8.9, -51.6, 69.4))
     said = choice_sentences(as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
-    assert said[0].endswith(
-        "no trial is significantly better (trial 3's log-likelihood of a run is 8.9 [-51.6, 69.4] lower, and it "
-        "is worse in run1.csv)."
-    )
+    ends = "trial 3's log-likelihood of a run is 8.9 [-51.6, 69.4] lower, and it is worse in run1.csv)."
+    assert said[0].endswith(f"no trial is significantly better ({ends}")
 
 
 def test_blocks_of_a_log_that_the_given_filter_cannot_follow_are_named():
@@ -345,17 +340,13 @@ def test_blocks_of_a_log_that_the_given_filter_cannot_follow_are_named():
 def test_where_own_numbers_give_way_to_a_noise_that_they_cannot_give_they_are_said():
     plan, own = Plan("ekf", (altitude_problem.problem(),)), untuned_choice("ekf", altitude_problem.problem())
     trial = _met("trial 3", 1.01, 0.99, 1.02)._replace(choice=own._replace(model={**own.model, "sigma_a": 0.25}))
-    noise, given = (
-        _met(FULL_Q, 1.0, 1.0, 1.0)._replace(choice=own._replace(model={"process_noise_cov": (1.0, 1.0, 1.0)})),
-        _met(GIVEN, 1.0, 1.0, 1.0)._replace(choice=own),
-    )
-    said = choice_sentences(
-        as_data(Validation((7, 8), True, (noise, trial), FULL_Q, "trial 3", FULL_Q, None)), plan
-    )
-    assert said[1].startswith(
-        "Your own parameters cannot express the Q and R of the noise estimation with a full Q; those of trial 3 "
-        "are sigma_a = 0.25, "
-    )
+    of_q = own._replace(model={"process_noise_cov": (1.0, 1.0, 1.0)})
+    noise = _met(FULL_Q, 1.0, 1.0, 1.0)._replace(choice=of_q)
+    given = _met(GIVEN, 1.0, 1.0, 1.0)._replace(choice=own)
+    meeting = Validation((7, 8), True, (noise, trial), FULL_Q, "trial 3", FULL_Q, None)
+    said = choice_sentences(as_data(meeting), plan)
+    begins = "Your own parameters cannot express the Q and R of the noise estimation with a full Q; those of "
+    assert said[1].startswith(f"{begins}trial 3 are sigma_a = 0.25, ")
     meeting = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", GIVEN, None)
     assert len(choice_sentences(as_data(meeting), plan)) == 1
 
@@ -378,11 +369,8 @@ def test_ranges_are_wide_hold_what_was_given_and_flag_what_ends_at_an_end():
     (said,) = range_warning(ended, plan)
     option = said.partition("--where '")[2].partition("'")[0]
     assert said.startswith("Q22 ended at the upper end of its range, ") and "Before you doubt the model" in said
-    assert (
-        at_ends(ended, plan._replace(where=(option,)))
-        == range_warning(ended, plan._replace(where=(option,)))
-        == []
-    )
+    wider = plan._replace(where=(option,))
+    assert at_ends(ended, wider) == range_warning(ended, wider) == []
     own = altitude_problem.problem()
     choice = untuned_choice("ekf", own)._replace(model={**altitude_problem.GIVEN, "sigma_a": 100.0})
     (said,) = at_ends(choice, Plan("ekf", (own,)))
@@ -391,11 +379,8 @@ def test_ranges_are_wide_hold_what_was_given_and_flag_what_ends_at_an_end():
 
 def test_every_second_trial_is_near_the_best_one_within_its_range_and_the_same_each_time():
     plan = Plan("ekf", (thruster(),))
-    space = {
-        "Q": FloatDistribution(1e-6, 1e6, log=True),
-        "N": IntDistribution(5, 200),
-        "k": FloatDistribution(0, 1),
-    }
+    space = {"Q": FloatDistribution(1e-6, 1e6, log=True), "N": IntDistribution(5, 200)}
+    space["k"] = FloatDistribution(0, 1)
     best = {"Q": 1.0, "N": 20, "k": 0.5}
     found = [near(best, space, plan, number) for number in range(300)]
     assert found[7] == near(best, space, plan, 7) and any(one["N"] != 20 for one in found)

@@ -107,10 +107,8 @@ def test_a_killed_process_leaves_no_trial_in_a_finished_study(tmp_path, monkeypa
 def test_two_commands_on_one_journal_end_it_together(tmp_path):
     options = f"tune --filter kf --problem nominal --no-pruning --trials 16 --study s --storage {tmp_path / 'j'}"
     command = [sys.executable, "-m", "tuning.cli", *options.split()]
-    processes = [
-        subprocess.Popen(command, cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-        for _ in range(2)
-    ]
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    processes = [subprocess.Popen(command, cwd=tmp_path, **output) for _ in range(2)]
     for process in processes:
         said, _ = process.communicate(timeout=300)
         assert process.returncode == 0, said
@@ -123,11 +121,9 @@ def test_two_commands_on_one_journal_end_it_together(tmp_path):
 def test_a_storage_is_text_or_a_path(storage, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rule = "storage must be a journal file, such as 'studies.journal', or the URL of a database, but got "
-    for call in (
-        lambda: tuning.tune("nominal", "ekf", trials=1, storage=storage, progress=False),
-        lambda: tuning.report("s", storage=storage),
-        lambda: open_storage(storage),
-    ):
+    calls = [lambda: tuning.tune("nominal", "ekf", trials=1, storage=storage, progress=False)]
+    calls += [lambda: tuning.report("s", storage=storage), lambda: open_storage(storage)]
+    for call in calls:
         refused(re.escape(rule), call)
     assert not list(tmp_path.iterdir())
 
@@ -327,12 +323,9 @@ def postgres():
 def test_ctrl_c_ends_all_workers_and_keeps_what_is_finished(tmp_path):
     journal, tuned = tmp_path / "j", tmp_path / "tuned.json"
     command = "from tuning.cli.main import run; run()"
-    arguments = (
-        f"tune --workers 2 --trials 100000 --no-pruning --study s --storage {journal} --out {tuned}".split()
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", command, *arguments], text=True, stderr=subprocess.PIPE, start_new_session=True
-    )
+    options = f"--workers 2 --trials 100000 --no-pruning --study s --storage {journal} --out {tuned}"
+    arguments = [sys.executable, "-c", command, "tune", *options.split()]
+    process = subprocess.Popen(arguments, text=True, stderr=subprocess.PIPE, start_new_session=True)
     study, busy = None, set()
     while len(busy) < 2:
         time.sleep(0.1)

@@ -38,10 +38,8 @@ def test_a_log_is_written_as_it_is_read(thruster, tmp_path):
     done = thruster("log", "run.csv", *options, "--out", "grid.csv")
     assert done.returncode == 0 and "wrote grid.csv" in done.stdout
     columns = {"V_s": "U_kV", "thrust": "load [mN]", "time": "when (UTC)"}
-    log, again = (
-        read_log(tmp_path / "run.csv", thruster_model(), columns),
-        read_log(tmp_path / "grid.csv", thruster_model()),
-    )
+    log = read_log(tmp_path / "run.csv", thruster_model(), columns)
+    again = read_log(tmp_path / "grid.csv", thruster_model())
     assert log.irregular and not again.irregular and log.dt == again.dt
     np.testing.assert_array_equal(again.inputs, log.inputs)
     np.testing.assert_array_equal(again.measurements, log.measurements)
@@ -102,9 +100,8 @@ def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_jso
 def test_rows_in_which_nothing_was_measured_tell_nothing(thruster, tmp_path):
     rows = [f"{0.01 * k:.2f},{k % 7},{k * 0.1 if k < 30 else ''}" for k in range(200)]
     (tmp_path / "run.csv").write_text("time_s,voltage_V,measured_thrust_N\n" + "\n".join(rows) + "\n")
-    assert "Nothing was measured in the rows that count, from 50 on" in " ".join(
-        thruster("estimate", "run.csv").stdout.split()
-    )
+    said = " ".join(thruster("estimate", "run.csv").stdout.split())
+    assert "Nothing was measured in the rows that count, from 50 on" in said
 
 
 def test_clock_offsets_of_a_preset_file_are_taken_off(thruster, as_json, tmp_path):
@@ -205,9 +202,8 @@ def test_a_study_of_logs_and_its_page_say_what_was_found(folder, thruster):
     page = (folder / "tuned.html").read_text()
     assert "<h2>The data</h2>" in page and "a gap: 40 rows" in page
     assert thruster("verify", "tuned.json", *MODEL).returncode == 0
-    other = thruster(
-        "tune", "--filter", "kf", *logs, "--trials", 3, "--out", "held.json", "--hold-gaps", "--study", "b"
-    )
+    options = "--trials", 3, "--out", "held.json", "--hold-gaps", "--study", "b"
+    other = thruster("tune", "--filter", "kf", *logs, *options)
     assert other.returncode in (0, 3)
     content = json.loads((folder / "held.json").read_text())["problems"]
     assert next(iter(content.values()))["content"]["options"]["hold_gaps"] is True
@@ -230,11 +226,8 @@ def test_recorders_of_two_rates_are_told_the_option(folder, thruster):
     slow = table()
     slow["time_s"] = slow["time_s"] * 1.01
     write_columns(folder / "slow.csv", slow, "exact")
-    for command in (
-        ("tune", "--log", "whole.csv", "--log", "slow.csv"),
-        ("identify", "whole.csv", "slow.csv", "--free", "gain"),
-    ):
-        done = thruster(*command, *MODEL)
+    for command in ("tune --log whole.csv --log slow.csv", "identify whole.csv slow.csv --free gain"):
+        done = thruster(*command.split(), *MODEL)
         assert done.returncode == 2 and "put them on one grid with --dt 0.1, in Python dt=0.1" in done.stderr
     both = log_problem([table(), slow], model="own:model", dt=0.1)
     assert both.dt == 0.1 and len(both.logs) == 2

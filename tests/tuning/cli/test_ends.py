@@ -220,9 +220,8 @@ def test_a_standard_output_that_is_full_is_said_and_json_is_written_first(monkey
             main()
     assert stop.value.code == 2
     said = capsys.readouterr().err
-    assert said == "thruster: files and standard output must take what is written, but the system says: " + (
-        "No space left on device\n"
-    )
+    begins = "thruster: files and standard output must take what is written, but the system says: "
+    assert said == f"{begins}No space left on device\n"
     assert (tmp_path / "kf.json").stat().st_size > 100
 
 

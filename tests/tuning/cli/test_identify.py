@@ -67,10 +67,8 @@ def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_
 
 @pytest.mark.slow
 def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tmp_path):
-    truth = OTHER.thruster._replace(
-        **{name: 1.5 * getattr(OTHER.thruster, name) for name in ("motor_damping", "voltage_gain", "load_gain")},
-        added_mass=0.6,
-    )
+    larger = {name: 1.5 * getattr(OTHER.thruster, name) for name in ("motor_damping", "voltage_gain", "load_gain")}
+    truth = OTHER.thruster._replace(**larger, added_mass=0.6)
     write_table(tmp_path / "table.csv", recorded_rows(OTHER))
     model = thruster_model(preset=truth, max_voltage=12.0, sensors=["speed"], measurement_noise_cov=[0.25])
     inputs = np.repeat([[[2.0], [10.0], [-8.0]]], 60, axis=1)
@@ -86,9 +84,8 @@ def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tm
     assert abs(values["motor_rate"] - 1.5) < 3 * errors["motor_rate"] < 0.3
     assert abs(values["added_mass"] - 0.6) < 3 * errors["added_mass"] < 0.3
     kept = read_preset("mine.toml").parameters
-    assert kept.voltage_gain / kept.motor_damping == pytest.approx(
-        truth.voltage_gain / truth.motor_damping, rel=1e-4
-    )
+    speeds = [one.voltage_gain / one.motor_damping for one in (kept, truth)]
+    assert speeds[0] == pytest.approx(speeds[1], rel=1e-4)
     assert kept.added_mass == values["added_mass"]
     inputs = np.full((60, 1), 2.0)
     write_log("flat.csv", Log("step", 0.01, inputs, drawn[:61], model.input_quantities, model.measurements))

@@ -6,11 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-MISTAKES = [
-    line.split(" | ")
-    for line in Path(__file__).with_name("mistakes.txt").read_text(encoding="utf-8").splitlines()
-    if line and not line.startswith("#")
-]
+LINES = Path(__file__).with_name("mistakes.txt").read_text(encoding="utf-8").splitlines()
+MISTAKES = [line.split(" | ") for line in LINES if line and not line.startswith("#")]
 
 
 @pytest.fixture

@@ -59,13 +59,11 @@ def test_a_log_is_shown_as_it_was_recorded(thruster, as_json, frames, monkeypatc
     assert as_json("play", "--log", "run.csv", "--out", "x.gif")["steps"] == 30
     table = np.genfromtxt("run.csv", delimiter=",", names=True)
     moment, overlay = shown[20]
-    assert moment == pytest.approx(
-        ChartEntry(0.2, *(table[name][20] for name in table.dtype.names[2:6]), None, 9.0), nan_ok=True
-    )
+    entries = (table[name][20] for name in table.dtype.names[2:6])
+    assert moment == pytest.approx(ChartEntry(0.2, *entries, None, 9.0), nan_ok=True)
     assert isinstance(overlay, Overlay) and abs(overlay.omega_m - moment.omega_m) < 5 * overlay.omega_m_std
-    assert overlay.thrust == pytest.approx(
-        thruster_model(preset="tunnel").output("T", np.array([[overlay.omega_m, overlay.U_a]]))[0], rel=1e-9
-    )
+    thrust = thruster_model(preset="tunnel").output("T", np.array([[overlay.omega_m, overlay.U_a]]))[0]
+    assert overlay.thrust == pytest.approx(thrust, rel=1e-9)
 
 
 def test_where_a_log_has_no_truth_the_estimate_moves_the_propeller(thruster, tmp_path):

@@ -110,9 +110,8 @@ def test_names_of_files_need_no_quotes(name, file):
 
 
 def test_a_tuning_that_made_it_worse_says_what_to_do_next():
-    comparison = SimpleNamespace(
-        tuned=SimpleNamespace(has_truth=True), ratios={"scaled default": Interval(1.2, 1.1, 1.3)}
-    )
+    ratios = {"scaled default": Interval(1.2, 1.1, 1.3)}
+    comparison = SimpleNamespace(tuned=SimpleNamespace(has_truth=True), ratios=ratios)
     tuning = SimpleNamespace(
         answer=None,
         method="tpe",
@@ -131,11 +130,8 @@ def test_a_tuning_that_made_it_worse_says_what_to_do_next():
     assert said.startswith("What to take: the scaled default (Q11 = ")
     assert "without --method likelihood runs a study" in said
     logs = SimpleNamespace(tuned=SimpleNamespace(has_truth=False))
-    logs.likelihood_gains = {
-        "given": Interval(-20, -30, -10),
-        RULE: Interval(-50, -60, -40),
-        ORACLE: Interval(-99, -99, -99),
-    }
+    logs.likelihood_gains = {"given": Interval(-20, -30, -10), RULE: Interval(-50, -60, -40)}
+    logs.likelihood_gains[ORACLE] = Interval(-99, -99, -99)
     (said,) = way_out(SimpleNamespace(**{**vars(by_method), "comparisons": [logs]}))
     assert said.startswith("What to take: the rule of thumb (Q11 = ")
     comparison.ratios["scaled default"] = Interval(0.9, 0.8, 0.95)

@@ -131,13 +131,11 @@ def test_two_targets_have_full_blocks_of_q_which_noise_estimation_finds():
     assert not blocks[0, :, 1].any() and np.linalg.eigvalsh(np.array(q))[0] > 0.0
     # Van Loan's integral of a velocity that wanders, by small steps.
     steps = np.linspace(0.0, 1.0, 2001)
-    moved = np.array(
-        [[np.trapezoid(a * b, steps) for b in (steps, 1.0 + 0.0 * steps)] for a in (steps, 1.0 + 0.0 * steps)]
-    )
+    driven = steps, 1.0 + 0.0 * steps
+    moved = np.array([[np.trapezoid(a * b, steps) for b in driven] for a in driven])
     np.testing.assert_allclose(blocks[0, :, 0], np.kron(moved, blocks[0, 2:, 0, 2:]), rtol=1e-6)
-    found, start, oracle = (
-        run_method(case, method, 0, FAST).last for method in ("noise-estimation", "start", "oracle")
-    )
+    methods = "noise-estimation", "start", "oracle"
+    found, start, oracle = (run_method(case, method, 0, FAST).last for method in methods)
     assert found.score < 1.01 * oracle.score < 0.9 * start.score
 
 

@@ -158,10 +158,7 @@ def test_published_kalman_filters_are_not_explained(comparisons, name):
 
 def test_the_text_corrects_cells_of_the_table():
     cells = STUDIES["kiki2020"].kf
-    assert cells["open-bladed", 0.8][:2] == (
-        1.9957,
-        2.6939,
-    )  # as the table is printed, and both abstracts quote it
+    assert cells["open-bladed", 0.8][:2] == (1.9957, 2.6939)  # as printed, and as both abstracts quote it
     assert cells["open-bladed", 0.8].meant == (2.6821, 2.6939)
     assert cells["open-bladed", 0.5].meant == (2.7061, 1.9870) and cells["tunnel", 0.5].meant == (0.8740, 0.9232)
     assert cells["tunnel", 0.6].meant == cells["tunnel", 0.6][:2]

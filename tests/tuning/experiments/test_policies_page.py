@@ -17,9 +17,8 @@ from tuning.problems.data import held_out_seeds
 
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = "\n".join((DOCS / name).read_text() for name in ("policies.md", "appendix/policies.md"))
-TABLES = {
-    noise: PAGE.partition(f"<!-- table policies_{noise} -->")[2].partition("<!-- end -->")[0] for noise in NOISES
-}
+BEGUN = {noise: PAGE.partition(f"<!-- table policies_{noise} -->")[2] for noise in NOISES}
+TABLES = {noise: text.partition("<!-- end -->")[0] for noise, text in BEGUN.items()}
 ANSWERS = " ".join(PAGE.partition("<!-- table answers -->")[2].partition("<!-- end -->")[0].split())
 
 
@@ -37,9 +36,8 @@ def returned(row):
 @pytest.mark.parametrize("noise", ["low", "high"])
 def test_the_tables_have_every_policy(noise):
     planned = runs_of(Comparison(noises=(noise,), seeds=1, variants=False))
-    assert list(rows_at(noise)) == [
-        name_of(run.kind, run.label) for run in planned if run.label not in NOT_ON_PAGE
-    ]
+    expected = [name_of(run.kind, run.label) for run in planned if run.label not in NOT_ON_PAGE]
+    assert list(rows_at(noise)) == expected
 
 
 def test_the_table_of_medium_noise_has_every_variant_too():

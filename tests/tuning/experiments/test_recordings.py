@@ -62,20 +62,8 @@ def folder(tmp_path_factory):
         shifted = [np.interp(times - OFFSET, times, one) for one in (load, tachometer)]
         own = np.full_like(times, np.nan) if place else 1.1 * runs.states[place, :, 0]
         zero = np.zeros_like(times)
-        columns = (
-            times,
-            load + 1.0,
-            zero,
-            commands[place],
-            tachometer,
-            zero,
-            shifted[0],
-            zero,
-            shifted[1],
-            own,
-            zero,
-            zero,
-        )
+        measured = times, load + 1.0, zero, commands[place], tachometer, zero
+        columns = *measured, shifted[0], zero, shifted[1], own, zero, zero
         text = [",".join(f"{value:.8g}" for value in row) for row in np.stack(columns, axis=1)]
         (folder / f"{name}.csv").write_text("\n".join([HEADER, *text]), encoding="utf-8")
     return folder
@@ -89,9 +77,8 @@ def runs(folder):
 def test_the_clock_offset_is_read_off_the_two_tachometers(runs):
     times = DT * np.arange(300)
     here = np.sin(times) + np.sin(3.1 * times)
-    assert clock_offset(times, here, np.sin(times - 0.033) + np.sin(3.1 * (times - 0.033))) == pytest.approx(
-        0.033, abs=2e-3
-    )
+    late = np.sin(times - 0.033) + np.sin(3.1 * (times - 0.033))
+    assert clock_offset(times, here, late) == pytest.approx(0.033, abs=2e-3)
     assert runs[1].offset == pytest.approx(OFFSET, abs=1e-2)
     assert runs[0].name == "CLLookupStep" and runs[0].own_is_desired and not runs[1].own_is_desired
     np.testing.assert_array_equal(runs[0].own, runs[0].desired)
@@ -133,10 +120,8 @@ def test_numbers_found_from_runs_estimate_thrust_where_the_load_cell_is_not(runs
 
 @pytest.mark.slow
 def test_more_noise_after_reversals_is_the_projects_filter_where_there_is_none(runs):
-    assert (
-        after_reversal(np.array([0.0, -1.0, -1.0, *[-1.0] * 12, 2.0, 2.0])).tolist()
-        == [True] * 11 + [False] * 4 + [True] * 2
-    )
+    after = after_reversal(np.array([0.0, -1.0, -1.0, *[-1.0] * 12, 2.0, 2.0]))
+    assert after.tolist() == [True] * 11 + [False] * 4 + [True] * 2
     short = [runs[1]._replace(**{name: getattr(runs[1], name)[:40] for name in SERIES})]
     (one,) = regimes(valued(to_identify(), TRUTH), short, [1.0])
     ours = thrusts(valued(to_identify(), TRUTH), short)[0]
@@ -159,10 +144,8 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
             return []
 
     asked = []
-    monkeypatch.setattr(
-        "tuning.experiments.recordings.identified",
-        lambda structure, *_: asked.append(structure) or Learnt(structure),
-    )
+    learnt = "tuning.experiments.recordings.identified"
+    monkeypatch.setattr(learnt, lambda structure, *_: asked.append(structure) or Learnt(structure))
     file, told = tmp_path / "results.json", []
     tasks = identify_all(runs, file, progress=lambda *one: told.append(one))
     assert len(asked) == len(tasks) == len(tasks_of(runs)) == 3 * len(STRUCTURES)
@@ -245,9 +228,8 @@ def broad_folder(tmp_path):
     rate, draw = 100.0, np.random.default_rng(2).normal
     time = np.arange(2000) / rate
     for name in ("02_made", "03_made"):
-        swing = np.where(time > 4.0, 1.0, 0.0)[:, None] * np.column_stack(
-            [np.sin(1.3 * time), np.cos(0.7 * time), 0.5 * np.sin(0.4 * time)]
-        )
+        waves = np.column_stack([np.sin(1.3 * time), np.cos(0.7 * time), 0.5 * np.sin(0.4 * time)])
+        swing = np.where(time > 4.0, 1.0, 0.0)[:, None] * waves
         q = [rotations.exponential((0.05, -0.1, 0.7))]
         for step in swing[1:]:
             q.append(rotations.product(q[-1], rotations.exponential(step / rate)))

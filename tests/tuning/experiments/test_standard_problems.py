@@ -218,9 +218,8 @@ class TestReproduce:
 
     def test_range_and_bearing_give_what_stone_soup_gives(self, monkeypatch):
         pytest.importorskip("stonesoup")
-        short = benchmark.ModelProblem(
-            range_bearing.model(), steps=30, first_scored_step=5, scale=[1.0] * 4, dt=range_bearing.DT
-        )
+        options = {"steps": 30, "first_scored_step": 5, "scale": [1.0] * 4, "dt": range_bearing.DT}
+        short = benchmark.ModelProblem(range_bearing.model(), **options)
         monkeypatch.setattr(range_bearing, "problem", short)
         monkeypatch.setattr(range_bearing, "tuned_sigma", lambda: 0.2)
         rows = range_bearing.BENCHMARK.reproduce(2)

@@ -101,9 +101,8 @@ def test_an_error_is_kept_and_the_others_go_on(monkeypatch, tmp_path):
 
     monkeypatch.setattr(users.tuning, "tune", failing)
     begun = []
-    (found,) = run_panel(
-        Panel(users.PANEL[:1], ("ekf",), 2), tmp_path, lambda text, done, count: begun.append((text, done, count))
-    )
+    panel = Panel(users.PANEL[:1], ("ekf",), 2)
+    (found,) = run_panel(panel, tmp_path, lambda *told: begun.append(told))
     assert found.error == "Matrix is not positive definite" and begun == [("altitude, ekf", 0, 1)]
     assert users.rows_of([found])[0][-1] == "failed" and "failed: Matrix" in users.sentences([found])[-1]
 
@@ -134,9 +133,7 @@ def test_the_quick_study_goes_on_where_it_was(as_json, thruster, tmp_path, monke
 
 
 def test_problems_that_do_not_fit_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(
-        ValueError, match="a problem of the panel must have true states, but tests.tuning.experiments"
-    ):
+    with pytest.raises(ValueError, match="a problem of the panel must have true states, but tests.tuning"):
         found_problems(["tests.tuning.experiments.test_users:blind"])
     monkeypatch.setattr(users, "PANEL", ("no_such_module:problem",))
     with pytest.raises(ValueError, match="must be found in tests/users of the working folder, a checkout"):

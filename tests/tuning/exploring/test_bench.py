@@ -49,9 +49,8 @@ def test_series_are_those_of_the_filter_on_the_training_seeds(bench):
     problem, values = bench.problem, {**OWN, "correlation_12": 0.5, "P0": 2.0}
     data, view = problem.data(problem.training_seeds(0, 3)), bench.view(values, 3)
     cov = np.array([[1.0, 0.5 * 0.02], [0.5 * 0.02, 4e-4]])
-    filter_ = make_filter(
-        "ekf", problem.model(process_noise_cov=cov, measurement_noise_cov=0.25, prior_cov_factor=2.0)
-    )
+    noise = {"process_noise_cov": cov, "measurement_noise_cov": 0.25}
+    filter_ = make_filter("ekf", problem.model(**noise, prior_cov_factor=2.0))
     belief = filter_.init()
     for k in range(60):
         belief, innovation = filter_.update(belief, data.measurements[1, k])
@@ -188,10 +187,8 @@ def test_python_lines_make_the_same_filter(bench):
     exec(compile(bench.python_lines(values), "lines", "exec"), names)
     assert names["problem"].digest == bench.problem_at(values).digest
     data = names["problem"].data(range(2))
-    ours, theirs = (
-        evaluate(one, data, bench.problem.scale).score.value
-        for one in (bench.choice(values).filter(bench.problem), names["filter_"])
-    )
+    both = bench.choice(values).filter(bench.problem), names["filter_"]
+    ours, theirs = (evaluate(one, data, bench.problem.scale).score.value for one in both)
     assert ours == theirs
     assert bench.command(values) == "thruster evaluate tuned.json"
 

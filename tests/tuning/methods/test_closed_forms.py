@@ -38,9 +38,8 @@ def level(q=1000.0, r=10000.0, start=0.0, wide=1e7):
 
 def nile():
     flow = np.array(NILE.split(), dtype=float)
-    runs = [
-        {"measurements": one} for one in (flow, flow, flow[::-1] + 1.0, flow[::-1] + 1.0)
-    ]  # the last are held out
+    held_out = flow[::-1] + 1.0
+    runs = [{"measurements": one} for one in (flow, flow, held_out, held_out)]
     return RunsProblem(runs, level(), held_out=[2, 3], name="the Nile")
 
 
@@ -157,9 +156,8 @@ MOTIVATING = {  # of the ALS toolbox: Odelson, Rajamani, Rawlings
 def motivating(q=0.2, r=0.4):
     """The example's model, at the Q and R of its first gain."""
     g = MOTIVATING["g"]
-    return affine_model(
-        A=MOTIVATING["a"], C=MOTIVATING["c"], Q=q * np.outer(g, g), R=r, x0=[10.0] * 3, P0=[1e-12] * 3
-    )
+    start = {"x0": [10.0] * 3, "P0": [1e-12] * 3}
+    return affine_model(A=MOTIVATING["a"], C=MOTIVATING["c"], Q=q * np.outer(g, g), R=r, **start)
 
 
 @pytest.mark.slow

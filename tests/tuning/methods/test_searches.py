@@ -162,9 +162,8 @@ def test_two_sample_times_find_the_q_and_r_of_a_level_where_one_leaves_a_curve_o
             task = task_of(problem, 32, options=box, seed=seed, budget=Budget(runs=5000))
             task.start = at(task, [5.0], [0.5])
             find_method(name).run(name, task)
-            found.append(
-                np.log([task.best.model["process_noise_cov"][0], task.best.model["measurement_noise_cov"] / 4])
-            )
+            model = task.best.model
+            found.append(np.log([model["process_noise_cov"][0], model["measurement_noise_cov"] / 4]))
     away = {name: np.median(abs(np.array(found)), axis=0) for name, found in ratios.items()}
     assert (away["c-nis-two-rates"] < 0.15).all() and away["c-nis"][0] > 0.4, away
     on_the_curve = at(task, [0.1], [8.784])  # where a naive filter's mean NIS is 1, too
@@ -204,12 +203,8 @@ def test_innovations_of_ensembles_tell_r_and_a_factor_on_q():
     problem = find_scenario("nominal")
     task = Task("enkf", problem, problem.data(range(16)), start=None)
     true = problem.true
-    task.start = task.start._replace(
-        model={
-            "process_noise_cov": tuple(4.0 * q for q in true["process_noise_cov"]),
-            "measurement_noise_cov": 0.5,
-        }
-    )
+    q = tuple(4.0 * q for q in true["process_noise_cov"])
+    task.start = task.start._replace(model={"process_noise_cov": q, "measurement_noise_cov": 0.5})
     find_method("desroziers").run("desroziers", task)
     found = task.best.model
     assert found["measurement_noise_cov"] == pytest.approx(true["measurement_noise_cov"], rel=0.1)

@@ -90,9 +90,8 @@ def test_what_is_saved_acts_as_what_learnt(tmp_path, monkeypatch):
     setup = setup_of()
     folder = learn(setup, tmp_path / "policy").folder
     for name, expected in kept.items():
-        found = next(
-            path for path in (folder / FINAL, folder / "best", folder / CHECKPOINTS / name) if path.name == name
-        )
+        paths = folder / FINAL, folder / "best", folder / CHECKPOINTS / name
+        found = next(path for path in paths if path.name == name)
         if found.exists():
             actions = load(found, make_environments(setup, [0])).predict(seen)[0]
             np.testing.assert_allclose(actions, expected, rtol=1e-5, atol=1e-7)  # tanh is torch's again
@@ -178,9 +177,8 @@ def test_a_setup_survives_its_text():
 @pytest.mark.parametrize("observe", ["stack", "ekf"])
 def test_native_envs_and_single_ones_give_the_same_learning_curve(observe, tmp_path):
     setup = setup_of(observe, steps=512)
-    native, single = (
-        learn(setup, tmp_path / str(native), native=native, evaluations=4).curve for native in (True, False)
-    )
+    curves = (learn(setup, tmp_path / str(own), native=own, evaluations=4).curve for own in (True, False))
+    native, single = curves
     assert len(native) == 4 and native[0][1] != native[-1][1]
     assert np.array(single) == pytest.approx(np.array(native), rel=1e-3)
 

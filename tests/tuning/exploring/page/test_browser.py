@@ -17,10 +17,8 @@ from tuning.exploring.page.session import Server, page_of
 from tuning.problems.find import find_problem
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium, Debian's package of that name"),
-]
+with_chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium, Debian's package of that name")
+pytestmark = [pytest.mark.slow, with_chromium]
 WIDE, PHONE = {"width": 1400, "height": 1000}, {"width": 390, "height": 844}
 PATIENCE = 120_000  # [ms]
 R = "#knob-R"
@@ -80,9 +78,8 @@ def seen(page):
 
 def map_drawn(page):
     page.wait_for_function("!document.body.classList.contains('busy')")
-    page.wait_for_function(
-        "Bokeh.documents[0].get_model_by_name('map').renderers[0].data_source.data.image.length > 0"
-    )
+    source = "Bokeh.documents[0].get_model_by_name('map').renderers[0].data_source"
+    page.wait_for_function(f"{source}.data.image.length > 0")
 
 
 def test_a_newcomer_halves_the_error_of_the_rule_of_thumb_by_dragging_r(page):

@@ -199,9 +199,8 @@ def test_what_is_seen_is_exported(tab, kind, begins):
 
 
 def test_numbers_that_json_has_not_become_nothing():
-    assert _plain({"a": [math.nan, math.inf, 1, True, None, "x", np.float64(0.5)]}) == {
-        "a": [None, None, 1, True, None, "x", 0.5]
-    }
+    numbers = _plain({"a": [math.nan, math.inf, 1, True, None, "x", np.float64(0.5)]})
+    assert numbers == {"a": [None, None, 1, True, None, "x", 0.5]}
 
 
 def test_names_of_a_problem_are_text_on_the_page():
