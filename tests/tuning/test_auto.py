@@ -22,32 +22,13 @@ from tuning.plants.thruster import find_scenario
 from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem, RunsProblem
 from tuning.reporting.sections import trials_of_type
+from tuning.search import among_types
 from tuning.search import trials as tuning_trials
-from tuning.search.among_types import (
-    ESTIMATED,
-    ESTIMATED_Q,
-    NEAR_BEST,
-    RESCALED,
-    SMALLER,
-    TRANSFERRED,
-    UNTUNED,
-    filter_types_tried,
-    next_in_race,
-    noise_by_gradient,
-    race_of,
-)
+from tuning.search.among_types import ESTIMATED, ESTIMATED_Q, NEAR_BEST, RESCALED, SMALLER, TRANSFERRED, UNTUNED
 from tuning.search.plan import Plan, joint_distributions
 from tuning.search.space import AUTO_FILTER_TYPES, FILTER_TYPE, choice_of, trial_parameters, untuned_choice
 from tuning.search.study import open_study, run_study
-from tuning.search.trials import (
-    BUDGET,
-    COST,
-    best_trial,
-    is_over_budget,
-    microseconds_a_step,
-    over_budget,
-    violation,
-)
+from tuning.search.trials import BUDGET, COST
 
 MISMATCH = find_scenario("mismatch")
 PLAN = Plan("auto", (MISMATCH,), budget=1.0)
@@ -106,7 +87,7 @@ def test_each_kind_is_tried_with_the_noise_that_true_states_show(priced):
     trials = studied(PLAN._replace(prune=False), 26).trials[:16]
     assert [trial.user_attrs.get(UNTUNED) for trial in trials[:2]] == ["ekf", None]
     assert choice_of("auto", trials[0].params, MISMATCH) == untuned_choice("ekf", MISMATCH)
-    in_race = set(race_of(PLAN, trials).running)
+    in_race = set(among_types.race_of(PLAN, trials).running)
     assert [trial.user_attrs[ESTIMATED_Q] for trial in trials if ESTIMATED_Q in trial.user_attrs] == list(FEW)
     assert in_race and any(ESTIMATED in trial.user_attrs for trial in trials)
     for key in (ESTIMATED_Q, ESTIMATED):
@@ -136,24 +117,24 @@ def test_on_recorded_runs_each_kind_begins_with_the_likeliest_noise(priced):
     problem = RunsProblem(runs, model, held_out=[3, 4], dt=MISMATCH.dt)
     plan = PLAN._replace(scenarios=(problem,), objectives=("likelihood",))
     trials = studied(plan, 9).trials
-    likeliest = noise_by_gradient(open_study("t", plan, optuna.storages.InMemoryStorage()), plan)
+    likeliest = among_types.noise_by_gradient(open_study("t", plan, optuna.storages.InMemoryStorage()), plan)
     for trial in (one for one in trials if ESTIMATED_Q in one.user_attrs):
         assert {key: trial.params[key] for key in likeliest} == pytest.approx(likeliest)
 
 
 def test_what_is_over_the_budget_ends_at_once_and_never_wins(priced):
     result = studied(PLAN, 40)
-    over = [trial for trial in result.trials if is_over_budget(trial)]
+    over = [trial for trial in result.trials if tuning_trials.is_over_budget(trial)]
     assert over and all(trial.state == TrialState.PRUNED and not trial.intermediate_values for trial in over)
     for trial in result.trials:
         if trial.state != TrialState.WAITING:
             cost = COSTS[trial.params[FILTER_TYPE]](trial.params.get(f"{trial.params[FILTER_TYPE]} N", 0))
             assert trial.user_attrs[COST] == cost and trial.constraints[BUDGET] == math.log(cost / 1.0)
-            assert is_over_budget(trial) == (cost > 1.0)
-    best = best_trial(result.trials)
-    assert best.user_attrs[COST] <= 1.0 and result.microseconds <= 1.0 and violation(best) <= 0
+            assert tuning_trials.is_over_budget(trial) == (cost > 1.0)
+    best = tuning_trials.best_trial(result.trials)
+    assert best.user_attrs[COST] <= 1.0 and result.microseconds <= 1.0 and tuning_trials.violation(best) <= 0
     assert result.choice.name == best.params[FILTER_TYPE]
-    kinds = {kind.name: kind for kind in filter_types_tried(result.trials)}
+    kinds = {kind.name: kind for kind in among_types.filter_types_tried(result.trials)}
     assert sum(kind.trials for kind in kinds.values()) == 40 and kinds["pf"].over_budget == kinds["pf"].trials
     assert kinds["pf"].value is None and kinds["pf"].microseconds > 1.0
     assert kinds[best.params[FILTER_TYPE]].value == best.values[0] and list(kinds)[0] == best.params[FILTER_TYPE]
@@ -165,7 +146,7 @@ def test_a_filter_over_the_budget_is_tried_with_fewer_members(priced):
     untuned = next(trial for trial in trials if trial.params[FILTER_TYPE] == "enkf")
     (smaller,) = [trial for trial in trials if SMALLER in trial.user_attrs]  # none for pf: 200 are too many
     assert smaller.user_attrs[SMALLER] == untuned.number and smaller.params["enkf N"] == 18
-    assert {**smaller.params, "enkf N": 30} == untuned.params and not is_over_budget(smaller)
+    assert {**smaller.params, "enkf N": 30} == untuned.params and not tuning_trials.is_over_budget(smaller)
 
 
 def test_other_kinds_inherit_the_noise_of_the_best_one(priced):
@@ -183,7 +164,7 @@ def test_a_budget_holds_one_kind_too_and_no_size_goes_beyond_it(priced):
     plan = Plan("enkf", (MISMATCH,), budget=1.0)
     result = studied(plan, 15)
     assert result.choice.numbers["ensemble_size"] <= 20 and max(row.size for row in result.sizes) <= 20
-    assert filter_types_tried(result.trials) == []
+    assert among_types.filter_types_tried(result.trials) == []
 
 
 def test_a_budget_that_nothing_keeps_is_one_clear_line(priced):
@@ -220,16 +201,18 @@ def finished(number, name, values, state=TrialState.COMPLETE):
 
 def test_the_best_third_of_the_types_rounded_up_goes_on_with_twice_as_many_trials(priced):
     def race(scores):
-        return race_of(PLAN, [finished(i, name, [score] * 8) for i, (name, score) in enumerate(scores)])
+        return among_types.race_of(
+            PLAN, [finished(i, name, [score] * 8) for i, (name, score) in enumerate(scores)]
+        )
 
     first = [("ekf", 1.2), ("kf", 1.5), ("enkf", 1.1)]
     assert race(first) == (0, ("enkf", "ekf", "kf", "pf"), 1)  # until each has had a trial
     first.append(("pf", 2.0))
     assert race(first) == (1, ("enkf", "ekf"), 3)
     trials = [finished(i, name, [score] * 8) for i, (name, score) in enumerate(first)]
-    assert next_in_race(PLAN, trials) == "enkf"
+    assert among_types.next_in_race(PLAN, trials) == "enkf"
     trials.append(finished(4, "enkf", [], TrialState.RUNNING))  # another worker's
-    assert next_in_race(PLAN, trials) == "ekf"
+    assert among_types.next_in_race(PLAN, trials) == "ekf"
     assert race([*first, *[("kf", 0.5)] * 9]) == (1, ("kf", "enkf"), 3)
     second = [*first, *[("ekf", 1.0), ("enkf", 1.3)] * 2]
     assert race(second) == (2, ("ekf",), 7)
@@ -239,9 +222,11 @@ def test_the_best_third_of_the_types_rounded_up_goes_on_with_twice_as_many_trial
         finished(2, "enkf", [1.3] * 8, TrialState.PRUNED),
         finished(3, "pf", [3.0] * 32),
     ]
-    assert race_of(PLAN, pruned).running == ("ekf", "enkf")  # 1.3 times the best on the same seeds
+    assert among_types.race_of(PLAN, pruned).running == ("ekf", "enkf")  # 1.3 times the best on the same seeds
     two = PLAN._replace(objectives=("score", "cost"))
-    assert set(race_of(two, [finished(i, name, [1.0]) for i, name in enumerate(FEW)]).running) == set(FEW)
+    assert set(among_types.race_of(two, [finished(i, name, [1.0]) for i, name in enumerate(FEW)]).running) == set(
+        FEW
+    )
 
 
 def test_trials_after_the_first_are_of_the_types_in_the_race(priced):
@@ -249,7 +234,7 @@ def test_trials_after_the_first_are_of_the_types_in_the_race(priced):
     for trial in result.trials[10:]:
         before = [one for one in result.trials if one.number < trial.number]
         enqueued = {UNTUNED, ESTIMATED_Q, ESTIMATED, TRANSFERRED, RESCALED, SMALLER} & trial.user_attrs.keys()
-        assert enqueued or trial.params[FILTER_TYPE] in race_of(PLAN, before).running
+        assert enqueued or trial.params[FILTER_TYPE] in among_types.race_of(PLAN, before).running
     late = [trial.params[FILTER_TYPE] for trial in result.trials[18:]]
     assert len(set(late)) <= 2 and any(NEAR_BEST in trial.user_attrs for trial in result.trials[10:])
 
@@ -299,10 +284,15 @@ def test_budget_and_kinds_belong_to_the_identity(monkeypatch):
 def test_cost_is_of_one_core_and_grows_with_the_ensemble():
     data = MISMATCH.data(range(32))
     untuned = untuned_choice("enkf", MISMATCH)
-    small, large = (microseconds_a_step(untuned.with_size(n).filter(MISMATCH), data) for n in (10, 200))
-    ekf = microseconds_a_step(untuned_choice("ekf", MISMATCH).filter(MISMATCH), data)
+    small, large = (
+        tuning_trials.microseconds_a_step(untuned.with_size(n).filter(MISMATCH), data) for n in (10, 200)
+    )
+    ekf = tuning_trials.microseconds_a_step(untuned_choice("ekf", MISMATCH).filter(MISMATCH), data)
     assert 0 < ekf < small and 3 < large / small < 40
-    assert over_budget(2.0, 1.0) == pytest.approx(np.log(2)) and over_budget(1.0, 1.0) == 0.0
+    assert (
+        tuning_trials.over_budget(2.0, 1.0) == pytest.approx(np.log(2))
+        and tuning_trials.over_budget(1.0, 1.0) == 0.0
+    )
 
 
 @pytest.mark.parametrize("method", ["tpe", "gradient"])

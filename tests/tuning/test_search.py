@@ -19,6 +19,7 @@ from tuning.experiments import lorenz63
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
 from tuning.plants.thruster import find_scenario
 from tuning.search import trials
+from tuning.search import trials as tuning_trials
 from tuning.search.among_types import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED
 from tuning.search.parameters import size_ladder
 from tuning.search.plan import LARGEST, NIS_BAND, Plan, nis_violation
@@ -31,18 +32,7 @@ from tuning.search.space import (
     untuned_choice,
 )
 from tuning.search.study import open_study, run_study
-from tuning.search.trials import (
-    BLOCK,
-    NEEDS,
-    SAMPLERS,
-    best_trial,
-    box,
-    enqueue_new,
-    make_sampler,
-    measure,
-    read_state,
-    violation,
-)
+from tuning.search.trials import BLOCK, NEEDS, SAMPLERS
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))
 PLAN = Plan("ekf", (MISMATCH,))
@@ -56,11 +46,11 @@ def studied(plan, trials):
 
 def test_the_winner_of_a_study_has_the_best_log_score_at_hardly_any_cost_in_error():
     result = studied(PLAN, 40)
-    best, met = best_trial(result.trials), result.validation.met
+    best, met = tuning_trials.best_trial(result.trials), result.validation.met
     chosen = result.validation.named(result.validation.chosen)
-    (evaluation,) = measure(PLAN.choice_of(best.params), PLAN, PLAN.training_data())
-    assert violation(best) <= 0 and NIS_BAND[0] <= evaluation.nis.value <= NIS_BAND[1]
-    assert nis_violation(evaluation) == pytest.approx(violation(best))
+    (evaluation,) = tuning_trials.measure(PLAN.choice_of(best.params), PLAN, PLAN.training_data())
+    assert tuning_trials.violation(best) <= 0 and NIS_BAND[0] <= evaluation.nis.value <= NIS_BAND[1]
+    assert nis_violation(evaluation) == pytest.approx(tuning_trials.violation(best))
     least = min(one.value for one in met)
     assert chosen.name.startswith("trial") and chosen.value <= 1.05 * least
     assert chosen.proper == max(one.proper for one in met if one.value <= 1.05 * least)
@@ -72,10 +62,12 @@ def test_the_winner_of_a_study_has_the_best_log_score_at_hardly_any_cost_in_erro
 def test_a_common_factor_on_q_and_r_is_what_makes_a_trial_consistent():
     result = studied(PLAN, 40)
     untuned, rescaled = result.trials[:2]
-    assert violation(untuned) > 0 and rescaled.user_attrs[RESCALED] == 1
+    assert tuning_trials.violation(untuned) > 0 and rescaled.user_attrs[RESCALED] == 1
     factors = {name: rescaled.params[name] / untuned.params[name] for name in ("Q11", "Q22", "R")}
     assert factors["Q11"] == pytest.approx(factors["R"]) == pytest.approx(factors["Q22"])
-    assert rescaled.values[0] == pytest.approx(untuned.values[0], rel=0.02) and violation(rescaled) <= 0
+    assert (
+        rescaled.values[0] == pytest.approx(untuned.values[0], rel=0.02) and tuning_trials.violation(rescaled) <= 0
+    )
 
 
 def test_one_trial_has_the_most_likely_noise_and_finds_what_sampling_finds_late():
@@ -102,7 +94,7 @@ def test_with_r_held_the_most_likely_q_is_tried_and_without_a_covariance_nothing
 def test_without_consistency_any_nis_will_do():
     result = studied(PLAN._replace(consistent=False), 8)
     assert result.free_value is None and not any(RESCALED in trial.user_attrs for trial in result.trials)
-    assert {violation(trial) for trial in result.trials} == {0.0}
+    assert {tuning_trials.violation(trial) for trial in result.trials} == {0.0}
 
 
 def test_a_trial_ends_early_only_if_it_is_worse_on_the_same_seeds():
@@ -112,7 +104,7 @@ def test_a_trial_ends_early_only_if_it_is_worse_on_the_same_seeds():
     assert len(pruned) == result.pruned > 0
     for trial in pruned[:5]:
         assert len(trial.intermediate_values) % BLOCK == 0 and len(trial.intermediate_values) < 32
-        (whole,) = measure(choice_of("ekf", trial.params, MISMATCH), PLAN, data)
+        (whole,) = tuning_trials.measure(choice_of("ekf", trial.params, MISMATCH), PLAN, data)
         assert whole.score.value > result.best_value
     unpruned = studied(PLAN._replace(prune=False), 12)
     assert unpruned.pruned == 0 and not any(trial.intermediate_values for trial in unpruned.trials)
@@ -165,7 +157,7 @@ def test_every_sampler_proposes_within_the_ranges(name):
 
 
 def test_a_grid_ends_where_it_is_exhausted():
-    sampler = make_sampler("grid", 0, 0, {"N": distributions("enkf", NOMINAL)["N"]})
+    sampler = tuning_trials.make_sampler("grid", 0, 0, {"N": distributions("enkf", NOMINAL)["N"]})
     assert isinstance(sampler, optuna.samplers.GridSampler)
 
 
@@ -206,7 +198,7 @@ def test_a_trial_whose_nis_is_not_finite_is_inconsistent_and_has_no_twin(monkeyp
 
     monkeypatch.setattr(trials, "compute_metrics", lost)
     result = studied.__wrapped__(PLAN, 3)
-    assert len(result.trials) == 3 and all(violation(trial) == LARGEST for trial in result.trials)
+    assert len(result.trials) == 3 and all(tuning_trials.violation(trial) == LARGEST for trial in result.trials)
     assert not any(RESCALED in trial.user_attrs for trial in result.trials)
 
 
@@ -216,7 +208,7 @@ def test_a_trial_that_there_is_already_is_not_enqueued_again():
     params = {"R": 0.25, "N": 30}
     study.add_trial(optuna.trial.create_trial(params=params, distributions=distributions, value=1.0))
     for r, size, count in ((0.25, 30, 1), (0.25 + 1e-7, 30, 1), (0.2501, 30, 2), (0.25, 31, 3), (0.2501, 30, 3)):
-        enqueue_new(study, {"R": r, "N": size}, {})
+        tuning_trials.enqueue_new(study, {"R": r, "N": size}, {})
         assert len(study.trials) == count
 
 
@@ -231,7 +223,9 @@ def test_r_may_be_held_at_the_sensor_s_sheet():
 def test_trials_have_a_nees_where_an_objective_is_made_of_it_alone():
     for objectives, known in ((("score",), False), (("score", "consistency"), True)):
         plan = PLAN._replace(objectives=objectives)
-        (found,) = measure(untuned_choice("ekf", MISMATCH), plan, [PLAN.training_data()[0].slice(0, 2)])
+        (found,) = tuning_trials.measure(
+            untuned_choice("ekf", MISMATCH), plan, [PLAN.training_data()[0].slice(0, 2)]
+        )
         assert np.isfinite(found.nees.value) == np.isfinite(found.median_nees) == known
         assert np.isfinite(found.score.value) and np.isfinite(found.nis.value)
 
@@ -239,14 +233,17 @@ def test_trials_have_a_nees_where_an_objective_is_made_of_it_alone():
 def test_the_box_of_a_search_grows_with_the_best_trial_and_stays_in_the_range():
     space = {name: FloatDistribution(1e-10, 1e4, log=True) for name in ("Q11", "R")} | {"N": IntDistribution(5, 9)}
     first = {"Q11": (1e-5, 1e2), "R": (1e-2, 1e3)}
-    ends = {name: (one.low, one.high) for name, one in box(space, first, {"Q11": 1e-6, "R": 2e3, "N": 5}).items()}
+    ends = {
+        name: (one.low, one.high)
+        for name, one in tuning_trials.box(space, first, {"Q11": 1e-6, "R": 2e3, "N": 5}).items()
+    }
     assert ends == {"Q11": (1e-6 / 10.0, 1e2), "R": (1e-2, 1e4), "N": (5, 9)}
-    assert box(space, first, {})["Q11"] == FloatDistribution(1e-5, 1e2, log=True)
+    assert tuning_trials.box(space, first, {})["Q11"] == FloatDistribution(1e-5, 1e2, log=True)
 
 
 @pytest.mark.parametrize(("sampler", "trials"), [("tpe", 25), ("gp", 14), ("random", 25)])
 def test_a_search_reaches_what_lies_outside_the_box_that_it_begins_in(sampler, trials):
-    study = optuna.create_study(sampler=make_sampler(sampler, 0, 0, {}, first={"Q": (1e-5, 1e2)}))
+    study = optuna.create_study(sampler=tuning_trials.make_sampler(sampler, 0, 0, {}, first={"Q": (1e-5, 1e2)}))
     study.optimize(lambda trial: np.log10(trial.suggest_float("Q", 1e-10, 1e4, log=True)), n_trials=trials)
     values = np.array([trial.params["Q"] for trial in study.trials])
     best = np.minimum.accumulate([1e-4, *values])[:-1]
@@ -270,7 +267,7 @@ def test_a_trial_s_state_is_read_as_data_and_no_code_runs(tmp_path, monkeypatch)
     marker = tmp_path / "marker"
     state = {"cma:optimizer:0": pickle.dumps(Attack(marker)).hex()}
     trial = optuna.trial.create_trial(value=1.0, system_attrs=state)
-    sampler = make_sampler("cma-es", 0, 0, {})
+    sampler = tuning_trials.make_sampler("cma-es", 0, 0, {})
     refused("must be that of an optimizer, but a trial's names .*open$", sampler._restore_optimizer, [trial])
     assert not marker.exists()
     assert sampler._restore_optimizer([optuna.trial.create_trial(value=1.0)]) is None
@@ -278,11 +275,11 @@ def test_a_trial_s_state_is_read_as_data_and_no_code_runs(tmp_path, monkeypatch)
 
 def test_arrays_are_read_and_what_is_damaged_is_one_clear_line():
     arrays = {"mean": np.arange(3.0), "n": np.float64(2.5), "transposed": np.eye(2).T}
-    found = read_state(pickle.dumps(arrays).hex())
+    found = tuning_trials.read_state(pickle.dumps(arrays).hex())
     assert found["n"] == 2.5 and (found["mean"] == arrays["mean"]).all()
     for text in ("", "80", pickle.dumps(arrays).hex()[:-20], "no digits"):
         with pytest.raises(ValueError) as error:
-            read_state(text)
+            tuning_trials.read_state(text)
         assert "\n" not in str(error.value)
 
 
@@ -294,7 +291,7 @@ def test_a_study_goes_on_as_with_optuna_s_own():
         study.optimize(lambda t: t.suggest_float("x", -5, 5) ** 2 + t.suggest_float("y", -5, 5) ** 2, n_trials=30)
         return [trial.value for trial in study.trials]
 
-    ours = make_sampler("cma-es", 0, 0, {})
+    ours = tuning_trials.make_sampler("cma-es", 0, 0, {})
     seed = int(np.random.SeedSequence([0, 0, 0]).generate_state(1)[0])
     assert values(ours) == values(optuna.samplers.CmaEsSampler(seed=seed))
 

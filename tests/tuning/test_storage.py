@@ -21,15 +21,7 @@ from tuning.problems.find import find_problem
 from tuning.search import storage as database
 from tuning.search.plan import Plan
 from tuning.search.space import distributions
-from tuning.search.storage import (
-    PATIENCE_SECONDS,
-    PROCESS,
-    RETRY_OF,
-    open_storage,
-    public_url,
-    retry_once,
-    without_secrets,
-)
+from tuning.search.storage import PATIENCE_SECONDS, PROCESS, RETRY_OF
 from tuning.search.study import open_study, run_study, run_trials
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
@@ -39,7 +31,7 @@ PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 def test_a_trial_without_a_heartbeat_is_lost_and_tried_once_more(tmp_path, monkeypatch):
     monkeypatch.setattr(database, "HEARTBEAT_SECONDS", 1)
     monkeypatch.setattr(database, "GRACE_SECONDS", 1)
-    storage = open_storage(f"sqlite:///{tmp_path}/s.db")
+    storage = database.open_storage(f"sqlite:///{tmp_path}/s.db")
     study = open_study("s", PLAN, storage)
     trial = study.ask(distributions("ekf", PLAN.scenarios[0]))
     trial.set_user_attr(PROCESS, "elsewhere:1")
@@ -60,14 +52,14 @@ def test_tables_that_another_host_is_making_are_found_in_the_end(tmp_path, monke
         return connected(url, on_lost)
 
     monkeypatch.setattr(database, "_connected", half_made)
-    assert not open_study("s", PLAN, open_storage(url)).trials[0].params
+    assert not open_study("s", PLAN, database.open_storage(url)).trials[0].params
     assert len(tries) == 3
 
 
 @pytest.fixture
 def flaky(tmp_path, monkeypatch):
     """Makes a database do its work and fail to say so, as often as told."""
-    storage = open_storage(f"sqlite:///{tmp_path}/s.db")
+    storage = database.open_storage(f"sqlite:///{tmp_path}/s.db")
 
     def fail(name, times):
         method, failures = getattr(storage._backend, name), iter(range(times))
@@ -114,10 +106,10 @@ def test_a_trial_whose_making_was_not_answered_is_made_once(flaky):
 
 
 def test_an_enqueued_trial_that_was_lost_before_its_first_parameter_is_enqueued_again(tmp_path):
-    study = optuna.create_study(storage=open_storage(str(tmp_path / "j")))
+    study = optuna.create_study(storage=database.open_storage(str(tmp_path / "j")))
     study.enqueue_trial({"a": 0.5})
     study.ask()  # by a process that ends now: it never signs
-    assert retry_once(study, study.trials[0])
+    assert database.retry_once(study, study.trials[0])
     again = study.ask()
     assert again.user_attrs == {RETRY_OF: 0} and again.suggest_float("a", 0.0, 1.0) == 0.5
 
@@ -136,18 +128,18 @@ def test_patience_has_an_end(flaky, monkeypatch):
 
 def test_a_driver_that_is_missing_is_named_with_the_extra_that_brings_it():
     with pytest.raises(ValueError, match=r"but got postgresql\+pg8000://host/s: .*: pip install '\.\[db\]' in"):
-        open_storage("postgresql+pg8000://host/s")
+        database.open_storage("postgresql+pg8000://host/s")
 
 
 def test_several_workers_on_sqlite_are_warned(monkeypatch):
-    monkeypatch.setattr("tuning.api.tune.checked", lambda plan: open_storage(""))  # ends here
+    monkeypatch.setattr("tuning.api.tune.checked", lambda plan: database.open_storage(""))  # ends here
     plan, console = Plan("ekf", (find_problem("nominal"),)), Console(quiet=True)
     with pytest.warns(UserWarning, match="so 2 workers wait"), pytest.raises(ValueError, match="stor"):
         run_tuning(plan, 3, console, "sqlite:///s.db", workers=2)
 
 
 def test_a_proxy_must_have_a_host():
-    refused("got grpc://:13000: it names no host", open_storage, "grpc://:13000")
+    refused("got grpc://:13000: it names no host", database.open_storage, "grpc://:13000")
 
 
 @pytest.mark.slow
@@ -158,14 +150,14 @@ def test_a_proxy_stands_between_a_study_and_its_database(tmp_path, monkeypatch):
         port = free.getsockname()[1]
     monkeypatch.setattr(database, "PROXY_SECONDS", 0.1)
     with pytest.raises(ValueError, match="storage must be a database that can be reached, but got grpc:"):
-        open_storage(f"grpc://localhost:{port}")
+        database.open_storage(f"grpc://localhost:{port}")
     program = "import sys, optuna; optuna.storages.run_grpc_proxy_server("
     program += "optuna.storages.RDBStorage(sys.argv[1]), port=int(sys.argv[2]))"
     url = f"sqlite:///{tmp_path}/s.db"
     server = subprocess.Popen([sys.executable, "-c", program, url, str(port)], stderr=subprocess.DEVNULL)
     try:
         monkeypatch.setattr(database, "PROXY_SECONDS", 30)
-        result = run_study(open_study("s", PLAN, open_storage(f"grpc://localhost:{port}")), PLAN, 3)
+        result = run_study(open_study("s", PLAN, database.open_storage(f"grpc://localhost:{port}")), PLAN, 3)
         assert [trial.state for trial in result.trials] == [TrialState.COMPLETE] * 3
     finally:
         server.terminate()
@@ -199,7 +191,7 @@ def clock(monkeypatch):
 
 @pytest.fixture
 def storage(tmp_path):
-    return open_storage(f"sqlite:///{tmp_path}/s.db")
+    return database.open_storage(f"sqlite:///{tmp_path}/s.db")
 
 
 @pytest.fixture
@@ -304,9 +296,9 @@ SHOWN = {
 
 @pytest.mark.parametrize(("storage", "shown"), SHOWN.items(), ids=list(SHOWN))
 def test_scheme_host_and_database_are_shown_and_nothing_else(storage, shown):
-    assert public_url(storage) == shown
+    assert database.public_url(storage) == shown
     said = f"could not connect to {storage}: password secret, or cret@host, or se"
-    said = without_secrets(said, storage)
+    said = database.without_secrets(said, storage)
     if shown != storage:
         assert storage not in said and shown in said
         assert not re.search(r"\bsecret\b|se.cret", said) or "secret" not in storage
@@ -332,7 +324,7 @@ def test_scheme_host_and_database_are_shown_and_nothing_else(storage, shown):
     ],
 )
 def test_a_message_loses_every_part_of_a_password(storage, said, clean):
-    assert without_secrets(said, storage).endswith(clean)
+    assert database.without_secrets(said, storage).endswith(clean)
 
 
 SECRET = [
@@ -355,14 +347,14 @@ def test_a_storage_that_cannot_be_reached_tells_no_password(url, tmp_path, monke
     monkeypatch.setattr(database, "PROXY_SECONDS", 0.01)
     scheme = url.partition(":")[0].replace("+", ".")
     with pytest.raises(ValueError, match=f"storage must be .* but got {scheme}:") as e:
-        open_storage(url)
+        database.open_storage(url)
     assert "secret" not in str(e.value) and "tuner:" not in str(e.value) and "\n" not in str(e.value)
     assert not list(tmp_path.iterdir())
 
 
 def test_an_outage_tells_no_password(tmp_path, monkeypatch):
     monkeypatch.setattr(database, "PATIENCE_SECONDS", 0.6)
-    storage, url = open_storage(f"sqlite:///{tmp_path}/s.db"), "postgresql://tuner:secret@host/s"
+    storage, url = database.open_storage(f"sqlite:///{tmp_path}/s.db"), "postgresql://tuner:secret@host/s"
     study = optuna.create_study(storage=storage)
 
     def away(*arguments):

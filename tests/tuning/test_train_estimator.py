@@ -13,21 +13,9 @@ from filters.learned.estimator import Track, unit_scales
 from filters.learned.filters import LEARNED, read
 from tests.filters.checks import refused
 from tests.models import plane_model
+from tuning import learning
 from tuning.evaluation.evaluate import values_of
-from tuning.learning import (
-    HELD_OUT,
-    LONGER,
-    NOISIER,
-    Loss,
-    Settings,
-    new_estimator,
-    scales_of,
-    standings,
-    starting_filter,
-    train,
-    twice_as_long,
-    with_larger_noise,
-)
+from tuning.learning import HELD_OUT, LONGER, NOISIER, Loss, Settings
 from tuning.plants.thruster import find_scenario
 from tuning.problems.check import data_of
 from tuning.problems.model_problem import ModelProblem
@@ -48,7 +36,7 @@ SETTINGS = Settings(steps=6, batch=8, window=10, rate=5e-3, checks=3)
 def runs():
     """The starting filter, training and validation runs of the plane."""
     data = data_of(PROBLEM, PROBLEM.training_seeds(0, 16))
-    return starting_filter(PROBLEM, data, 0)[1], data, data_of(PROBLEM, PROBLEM.validation_seeds(0, 10))
+    return learning.starting_filter(PROBLEM, data, 0)[1], data, data_of(PROBLEM, PROBLEM.validation_seeds(0, 10))
 
 
 def test_the_loss_is_the_weighted_square_or_the_log_density_of_the_states_that_count():
@@ -70,7 +58,7 @@ def test_the_loss_is_the_weighted_square_or_the_log_density_of_the_states_that_c
 
 def test_scales_are_sizes_of_the_filter_s_quantities_and_the_gain_is_its_mean_one(runs):
     filter_, data, _ = runs
-    found = scales_of(filter_, data)
+    found = learning.scales_of(filter_, data)
     estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
     np.testing.assert_allclose(found.error, np.sqrt(((estimates.means - data.states) ** 2).mean(axis=(0, 1))))
     np.testing.assert_allclose(found.innovation, np.sqrt((estimates.innovations**2).mean(axis=(0, 1))))
@@ -81,10 +69,10 @@ def test_scales_are_sizes_of_the_filter_s_quantities_and_the_gain_is_its_mean_on
 
 def test_longer_runs_begin_as_the_others_and_larger_noise_has_four_times_r():
     seeds = PROBLEM.held_out_seeds(0, 400)
-    data, longer = data_of(PROBLEM, seeds), twice_as_long(PROBLEM, seeds)
+    data, longer = data_of(PROBLEM, seeds), learning.twice_as_long(PROBLEM, seeds)
     assert longer.steps == 80 and PROBLEM.steps == 40
     np.testing.assert_array_equal(longer.filter_keys, data.filter_keys)
-    added = with_larger_noise(PROBLEM, data).measurements - data.measurements
+    added = learning.with_larger_noise(PROBLEM, data).measurements - data.measurements
     cov, size = np.cov(added.reshape(-1, 2).T), added.size / 2
     room = 4.5 * np.sqrt(2.0 / size) * 3.0 * np.abs(MODEL.measurement_noise_cov).max()
     np.testing.assert_allclose(cov, 3.0 * MODEL.measurement_noise_cov, atol=room)
@@ -94,29 +82,33 @@ def test_longer_runs_begin_as_the_others_and_larger_noise_has_four_times_r():
     np.testing.assert_array_equal(longer.states[:, :41], data.states)
     nominal = find_scenario("nominal")
     some = nominal.held_out_seeds(0, 2)
-    found, known = twice_as_long(nominal, some), nominal.data(some)
+    found, known = learning.twice_as_long(nominal, some), nominal.data(some)
     assert found.steps == 2 * known.steps
     fixed = ModelProblem(MODEL, inputs=np.zeros((20, 1)), first_scored_step=5, scale=[1.0, 1.0])
-    assert twice_as_long(fixed, range(3)) is None
+    assert learning.twice_as_long(fixed, range(3)) is None
 
 
 def test_a_channel_without_measurements_is_refused_and_one_with_few_has_a_scale(runs):
     filter_, data, _ = runs
     measurements = data.measurements.copy()
     measurements[:, 1::2] = np.nan
-    found = scales_of(filter_, data._replace(measurements=measurements))
+    found = learning.scales_of(filter_, data._replace(measurements=measurements))
     assert all(np.isfinite(one).all() for one in found)
     np.testing.assert_allclose(found.measured, np.nanstd(measurements, axis=(0, 1)))
     with pytest.raises(ValueError, match="must have measurements of each channel, but .* has none"):
-        new_estimator("gru", filter_, data._replace(measurements=np.full_like(measurements, np.nan)), seed=1)
+        learning.new_estimator(
+            "gru", filter_, data._replace(measurements=np.full_like(measurements, np.nan)), seed=1
+        )
 
 
 def test_training_lowers_the_score_and_the_same_seed_gives_the_same_weights(runs):
     filter_, data, validation = runs
     threads, drawn, found = torch.get_num_threads(), torch.random.get_rng_state(), []
     for _ in range(2):
-        estimator = new_estimator("gru", filter_, data, seed=1, width=8)
-        checks = train(estimator, data, validation, PROBLEM.scale, SETTINGS._replace(steps=60, rate=0.02), seed=3)
+        estimator = learning.new_estimator("gru", filter_, data, seed=1, width=8)
+        checks = learning.train(
+            estimator, data, validation, PROBLEM.scale, SETTINGS._replace(steps=60, rate=0.02), seed=3
+        )
         found.append((estimator.state_dict(), checks))
     assert torch.get_num_threads() == threads and torch.equal(torch.random.get_rng_state(), drawn)
     (weights, checks), (again, _) = found
@@ -130,20 +122,20 @@ def test_training_lowers_the_score_and_the_same_seed_gives_the_same_weights(runs
 
 def test_a_training_that_gets_worse_returns_the_first_weights_and_one_that_is_stopped_the_best(runs):
     filter_, data, validation = runs
-    estimator = new_estimator("kalmannet", filter_, data, seed=0)
+    estimator = learning.new_estimator("kalmannet", filter_, data, seed=0)
     before = {name: one.clone() for name, one in estimator.state_dict().items()}
-    checks = train(estimator, data, validation, PROBLEM.scale, SETTINGS._replace(rate=10.0))
+    checks = learning.train(estimator, data, validation, PROBLEM.scale, SETTINGS._replace(rate=10.0))
     assert all(one.score > checks[0].score for one in checks[1:])
     assert all(torch.equal(before[name], one) for name, one in estimator.state_dict().items())
     steps = []
     ends = {"on_step": steps.append, "stopped": lambda: len(steps) == 3}
-    checks = train(estimator, data, validation, PROBLEM.scale, SETTINGS, **ends)
+    checks = learning.train(estimator, data, validation, PROBLEM.scale, SETTINGS, **ends)
     assert steps == [1, 2, 3] and [one.step for one in checks] == [0, 2]
 
 
 def test_standings_pair_all_filters_on_the_same_runs(runs):
     filter_, data, _ = runs
-    rows = standings({"a": filter_, "b": filter_}, PROBLEM, PROBLEM.held_out_seeds(0, 5))
+    rows = learning.standings({"a": filter_, "b": filter_}, PROBLEM, PROBLEM.held_out_seeds(0, 5))
     for name in (HELD_OUT, LONGER, NOISIER):
         assert rows[1].ratio(rows[0], name).value == 1.0
     assert rows[0].evaluations[NOISIER].score.value > rows[0].evaluations[HELD_OUT].score.value

@@ -12,50 +12,11 @@ from tests.slow import slow_but
 from thruster_env.model.simulate import simulate
 from thruster_env.thruster.linear import PUBLISHED
 from tuning.cli import output
+from tuning.experiments import thruster_papers, vehicle_runs
 from tuning.experiments import vehicle_papers as estimators
-from tuning.experiments.thruster_papers import (
-    NOISE_LEVELS,
-    STEPS,
-    STUDIES,
-    SYSTEMS,
-    H,
-    compare,
-    compare_all,
-    discrete_model,
-    findings,
-    optimum,
-    study_statements,
-    unupdated_ensemble_means,
-)
-from tuning.experiments.vehicle_papers import (
-    DT,
-    NOISE,
-    PRINTED_PATHS,
-    TABLE_III,
-    MeanPropagatingEnKF,
-    PrintedRow,
-    full_pose,
-    kalman,
-    level_model,
-    measured,
-    papers_model,
-    planar_pose,
-    pose_errors,
-    reckoned_attitude,
-)
-from tuning.experiments.vehicle_runs import (
-    PAPERS,
-    PATHS,
-    Task,
-    along_path,
-    keys_of,
-    measured_velocities,
-    noise_free,
-    path_inputs,
-    run_tasks,
-    scores_of,
-    true_runs,
-)
+from tuning.experiments.thruster_papers import NOISE_LEVELS, STEPS, STUDIES, SYSTEMS, H
+from tuning.experiments.vehicle_papers import DT, NOISE, PRINTED_PATHS, TABLE_III, MeanPropagatingEnKF, PrintedRow
+from tuning.experiments.vehicle_runs import PAPERS, PATHS, Task
 from tuning.experiments.vehicle_tables import why_different
 
 # The Riccati values and the errors of the un-updated ensemble, computed independently of this package.
@@ -74,18 +35,18 @@ UNUPDATED = {  # (case, q): mean over 400 runs of the RMSE of a single run from 
 
 @pytest.fixture(scope="module")
 def comparisons():
-    return compare_all(runs=200, members=200, seed=0)
+    return thruster_papers.compare_all(runs=200, members=200, seed=0)
 
 
 @pytest.mark.parametrize("case", SYSTEMS)
 def test_optimum_is_the_riccati_solution(case):
-    a = discrete_model(case, 1.0).matrices()[0]
+    a = thruster_papers.discrete_model(case, 1.0).matrices()[0]
     h = np.array(H)
     for q, expected in zip(NOISE_LEVELS, OPTIMUM[case], strict=True):
-        np.testing.assert_allclose(optimum(case, q), expected, atol=6e-5)
+        np.testing.assert_allclose(thruster_papers.optimum(case, q), expected, atol=6e-5)
         predicted = solve_discrete_are(a.T, h.T, q * np.eye(2), q * np.eye(1))
         posterior = np.linalg.inv(np.linalg.inv(predicted) + h.T @ h / q)
-        np.testing.assert_allclose(optimum(case, q), np.sqrt(np.diag(posterior)), rtol=1e-9)
+        np.testing.assert_allclose(thruster_papers.optimum(case, q), np.sqrt(np.diag(posterior)), rtol=1e-9)
 
 
 @pytest.mark.parametrize("table", STUDIES.values(), ids=STUDIES)
@@ -96,12 +57,12 @@ def test_published_tables_are_whole(table):
 
 @pytest.mark.parametrize("case", SYSTEMS)
 def test_kalman_filter_is_stationary_at_the_optimum(case):
-    model, runs = discrete_model(case, 0.5), 3000
+    model, runs = thruster_papers.discrete_model(case, 0.5), 3000
     keys = np.random.default_rng(5).integers(0, 2**32, size=(runs, 2))
     inputs = np.zeros((runs, STEPS, 2))
     truth = simulate(model, keys, inputs)
     estimates = run(KalmanFilter(model=model), keys, inputs, truth.measurements)
-    expected = optimum(case, 0.5) ** 2
+    expected = thruster_papers.optimum(case, 0.5) ** 2
     np.testing.assert_allclose(np.diagonal(estimates.covs[0], axis1=1, axis2=2), np.tile(expected, (101, 1)))
     squares = np.square(estimates.means - truth.states).mean(axis=1)
     error = squares.std(axis=0) / runs**0.5
@@ -128,10 +89,14 @@ def test_ensemble_filter_ties_with_the_kalman_filter(comparisons):
 
 @pytest.mark.parametrize(("case", "q"), UNUPDATED)
 def test_unupdated_ensemble_from_a_known_start(case, q):
-    model, runs, generator = discrete_model(case, q, prior_cov=[0, 0]), 400, np.random.default_rng(11)
+    model, runs, generator = (
+        thruster_papers.discrete_model(case, q, prior_cov=[0, 0]),
+        400,
+        np.random.default_rng(11),
+    )
     keys = generator.integers(0, 2**32, size=(runs, 2))
     truth = simulate(model, keys, np.zeros((runs, STEPS, 2)))
-    errors = unupdated_ensemble_means(model, truth.states, 100, generator) - truth.states
+    errors = thruster_papers.unupdated_ensemble_means(model, truth.states, 100, generator) - truth.states
     single = np.sqrt(np.square(errors[:, 1:]).mean(axis=1))
     error = (2 / runs) ** 0.5 * single.std(axis=0)  # theirs and ours
     assert (np.abs(single.mean(axis=0) - UNUPDATED[case, q]) < 3 * error).all()
@@ -139,7 +104,7 @@ def test_unupdated_ensemble_from_a_known_start(case, q):
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_published_ensemble_filters_are_explained(comparisons, name):
-    ensemble = [f for f in findings(STUDIES[name], comparisons) if f.filter == "enkf"]
+    ensemble = [f for f in thruster_papers.findings(STUDIES[name], comparisons) if f.filter == "enkf"]
     assert len(ensemble) == 8
     for f in ensemble:
         assert (np.abs(f.from_unupdated) < 1.5).all()
@@ -151,7 +116,7 @@ def test_published_ensemble_filters_are_explained(comparisons, name):
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_published_kalman_filters_are_not_explained(comparisons, name):
-    kalman = [f for f in findings(STUDIES[name], comparisons) if f.filter == "kf"]
+    kalman = [f for f in thruster_papers.findings(STUDIES[name], comparisons) if f.filter == "kf"]
     assert len(kalman) == 8
     assert all("no mechanism known" in f.why for f in kalman)
 
@@ -171,7 +136,7 @@ def test_the_text_corrects_cells_of_the_table():
     [("kiki2020", "in 7 of 8 rows (6 by the table, which the text corrects)"), ("nurhadi2022", "in 7 of 8 rows,")],
 )
 def test_rows_with_equal_errors_in_both_states(comparisons, name, rows):
-    said = study_statements(STUDIES[name], findings(STUDIES[name], comparisons))
+    said = thruster_papers.study_statements(STUDIES[name], thruster_papers.findings(STUDIES[name], comparisons))
     assert sum(rows in statement for statement in said) == 1
     assert set(STUDIES[name].remarks) <= set(said)
 
@@ -193,7 +158,9 @@ def test_by_the_article_s_own_numbers_the_ensemble_filter_is_the_worse_one_in_th
 
 
 def test_a_seed_fixes_the_result():
-    first, again, other = (compare("tunnel", 0.6, runs=20, members=30, seed=seed) for seed in (4, 4, 5))
+    first, again, other = (
+        thruster_papers.compare("tunnel", 0.6, runs=20, members=30, seed=seed) for seed in (4, 4, 5)
+    )
     for a, b, c in zip(first[3:], again[3:], other[3:], strict=True):
         np.testing.assert_array_equal(a.rmse, b.rmse)
         np.testing.assert_array_equal(a.low, b.low)
@@ -211,7 +178,7 @@ def test_a_seed_fixes_the_result():
     ],
 )
 def test_wrong_arguments(arguments, rule):
-    refused(rule, compare, **{"case": "tunnel", "q": 0.5, **arguments})
+    refused(rule, thruster_papers.compare, **{"case": "tunnel", "q": 0.5, **arguments})
 
 
 def test_json_on_standard_output_is_whole(as_json):
@@ -247,46 +214,50 @@ GAPS = {  # x, y, z, psi: RMSE of the transformation by yaw alone on noise-free 
 
 @pytest.mark.parametrize("name", PATHS)
 def test_paths_end_where_they_should_and_yaw_alone_leads_elsewhere(name):
-    states = noise_free("vehicle", path_inputs(name))
+    states = vehicle_runs.noise_free("vehicle", vehicle_runs.path_inputs(name))
     np.testing.assert_allclose(states[-1, 9:], ENDS[name], atol=6e-3)
     pose = states[:, [9, 10, 11, 8]]
-    gap = np.sqrt(np.square(planar_pose(states[None, :, :6], DT)[0] - pose).mean(axis=0))
+    gap = np.sqrt(np.square(estimators.planar_pose(states[None, :, :6], DT)[0] - pose).mean(axis=0))
     np.testing.assert_allclose(gap, GAPS[name], rtol=0.02, atol=6e-4)
     # The full transformation of exact velocities is the exact pose, with roll and pitch told or reckoned.
     for attitude in (states[None, :, 6:8], None):
-        np.testing.assert_allclose(full_pose(states[None, :, :6], attitude, DT)[0], pose, atol=2e-5)
-    np.testing.assert_allclose(reckoned_attitude(states[None, :, :6], DT)[0], states[:, 6:8], atol=1e-6)
+        np.testing.assert_allclose(estimators.full_pose(states[None, :, :6], attitude, DT)[0], pose, atol=2e-5)
+    np.testing.assert_allclose(estimators.reckoned_attitude(states[None, :, :6], DT)[0], states[:, 6:8], atol=1e-6)
 
 
 def test_inputs_of_the_dynamic_path_change_sign_as_the_sines_do():
-    inputs, time = path_inputs("dynamic"), DT * np.arange(25000)
+    inputs, time = vehicle_runs.path_inputs("dynamic"), DT * np.arange(25000)
     np.testing.assert_array_equal(inputs[:, 2] > 0, (time % 14.0) < 7.0)
     np.testing.assert_array_equal(inputs[:, 3] > 0, (time % 10.0) < 5.0)
     np.testing.assert_allclose(np.unique(inputs[:, 0]), 2.84531 * np.array([0.6, 1.4]))
     np.testing.assert_allclose(inputs[:, 1], -0.006 * inputs[:, 0])
-    refused("path must be one of I, II, III, IV, dynamic, but got 'V'", path_inputs, "V")
+    refused("path must be one of I, II, III, IV, dynamic, but got 'V'", vehicle_runs.path_inputs, "V")
 
 
 def test_measurements_alone_are_what_the_sensors_say():
-    truth = true_runs("vehicle", keys_of("III", 2, 0), path_inputs("III", 400))
-    velocities = measured_velocities(truth)
+    truth = vehicle_runs.true_runs(
+        "vehicle", vehicle_runs.keys_of("III", 2, 0), vehicle_runs.path_inputs("III", 400)
+    )
+    velocities = vehicle_runs.measured_velocities(truth)
     np.testing.assert_array_equal(velocities[..., [0, 1, 2, 5]], truth.measurements)
     assert not velocities[..., 3:5].any()
     errors = (velocities - truth.states[..., :6])[..., [0, 1, 2, 5]]
     np.testing.assert_allclose(errors.std(axis=(0, 1)), 1e-3, rtol=0.1)
-    scores = scores_of(measured(), truth, keys_of("III", 2, 0), path_inputs("III", 400))
+    scores = vehicle_runs.scores_of(
+        estimators.measured(), truth, vehicle_runs.keys_of("III", 2, 0), vehicle_runs.path_inputs("III", 400)
+    )
     assert np.isnan(scores.full).all() and np.isnan(scores.nees).all() and np.isfinite(scores.planar).all()
 
 
 def test_bound_of_measured_velocities_is_the_golden_ratio(as_python):
-    _, _, outside, bound = along_path("vehicle", path_inputs("IV", 60))
+    _, _, outside, bound = vehicle_runs.along_path("vehicle", vehicle_runs.path_inputs("IV", 60))
     np.testing.assert_allclose(bound.velocities[[0, 1, 2, 5]], GOLDEN, rtol=1e-3)
     assert (bound.velocities[3:5] > 2 * GOLDEN).all() and outside[-1] >= outside[:-1].max()
 
 
 def test_a_forecast_from_the_mean_forgets_the_members(as_python):
-    wide = papers_model("motion", integration="euler").replace(prior_cov=(1e-4,) * 8)
-    u = path_inputs("I", 1)[0]
+    wide = estimators.papers_model("motion", integration="euler").replace(prior_cov=(1e-4,) * 8)
+    u = vehicle_runs.path_inputs("I", 1)[0]
     spread = {}
     for kind in (MeanPropagatingEnKF, EnsembleKalmanFilter):
         filter_ = kind(model=wide, ensemble_size=400)
@@ -319,13 +290,13 @@ def test_mean_propagating_filter_has_a_gain_of_one_half(as_python):
 
 
 def test_own_attitude_is_what_its_own_rates_lead_to(as_python):
-    own = kalman()[3].filter
-    inputs, keys = np.zeros((2, 40, 6)), keys_of("dynamic", 2, 0)
-    inputs[..., :4] = path_inputs("dynamic", 40)
-    z = true_runs("vehicle", keys, inputs[0, :, :4]).measurements
+    own = estimators.kalman()[3].filter
+    inputs, keys = np.zeros((2, 40, 6)), vehicle_runs.keys_of("dynamic", 2, 0)
+    inputs[..., :4] = vehicle_runs.path_inputs("dynamic", 40)
+    z = vehicle_runs.true_runs("vehicle", keys, inputs[0, :, :4]).measurements
     means = run(own, keys, inputs, z).means
     told = inputs.copy()
-    told[..., 4:] = reckoned_attitude(means, DT)[:, :-1]
+    told[..., 4:] = estimators.reckoned_attitude(means, DT)[:, :-1]
     assert np.abs(told[:, -1, 4:]).min() > 1e-6
     plain = run(ExtendedKalmanFilter(model=own.model), keys, told, z).means
     np.testing.assert_allclose(means, plain, atol=1e-13)
@@ -335,9 +306,9 @@ def test_own_attitude_is_what_its_own_rates_lead_to(as_python):
 
 @pytest.mark.slow
 def test_filters_on_the_same_runs(as_python):
-    ekf8, _, level, own = kalman()
-    tasks = [Task("dynamic", "vehicle", [measured(), ekf8, level, own])]
-    (result,) = run_tasks(tasks, runs=2, steps=80)
+    ekf8, _, level, own = estimators.kalman()
+    tasks = [Task("dynamic", "vehicle", [estimators.measured(), ekf8, level, own])]
+    (result,) = vehicle_runs.run_tasks(tasks, runs=2, steps=80)
     assert [len(one.nees) for one in result.scores.values()] == [2] * 4 and result.steps == 80
     for label in ("EKF8", "EKF6 level", "EKF6 own attitude"):
         one = result.scores[label]
@@ -345,12 +316,12 @@ def test_filters_on_the_same_runs(as_python):
         np.testing.assert_allclose(one.rmse("planar"), result.scores["EKF8"].rmse("planar"), rtol=0.1)
         assert (one.rmse("full")[:3] < 1e-3).all() and not one.divergences.any()
     assert 4 < result.scores["EKF8"].nees.mean() < 14
-    again = run_tasks([Task("dynamic", "vehicle", [ekf8])], runs=2, steps=80)[0].scores["EKF8"]
+    again = vehicle_runs.run_tasks([Task("dynamic", "vehicle", [ekf8])], runs=2, steps=80)[0].scores["EKF8"]
     np.testing.assert_array_equal(again.velocities, result.scores["EKF8"].velocities)
 
 
 def test_corners_of_the_bounds_are_unstable():
-    rules = FuzzyKalmanFilter(model=level_model(), low=np.zeros(6), high=np.ones(6)).rules
+    rules = FuzzyKalmanFilter(model=estimators.level_model(), low=np.zeros(6), high=np.ones(6)).rules
     growth = [np.linalg.eigvals((rule.matrices()[0] - np.eye(6)) / DT).real.max() for rule in rules]
     assert (np.array(growth) > 1e-6).sum() == 23 and max(growth) == pytest.approx(1.77, abs=0.01)
 
@@ -369,7 +340,9 @@ def test_printed_tables_are_whole():
 
 
 def test_why_differences_are_told_by_size(as_python):
-    (result,) = run_tasks([Task("III", "vehicle", [measured(), kalman()[0]])], runs=2, steps=60)
+    (result,) = vehicle_runs.run_tasks(
+        [Task("III", "vehicle", [estimators.measured(), estimators.kalman()[0]])], runs=2, steps=60
+    )
     scores = result.scores["EKF8"]
     pose = dict(zip(("x", "y", "psi"), scores.rmse("full")[[0, 1, 3]], strict=True))
     full = why_different(PrintedRow(pose, 1.0), scores, result)
@@ -418,4 +391,6 @@ def test_a_paper_is_reproduced_at_the_command_line(quick, thruster, monkeypatch,
 
 def test_errors_of_yaw_are_the_short_way_round():
     true, found = np.array([[1.0, 2.0, 3.0, 6.2]]), np.array([[1.5, 2.0, 2.0, 0.1]])
-    np.testing.assert_allclose(pose_errors(found, true), [[0.5, 0.0, -1.0, 2 * np.pi - 6.1]], atol=1e-12)
+    np.testing.assert_allclose(
+        estimators.pose_errors(found, true), [[0.5, 0.0, -1.0, 2 * np.pi - 6.1]], atol=1e-12
+    )

@@ -11,31 +11,8 @@ from tests.filters.checks import refused
 from thruster_env.core.streams import episode_keys
 from thruster_env.model import rotations
 from thruster_env.model.simulate import simulate
-from tuning.experiments import broad
-from tuning.experiments.recordings import (
-    CHOSEN,
-    LOOKUP,
-    OURS,
-    OWN,
-    STATIC_MAP,
-    STRUCTURES,
-    Structure,
-    after_reversal,
-    averaged,
-    best_rmse,
-    error,
-    estimates_of,
-    identified,
-    identify_all,
-    ladder_rows,
-    number_rows,
-    ratios,
-    regimes,
-    rmse,
-    settled_rmse,
-    tasks_of,
-    thrusts,
-)
+from tuning.experiments import broad, recordings
+from tuning.experiments.recordings import CHOSEN, LOOKUP, OURS, OWN, STATIC_MAP, STRUCTURES, Structure
 from tuning.experiments.recordings_model import DT, clock_offset, model, read_recordings, to_identify
 from tuning.likelihood.result import valued
 
@@ -94,14 +71,17 @@ def test_a_run_is_a_log_on_the_recorders_clock(runs):
 
 
 def test_errors_are_averaged_and_shifted(runs):
-    assert averaged(np.array([0.0, 3.0, 0.0, 0.0]), 3).tolist() == [1.5, 1.0, 1.0, 0.0]
+    assert recordings.averaged(np.array([0.0, 3.0, 0.0, 0.0]), 3).tolist() == [1.5, 1.0, 1.0, 0.0]
     run = runs[1]
     exact = np.interp(run.times + run.offset, run.times, run.load)
     middle = slice(5, -5)
-    assert abs(error(exact, run, run.offset)[middle]).max() < 0.1 * abs(error(exact, run, 0.1)[middle]).max()
-    assert best_rmse(exact, run) <= rmse(exact, run, 0.0)
-    assert rmse(run.own, run) > settled_rmse(exact, run)
-    assert ratios(run.own, run) == (1.0, 1.0, 1.0)
+    assert (
+        abs(recordings.error(exact, run, run.offset)[middle]).max()
+        < 0.1 * abs(recordings.error(exact, run, 0.1)[middle]).max()
+    )
+    assert recordings.best_rmse(exact, run) <= recordings.rmse(exact, run, 0.0)
+    assert recordings.rmse(run.own, run) > recordings.settled_rmse(exact, run)
+    assert recordings.ratios(run.own, run) == (1.0, 1.0, 1.0)
 
 
 @pytest.mark.slow
@@ -109,24 +89,26 @@ def test_numbers_found_from_runs_estimate_thrust_where_the_load_cell_is_not(runs
     few = tuple(one for one in STRUCTURES[CHOSEN].free if one.name in ("thrust_factor", "dead_band_high", "R22"))
     fixed = {name: value for name, value in TRUTH.items() if name not in ("thrust_factor", "dead_band_high")}
     structure = Structure("few", few, fixed)
-    found = identified(structure, runs)
+    found = recordings.identified(structure, runs)
     assert found.values["thrust_factor"] == pytest.approx(TRUTH["thrust_factor"], rel=0.05)
     assert found.values["dead_band_high"] == pytest.approx(TRUTH["dead_band_high"], abs=0.05)
-    better = thrusts(structure.model(**found.values), runs)
-    worse = thrusts(structure.model(thrust_factor=2e-3), runs)
+    better = recordings.thrusts(structure.model(**found.values), runs)
+    worse = recordings.thrusts(structure.model(thrust_factor=2e-3), runs)
     for one, other, run in zip(better, worse, runs, strict=True):
-        assert len(one) == len(run.times) and settled_rmse(one, run) < 0.5 * settled_rmse(other, run)
+        assert len(one) == len(run.times) and recordings.settled_rmse(one, run) < 0.5 * recordings.settled_rmse(
+            other, run
+        )
 
 
 @pytest.mark.slow
 def test_more_noise_after_reversals_is_the_projects_filter_where_there_is_none(runs):
-    after = after_reversal(np.array([0.0, -1.0, -1.0, *[-1.0] * 12, 2.0, 2.0]))
+    after = recordings.after_reversal(np.array([0.0, -1.0, -1.0, *[-1.0] * 12, 2.0, 2.0]))
     assert after.tolist() == [True] * 11 + [False] * 4 + [True] * 2
     short = [runs[1]._replace(**{name: getattr(runs[1], name)[:40] for name in SERIES})]
-    (one,) = regimes(valued(to_identify(), TRUTH), short, [1.0])
-    ours = thrusts(valued(to_identify(), TRUTH), short)[0]
-    assert one.ratio == pytest.approx(ratios(ours, short[0]).averaged, rel=1e-6)
-    (more,) = regimes(valued(to_identify(), TRUTH), short, [16.0])
+    (one,) = recordings.regimes(valued(to_identify(), TRUTH), short, [1.0])
+    ours = recordings.thrusts(valued(to_identify(), TRUTH), short)[0]
+    assert one.ratio == pytest.approx(recordings.ratios(ours, short[0]).averaged, rel=1e-6)
+    (more,) = recordings.regimes(valued(to_identify(), TRUTH), short, [16.0])
     assert more.nis < one.nis
 
 
@@ -147,16 +129,16 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
     learnt = "tuning.experiments.recordings.identified"
     monkeypatch.setattr(learnt, lambda structure, *_: asked.append(structure) or Learnt(structure))
     file, told = tmp_path / "results.json", []
-    tasks = identify_all(runs, file, progress=lambda *one: told.append(one))
-    assert len(asked) == len(tasks) == len(tasks_of(runs)) == 3 * len(STRUCTURES)
+    tasks = recordings.identify_all(runs, file, progress=lambda *one: told.append(one))
+    assert len(asked) == len(tasks) == len(recordings.tasks_of(runs)) == 3 * len(STRUCTURES)
     assert told[0] == (CHOSEN, 0, len(tasks)) and told[1][0] == f"{CHOSEN}, without CLLookupStep"
-    identify_all(runs, file)
+    recordings.identify_all(runs, file)
     assert len(asked) == len(tasks)
-    assert len(number_rows(runs, tasks)) == len(STRUCTURES[CHOSEN].free)
-    assert len(estimates_of(runs, tasks)[OURS]) == 2
+    assert len(recordings.number_rows(runs, tasks)) == len(STRUCTURES[CHOSEN].free)
+    assert len(recordings.estimates_of(runs, tasks)[OURS]) == 2
     few = {name: one for name, one in STRUCTURES.items() if name in (CHOSEN, "ambient")}
     monkeypatch.setattr("tuning.experiments.recordings.STRUCTURES", few)
-    assert [row[0] for row in ladder_rows(runs, tasks)] == [one.about for one in few.values()]
+    assert [row[0] for row in recordings.ladder_rows(runs, tasks)] == [one.about for one in few.values()]
 
 
 @pytest.mark.slow
@@ -178,12 +160,19 @@ def test_a_folder_without_recordings_is_refused(thruster, tmp_path):
 @pytest.mark.skipif(not RECORDED.is_dir(), reason="the recordings are no part of this project")
 def test_goals_on_the_recorded_runs():
     recorded = read_recordings(RECORDED)
-    found = np.array([ratios(one, run) for one, run in zip(thrusts(model(), recorded), recorded, strict=True)])
+    found = np.array(
+        [
+            recordings.ratios(one, run)
+            for one, run in zip(recordings.thrusts(model(), recorded), recorded, strict=True)
+        ]
+    )
     averages, best, raw = found.T
     steps = np.array(["Step" in run.name for run in recorded])
     assert averages.max() <= 0.6 and averages.mean() <= 0.4 and best.max() <= 0.8
     assert raw[~steps].max() <= 0.65 and raw[steps].max() <= 0.7
-    assert rmse(recorded[0].own, recorded[0], 0.0, window=1) == pytest.approx(1.99, abs=5e-3)  # as filed
+    assert recordings.rmse(recorded[0].own, recorded[0], 0.0, window=1) == pytest.approx(
+        1.99, abs=5e-3
+    )  # as filed
 
 
 def test_the_own_estimate_of_another_estimator_is_not_made_up(folder, tmp_path):

@@ -22,21 +22,11 @@ import pytest
 
 from tests.fuzz.checkpoints import kill_training
 from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures  # noqa: E402, F401 - one is a fixture  # noqa: F401 - some are fixtures
+from tuning.policies import saved
 from tuning.policies.algorithms import ALGORITHMS, OBSERVATION_SETS
 from tuning.policies.environments import make_environments
 from tuning.policies.learn import VALIDATION_EPISODES, _episodes_after, mend
-from tuning.policies.saved import (
-    BEST,
-    CHECKPOINTS,
-    EVALUATIONS,
-    FINAL,
-    SETUP,
-    configuration_from_json,
-    find_saved,
-    load,
-    read_configuration,
-    score,
-)
+from tuning.policies.saved import BEST, CHECKPOINTS, EVALUATIONS, FINAL, SETUP
 from tuning.problems.data import held_out_seeds
 
 
@@ -49,8 +39,8 @@ def test_a_policy_learns_on_every_arm_and_is_scored(observe, tmp_path):
     assert [steps for steps, _ in told] == list(range(COPIES, 257, COPIES))
     assert np.isnan(told[0][1]) and told[-1][1] == run.curve[-1][1]
     seeds = held_out_seeds(0, 3)
-    policy = load(find_saved(run.folder), make_environments(setup, seeds))
-    scores = score(policy, setup, seeds)
+    policy = saved.load(saved.find_saved(run.folder), make_environments(setup, seeds))
+    scores = saved.score(policy, setup, seeds)
     assert scores.returns.shape == (3,) and (scores.returns < 0).all()
     assert scores.parts["all"].steps.sum() == 3 * LIMIT
 
@@ -65,13 +55,16 @@ def test_a_policy_learns_by_every_algorithm_goes_on_and_acts_the_same_when_loade
     run = learn(longer, folder)
     assert (run.steps, run.learnt) == (256, 128)
     assert [steps for steps, _ in run.curve] == [64, 128, 256]
-    assert steps_of(find_saved(folder)) == 256 and read_configuration(find_saved(folder)).steps == 256
+    assert (
+        steps_of(saved.find_saved(folder)) == 256
+        and saved.read_configuration(saved.find_saved(folder)).steps == 256
+    )
     seen = np.random.default_rng(0).normal(0, 20, (5, 4)).astype(np.float32)
-    policies = [load(find_saved(folder), make_environments(setup, [0, 1])) for _ in range(2)]
+    policies = [saved.load(saved.find_saved(folder), make_environments(setup, [0, 1])) for _ in range(2)]
     first, second = (policy.predict(seen)[0] for policy in policies)
     np.testing.assert_array_equal(first, second)
     assert first.shape == (5, 1) and (abs(first) <= 1).all()
-    assert (score(policies[0], setup, held_out_seeds(0, 2)).returns < 0).all()
+    assert (saved.score(policies[0], setup, held_out_seeds(0, 2)).returns < 0).all()
 
 
 def test_what_is_saved_acts_as_what_learnt(tmp_path, monkeypatch):
@@ -93,7 +86,7 @@ def test_what_is_saved_acts_as_what_learnt(tmp_path, monkeypatch):
         paths = folder / FINAL, folder / "best", folder / CHECKPOINTS / name
         found = next(path for path in paths if path.name == name)
         if found.exists():
-            actions = load(found, make_environments(setup, [0])).predict(seen)[0]
+            actions = saved.load(found, make_environments(setup, [0])).predict(seen)[0]
             np.testing.assert_allclose(actions, expected, rtol=1e-5, atol=1e-7)  # tanh is torch's again
     assert FINAL in kept and "best" in kept
 
@@ -107,7 +100,7 @@ def test_an_interrupted_training_goes_on_where_it_was(tmp_path):
 
     first = learn(setup, folder, on_progress=interrupt)
     assert first.interrupted and first.steps == 300 and not (folder / FINAL).exists()
-    assert find_saved(folder).name == "000000300"
+    assert saved.find_saved(folder).name == "000000300"
     second = learn(setup, folder, on_progress=lambda steps, value: seen.append(steps))
     assert seen[0] == 304 and not second.interrupted
     assert second.steps >= 512 and second.learnt == second.steps - 300
@@ -127,7 +120,7 @@ def test_a_longer_training_that_is_interrupted_is_not_lost(copied):
             os.kill(os.getpid(), signal.SIGINT)
 
     assert learn(longer, copied, on_progress=interrupt).steps == 400
-    assert steps_of(find_saved(copied)) == 400
+    assert steps_of(saved.find_saved(copied)) == 400
     seen = []
     learn(longer, copied, on_progress=lambda steps, value: seen.append(steps))
     assert seen[0] == 404
@@ -170,7 +163,7 @@ def test_a_training_goes_on_after_any_number_of_steps_with_episodes_of_its_own(s
 def test_a_setup_survives_its_text():
     for observe in OBSERVATION_SETS:
         setup = setup_of(observe)
-        again = configuration_from_json(setup.as_json(), "setup.json")
+        again = saved.configuration_from_json(setup.as_json(), "setup.json")
         assert again == setup and not setup.differences(again)
 
 
@@ -185,7 +178,7 @@ def test_native_envs_and_single_ones_give_the_same_learning_curve(observe, tmp_p
 
 def test_the_learning_rate_never_falls_below_zero(tmp_path):
     setup = setup_of(steps=200)  # whole rollouts end at 256
-    model = load(learn(setup, tmp_path / "ekf").folder / FINAL, make_environments(setup, [0])).model
+    model = saved.load(learn(setup, tmp_path / "ekf").folder / FINAL, make_environments(setup, [0])).model
     assert model.num_timesteps == 256 and model.lr_schedule(1.0) == setup.hyperparameters["learning_rate"]
     assert model.policy.optimizer.param_groups[0]["lr"] == 0.0 == model.lr_schedule(-0.1)
 
@@ -271,7 +264,7 @@ def test_an_end_while_a_policy_is_removed_leaves_none_that_is_half_there(copied,
     with monkeypatch.context() as patch, pytest.raises(Killed):
         patch.setattr(shutil, "rmtree", half)
         learn(longer, copied)  # whose final policy becomes a checkpoint that is there already
-    assert not (copied / FINAL).exists() and steps_of(find_saved(copied)) == 256
+    assert not (copied / FINAL).exists() and steps_of(saved.find_saved(copied)) == 256
     assert learn(longer, copied).learnt == 256
 
 
