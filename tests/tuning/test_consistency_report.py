@@ -68,11 +68,15 @@ def scalar_truth():
         return simulate.simulate(scalar(), episode_keys(range(40)), np.zeros((40, 150, 0)))
 
 
-def scalar_report(drawn, **assumed):
-    filter_ = KalmanFilter(model=scalar(**assumed))
+def scalar_estimates(drawn, **assumed):
     with interpreted():
-        estimates = run(filter_, np.zeros((40, 2)), np.zeros((40, 150, 0)), drawn.measurements)
-    return consistency_report(estimates, drawn.states, first_step=20)
+        return run(
+            KalmanFilter(model=scalar(**assumed)), np.zeros((40, 2)), np.zeros((40, 150, 0)), drawn.measurements
+        )
+
+
+def scalar_report(drawn, **assumed):
+    return consistency_report(scalar_estimates(drawn, **assumed), drawn.states, first_step=20)
 
 
 @pytest.mark.parametrize(
@@ -114,9 +118,7 @@ def test_of_the_right_filter_every_sentence_is_good_news(scalar_truth):
 
 def test_a_report_has_the_numbers_of_its_parts(scalar_truth):
     report = scalar_report(scalar_truth)
-    with interpreted():
-        given = np.zeros((40, 2)), np.zeros((40, 150, 0)), scalar_truth.measurements
-        estimates = run(KalmanFilter(model=scalar()), *given)
+    estimates = scalar_estimates(scalar_truth)
     errors, covs = (estimates.means - scalar_truth.states)[:, 20:], estimates.covs[:, 20:]
     assert report.nees.mean.value == pytest.approx(normalized_squares(errors, covs).mean())
     deviations = np.sqrt(covs[..., 0, 0])
@@ -131,17 +133,13 @@ def test_a_report_has_the_numbers_of_its_parts(scalar_truth):
 def test_missing_measurements_lower_the_right_mean_of_no_check(scalar_truth):
     measurements = scalar_truth.measurements.copy()
     measurements[np.random.default_rng(0).random(measurements.shape) < 0.4] = np.nan
-    given = episode_keys(range(40)), np.zeros((40, 150, 0)), measurements
-    with interpreted():
-        estimates = run(KalmanFilter(model=scalar()), *given)
+    estimates = scalar_estimates(scalar_truth._replace(measurements=measurements))
     report = consistency_report(estimates, scalar_truth.states, measurements)
     assert report.nis.dimension == 1 and report.nis.mean.covers(1.0) and report.whiteness.p_value > 0.01
 
 
 def test_a_report_refuses_what_does_not_fit(scalar_truth):
-    with interpreted():
-        given = np.zeros((40, 2)), np.zeros((40, 150, 0)), scalar_truth.measurements
-        estimates = run(KalmanFilter(model=scalar()), *given)
+    estimates = scalar_estimates(scalar_truth)
     with pytest.raises(ValueError, match="states must have the shape of the estimates"):
         consistency_report(estimates, scalar_truth.states[:, 1:])
     one = Estimates(*(part[:1] for part in estimates))

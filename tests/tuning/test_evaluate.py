@@ -12,7 +12,6 @@ from tests.filters.checks import refused
 from tests.linear_problem import LinearProblem
 from thruster_env.core.compiled import interpreted
 from thruster_env.model import simulate
-from thruster_env.thruster.model import observe
 from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
 from tuning.evaluation.held_out import summary
 from tuning.evaluation.runs import _means_over_steps, log_scores_of
@@ -70,15 +69,6 @@ def test_the_untuned_ekf_is_worse_and_the_paired_interval_says_so(ekf, untuned_e
     # pairing makes the interval of the ratio narrower than the two intervals side by side
     unpaired = untuned_ekf.score.high / ekf.score.low - untuned_ekf.score.low / ekf.score.high
     assert ratio.high - ratio.low < unpaired
-
-
-def test_rmse_of_thrust_is_that_of_the_model_s_thrust_at_the_estimate(nominal, data, ekf):
-    filter_ = oracle_choice("ekf", nominal).filter(nominal)
-    estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
-    states = np.moveaxis(estimates.means, -1, 0)
-    errors = observe((states[0], states[1]), filter_.model.constants)[0] - data.outputs["T"]
-    assert ekf.output_rmse["T"].value == pytest.approx(np.sqrt((errors[:, 50:] ** 2).mean()), rel=1e-12)
-    assert ekf.output_rmse["T"].low < ekf.output_rmse["T"].value < ekf.output_rmse["T"].high
 
 
 def test_a_filter_without_covariance_is_judged_by_its_errors_only(nominal, data):

@@ -204,20 +204,8 @@ def test_logs_of_different_lengths_are_one_batch(data, found):
     again = identify(logs, pendulum, FREE, starts=1)
     assert again.values["stiffness"] == pytest.approx(found.values["stiffness"], rel=0.03)
     with pytest.raises(ValueError, match="must have the same sample time, but"):
-        runs_of([logs[0], Log("b", 0.2, *map(np.array, (u_of(logs), z_of(logs))), *quantities(model))])
+        runs_of([logs[0], replace(logs[0], name="b", dt=0.2)])
     refused("data must be some of Log or Data", runs_of, [1.0])
-
-
-def u_of(logs):
-    return logs[0].inputs
-
-
-def z_of(logs):
-    return logs[0].measurements
-
-
-def quantities(model):
-    return model.input_quantities, model.measurements
 
 
 def test_a_family_knows_arguments_constants_and_noise():

@@ -25,9 +25,9 @@ from tuning.search.storage import PATIENCE_SECONDS, PROCESS, RETRY_OF
 from tuning.search.study import open_study, run_study, run_trials
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
+pytestmark = pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with")
 
 
-@pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
 def test_a_trial_without_a_heartbeat_is_lost_and_tried_once_more(tmp_path, monkeypatch):
     monkeypatch.setattr(database, "HEARTBEAT_SECONDS", 1)
     monkeypatch.setattr(database, "GRACE_SECONDS", 1)
@@ -75,7 +75,6 @@ def flaky(tmp_path, monkeypatch):
     return storage, fail
 
 
-@pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
 def test_an_answer_that_gets_lost_is_asked_for_again(flaky):
     storage, fail = flaky
     study = optuna.create_study(storage=storage)
@@ -87,7 +86,6 @@ def test_an_answer_that_gets_lost_is_asked_for_again(flaky):
         study.tell(trial.number, 1.0)
 
 
-@pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
 def test_a_trial_whose_making_was_not_answered_is_made_once(flaky):
     storage, fail = flaky
     study = optuna.create_study(storage=storage)

@@ -136,12 +136,6 @@ def test_what_the_model_came_with_is_evaluated_and_is_no_rule_of_thumb(as_json, 
     assert done.returncode == 0 and "Parameters of the ukf filter" in done.stdout and "given" in done.stdout
 
 
-def test_the_covariance_of_what_was_given_is_checked(as_json, tmp_path):
-    options = "evaluate", "--given", "--problem", ALTITUDE, "--seeds", 8, "--consistency"
-    told = as_json(*options, "c.png")
-    assert told["consistency"] and (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
-
-
 @pytest.mark.slow
 def test_a_preset_that_was_identified_is_not_made_worse_by_tuning(as_json, tmp_path):
     for place, log in enumerate(record(0, 3, 300)):

@@ -83,15 +83,11 @@ def test_a_demo_whose_search_was_interrupted_says_so_and_exits_with_130(run_demo
 
 
 def test_a_demo_that_is_interrupted_later_exits_with_130(run_demo, monkeypatch):
-    monkeypatch.setattr(demo, "run_tuning", failing(KeyboardInterrupt))
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo, "run_tuning", interrupted)
     assert run_demo() == (130, [])
-
-
-def failing(error):
-    def function(*arguments, **options):
-        raise error
-
-    return function
 
 
 @pytest.fixture

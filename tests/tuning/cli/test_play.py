@@ -25,30 +25,21 @@ def test_pi_follows_a_reference_under_an_estimate(as_json, frames):
     assert found == {"steps": 12, "total_reward": found["total_reward"], "seconds": 0.12, "video": "x.gif"}
     ((path, pictures, rate),) = frames
     assert path.name == "x.gif" and rate == 25 and len(pictures) == 4 and pictures[0].shape[2] == 3
-
-
-def test_alone_it_plays_pi(as_json, frames):
-    alone = as_json("play", "--steps", 8, "--out", "x.gif")
-    assert alone == as_json("play", "--policy", "pi", "--steps", 8, "--out", "x.gif") and alone["steps"] == 8
+    alone, of_pi = (
+        as_json("play", *policy, "--steps", 8, "--out", "x.gif") for policy in ((), ("--policy", "pi"))
+    )
+    assert alone == of_pi and alone["steps"] == 8
 
 
 @pytest.mark.parametrize("option", [("--voltage", 8), ("--excitation", "prbs")])
 def test_voltages_drive_the_thruster(as_json, frames, monkeypatch, option):
-    seen = []
-    monkeypatch.setattr(play, "_played", spy(play._played, seen))
+    seen, played = [], play._played
+    monkeypatch.setattr(play, "_played", lambda env, *rest: seen.append(env) or played(env, *rest))
     found = as_json("play", *option, "--steps", 8, "--preset", "t200", "--seed", 3, "--out", "x.gif")
     assert found["steps"] == 8
     env = seen[0]
     assert env.unwrapped.plant.parameters.gear_ratio == 1.0  # a T200
     assert env.unwrapped.moment_of([0.0] * 40).reference is None
-
-
-def spy(function, seen):
-    def called(env, *arguments):
-        seen.append(env)
-        return function(env, *arguments)
-
-    return called
 
 
 def test_a_log_is_shown_as_it_was_recorded(thruster, as_json, frames, monkeypatch):

@@ -81,12 +81,6 @@ def test_the_first_ctrl_c_is_acknowledged_at_once():
         assert stopped() and told == [STOPPING]
 
 
-def test_a_refused_study_leaves_no_journal(thruster, tmp_path):
-    for arguments in (("--method", "none"), ("--objective", "none"), ("--filter", "none")):
-        assert thruster("tune", "--filter", "ekf", *arguments).returncode == 2
-    assert not list(tmp_path.rglob("*.journal"))
-
-
 def test_a_preset_beyond_its_range_is_warned_about(thruster):
     done = thruster("inspect", "--preset", "t200", "--voltage", 20)
     assert done.returncode == 0 and "t200 is valid up to 13.3 V, but is driven by 20 V" in done.stderr

@@ -74,16 +74,20 @@ def test_means_and_correlation_over_time_tell_a_wrong_model():
     assert found.process_correlation.max() > 0.3
 
 
-def test_map_of_noise_of_a_known_state_is_the_mode_of_an_inverse_wishart_distribution():
-    still = {"prior_mean": [0.0], "prior_cov": [1e-14], "process_noise_cov": [1e-14]}
-    one = np.eye(1)
+def of_known_state(rows, seed, q):
+    """A task on noise about a state that is known: of its model only R is free."""
+    one, still = np.eye(1), {"prior_mean": [0.0], "prior_cov": [1e-14], "process_noise_cov": [q]}
     model = affine_model(a=one, b=np.zeros((1, 0)), c=one, measurement_noise_cov=2.0, **still)
-    z = 1.3 * np.random.default_rng(0).standard_normal((4, 12))
+    z = 1.3 * np.random.default_rng(seed).standard_normal((4, rows))
     problem = RunsProblem([{"measurements": run} for run in z], model, held_out=[2, 3], name="noise")
-    task = Task("kf", problem, problem.data([0]))
+    return z[0], Task("kf", problem, problem.data([0]))
+
+
+def test_map_of_noise_of_a_known_state_is_the_mode_of_an_inverse_wishart_distribution():
+    z, task = of_known_state(12, 0, 1e-14)
     find_method("map").run("map", task)
     scale = task.start.model["measurement_noise_cov"]  # nu = 3: density r^(-5/2) exp(-scale / 2 r)
-    expected = (scale + (z[0] ** 2).sum()) / (z[0].size + 5)
+    expected = (scale + (z**2).sum()) / (z.size + 5)
     assert task.best.model["measurement_noise_cov"] == pytest.approx(expected, rel=1e-5)
 
 
@@ -104,16 +108,11 @@ def test_map_of_a_full_q_that_is_seen_is_the_mode_of_an_inverse_wishart_distribu
 def test_the_posterior_mean_is_that_of_an_integral_on_a_grid(method):
     if method == "nuts":
         pytest.importorskip("nutpie")
-    still = {"prior_mean": [0.0], "prior_cov": [1e-14], "process_noise_cov": [0.0]}
-    one = np.eye(1)
-    model = affine_model(a=one, b=np.zeros((1, 0)), c=one, measurement_noise_cov=2.0, **still)
-    z = 1.3 * np.random.default_rng(1).standard_normal((4, 8))
-    problem = RunsProblem([{"measurements": run} for run in z], model, held_out=[2, 3], name="noise")
-    task = Task("kf", problem, problem.data([0]), start=None)
+    z, task = of_known_state(8, 1, 0.0)
     assert [parameter.name for parameter in task.free] == ["R"]
     find_method(method).run(method, task)
     grid = np.linspace(-8.0, 8.0, 4001)
-    log = -0.5 * (z[0].size * grid + (z[0] ** 2).sum() * np.exp(-grid))
+    log = -0.5 * (z.size * grid + (z**2).sum() * np.exp(-grid))
     log -= 0.5 * ((grid - np.log(2.0)) / np.log(10.0)) ** 2
     weights = np.exp(log - log.max())
     mean, second = ((weights * power).sum() / weights.sum() for power in (grid, grid**2))
@@ -380,28 +379,21 @@ def test_a_step_of_diagonals_is_a_smoothers(missing):
     np.testing.assert_allclose(r, np.diag(expected[1]), rtol=1e-9)
 
 
-def test_the_method_goes_these_steps():
-    task = task_of(linear())
-    task.start = at(task, FIRST_Q, FIRST_R)
-    with pytest.raises(StopIteration):
-        _second_choice(task, "em")
-    q, r = np.diag(FIRST_Q), np.diag(FIRST_R)
-    for answer in task.answers[2:5]:
-        q, r = (np.diag(np.diag(one)) for one in textbook_step(task.data[0].measurements, q, r))
-        np.testing.assert_allclose(answer.choice.model["process_noise_cov"], np.diag(q), rtol=1e-8)
-        np.testing.assert_allclose(answer.choice.model["measurement_noise_cov"], np.diag(r), rtol=1e-8)
-
-
-def test_the_method_goes_these_steps_with_full_matrices():
-    task = task_of(linear(), options={"full_q": True, "full_r": True})
+@pytest.mark.parametrize("full", [False, True])
+def test_the_method_goes_these_steps(full):
+    problem = linear()
+    task = task_of(problem, options={"full_q": full, "full_r": full})
     task.start = at(task, FIRST_Q, FIRST_R)
     with pytest.raises(StopIteration):
         _second_choice(task, "em")
     q, r = np.diag(FIRST_Q), np.diag(FIRST_R)
     for answer in task.answers[2:5]:
         q, r = textbook_step(task.data[0].measurements, q, r)
-        np.testing.assert_allclose(answer.choice.model["process_noise_cov"], q, rtol=1e-8)
-        np.testing.assert_allclose(answer.choice.model["measurement_noise_cov"], r, rtol=1e-8)
+        if not full:
+            q, r = (np.diag(np.diag(one)) for one in (q, r))
+        model = answer.choice.filter(problem).model
+        np.testing.assert_allclose(model.process_noise_cov, q, rtol=1e-8)
+        np.testing.assert_allclose(model.measurement_noise_cov, r, rtol=1e-8)
 
 
 def _second_choice(task, name):
