@@ -248,7 +248,7 @@ def test_the_figure_is_drawn(scalar_truth, kind, tmp_path):
             "No test of whiteness: the filter gives no innovation covariance, or nothing was measured.",
             "No run diverged.",
         ]
-        refused("needs something to draw", save_figure, draw_consistency(report, "a title"), tmp_path / "none.png")
+        refused("needs something to draw", draw_consistency, report, "a title")
     ratios = {"one\nover other": rmse_ratios(np.ones((40, 1)), np.full((40, 1), 2.0))}
     path = save_figure(draw_consistency(report, "a title", ratios), tmp_path / "new" / "calibrated.png")
     assert path.read_bytes().startswith(b"\x89PNG")

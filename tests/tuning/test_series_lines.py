@@ -112,6 +112,7 @@ RNG = np.random.default_rng(3)
 TIMES = np.cumsum(RNG.exponential(0.1, 120))
 LEVEL = 50.0 + np.cumsum(RNG.normal(0.0, 0.3, 120))
 Z = LEVEL + RNG.normal(0.0, 1.0, 120)
+TIMES[60:] += 40.0  # a gap
 MODELS = "constant-velocity", "ornstein-uhlenbeck", "oscillator", "constant + harmonic:period=3"
 
 
