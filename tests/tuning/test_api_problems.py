@@ -191,15 +191,12 @@ def test_envs_of_other_problems(logs):
     refused("must come with run alone, but got low", recorded.make_env, low=1.0)
 
 
-def test_outliers_in_logs_name_the_filter_that_bears_them(logs):
+def test_outliers_in_logs_name_the_filter_and_constants_without_names_stay_as_they_are(logs):
     assert not any("ekf-robust" in sentence for sentence in LogProblem(logs, cart()).remarks)
     values = logs[0].measurements.copy()
     values[100] += 9.0
     wild = dataclasses.replace(logs[0], measurements=values)
     sentences = LogProblem([wild, logs[1]], cart()).remarks
     assert "1 isolated outlier in row 100" in sentences[0] and "--filter ekf-robust" in sentences[1]
-
-
-def test_only_constants_with_names_of_a_problem_that_tunes_q_and_r_may_be_estimated(logs):
     assert may_estimate_constants(find_problem("nominal"))
     assert not may_estimate_constants(LogProblem(logs, cart()))

@@ -170,28 +170,19 @@ WRONG = [
     (lambda: tuning.tune("mismatch", trials=0), "trials must be a whole number of at least 1, but got 0"),
     (
         lambda: tuning.tune("mismatch", method="newton"),
-        "method must be one of tpe, gp, cma-es, nsga-ii, random, grid, gradient, likelihood",
+        "method must be one of tpe, gp, .*, grid, gradient, likeli",
     ),
-    (
-        lambda: tuning.tune("mismatch", workers=2),
-        "workers must be 1 without a storage that they share, such as storage='studies.journal'",
-    ),
+    (lambda: tuning.tune("mismatch", workers=2), "workers must be 1 without a storage that they share, such as"),
     (lambda: tuning.tune("mismatch", progress="yes"), "progress must be True, False or None, but got 'yes'"),
     (lambda: tuning.tune("mismatch", name="a/b"), "study must be a name without slashes, but got 'a/b'"),
     (lambda: tuning.evaluate("none.json"), "none.json"),
     (lambda: tuning.evaluate(3), "a filter must be a name, a tuned file, a Study or an estimator, but got 3"),
     (lambda: tuning.tune("mismatch", len), "filter must be a name or 'module:object', by which trials keep it"),
     (lambda: tuning.report(3), "a report must be of a Study, a tuned file or the name of a study, but got 3"),
-    (
-        lambda: tuning.report(["a.json"]),
-        "a report must be of a Study, a tuned file or the name of a study, but got",
-    ),
+    (lambda: tuning.report(["a.json"]), "a report must be of a Study, a tuned file or the name of a study, but"),
     (lambda: tuning.report("a.json", "b.json"), "for it .tuning.compare compares studies., but got out='b.json'"),
     (lambda: tuning.report("no such study"), "a report must be of a tuned file or of a study in"),
-    (
-        lambda: tuning.tune(SHORT, trials=1).plot_sizes(),
-        "a figure of ensemble sizes needs an ensemble and true states",
-    ),
+    (lambda: tuning.tune(SHORT, trials=1).plot_sizes(), "figure of ensemble sizes needs an ensemble and true"),
     (lambda: tuning.evaluate("ekf", seeds=2).plot_run(2), "run must be at most 1, but got 2"),
 ]
 

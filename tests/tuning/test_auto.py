@@ -53,12 +53,9 @@ def studied(plan, count):
     return run_study(open_study("s", plan, optuna.storages.InMemoryStorage()), plan, count)
 
 
-def test_the_kinds_are_all_filters_with_a_covariance_the_ekf_first():
+def test_the_kinds_are_all_filters_with_a_covariance_but_those_that_a_model_does_not_allow():
     assert AUTO_FILTER_TYPES[0] == "ekf" and len(set(AUTO_FILTER_TYPES)) == len(AUTO_FILTER_TYPES)
     assert set(AUTO_FILTER_TYPES) == {name for name, kind in FILTERS.items() if kind.has_covariance}
-
-
-def test_a_filter_that_a_model_does_not_allow_is_left_out():
     model = MISMATCH.model().replace(operating_state=None, operating_input=None, operating_points=None)
     plan = PLAN._replace(scenarios=(ModelProblem(model, inputs=Steps(12.0), steps=60),))
     assert set(AUTO_FILTER_TYPES) - set(plan.filter_types) == {"kf", "kf-steady"}
@@ -263,7 +260,7 @@ def test_without_a_budget_auto_has_a_default_one_and_few_trials_are_warned_of(mo
         ({"budget": 0.0}, "budget must be positive, but got 0.0"),
         (
             {"sampler": "grid"},
-            r"a method \(--method\) that chooses among filters must be one of tpe, .*, but got 'grid'",
+            r"a method \(--method\) that chooses among filters must be .* tpe, .*, but got 'grid'",
         ),
         ({"filter": "low-pass", "full_q": True}, "a full Q needs a filter with a covariance, but got 'low-pass'"),
     ],

@@ -183,10 +183,13 @@ def test_residuals_are_those_of_the_model_step_by_step():
     np.testing.assert_allclose(found.measurement[k], data.measurements[0, late + k] - seen, rtol=1e-9)
 
 
-def test_equal_filters_are_known_as_equal():
+def test_equal_filters_are_known_as_equal_and_a_contender_may_know_the_scaled_default():
     one = rule_of_thumb("kf", LinearProblem())
     assert same_filter(one, rule_of_thumb("kf", LinearProblem()))
     assert not same_filter(one, one._replace(name="ekf"))
+    choices = baselines("ekf", MISMATCH, 2)
+    assert contender("ekf", "scaled", seed=2).choose(MISMATCH) == choices[SCALED]
+    assert scaled(choices[RULE], scaled_default("ekf", MISMATCH, 2).factor) == choices[SCALED]
 
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
@@ -265,9 +268,3 @@ def test_a_proof_holds_all_baselines_on_the_same_seeds_and_names_the_one_that_co
     assert said.startswith("lowers the error by ") and " against the scaled default, by " in said
     assert " against the rule of thumb and raises the error by " in said and said.endswith("noise estimation")
     assert f"its Q times {comparison.default.factor:.4g}" in scaling_sentence(comparison)
-
-
-def test_a_filter_of_a_comparison_may_know_the_scaled_default():
-    choices = baselines("ekf", MISMATCH, 2)
-    assert contender("ekf", "scaled", seed=2).choose(MISMATCH) == choices[SCALED]
-    assert scaled(choices[RULE], scaled_default("ekf", MISMATCH, 2).factor) == choices[SCALED]

@@ -58,15 +58,12 @@ def noises(data):
     return x[:, 1:] - 0.5 * x[:, :-1] - data.inputs[..., 0]
 
 
-def test_random_actions_are_not_the_noise_of_the_env():
+def test_random_actions_are_neither_the_noise_of_the_env_nor_its_first_state():
     data = problem().data(SEEDS)
     u, w = data.inputs[..., 0], noises(data)
     assert abs(np.corrcoef(u.ravel(), w.ravel())[0, 1]) < BAND / np.sqrt(ENTRIES)
     gain = np.vdot(u, u + w) / np.vdot(u, u)  # which was 2 on the same stream
     assert gain == pytest.approx(1.0, abs=BAND / np.sqrt(ENTRIES))
-
-
-def test_random_actions_are_not_the_first_state_of_a_pendulum():
     pendulum = EnvProblem("Pendulum-v1", "random", pendulum_model(), steps=60, state_of=lambda env: env.state)
     data = pendulum.data(range(100))
     first = np.column_stack([data.states[:, 0], data.inputs[:, :2, 0]])

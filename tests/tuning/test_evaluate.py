@@ -53,16 +53,13 @@ def test_runs_may_be_evaluated_some_at_a_time(nominal, data, name, monkeypatch):
     assert pickle.dumps(parts) == pickle.dumps(whole)
 
 
-def test_the_true_ekf_sits_on_the_bound_and_is_consistent(nominal, data, ekf):
+def test_the_true_ekf_sits_on_the_bound_and_the_untuned_one_is_worse_as_pairs_say(nominal, data, ekf, untuned_ekf):
     bound = nominal.bound(data)
     for rmse, limit in zip(ekf.rmse, bound, strict=True):
         assert 0.98 * limit < rmse.value < 1.05 * limit
     assert ekf.nees.low < 2.0 < ekf.nees.high
     assert ekf.nis.low < 1.0 < ekf.nis.high
     assert ekf.divergences == 0
-
-
-def test_the_untuned_ekf_is_worse_and_the_paired_interval_says_so(ekf, untuned_ekf):
     ratio = score_ratio(untuned_ekf, ekf)
     assert 1.0 < ratio.low < ratio.value < ratio.high
     assert score_ratio(ekf, ekf) == (1.0, 1.0, 1.0)
@@ -177,15 +174,12 @@ def test_the_log_score_is_the_density_of_the_states_that_count(scale, places):
     np.testing.assert_allclose(scores(scale), by_hand(places), rtol=1e-9)
 
 
-def test_a_state_that_does_not_count_and_is_known_to_the_last_digit_earns_nothing():
+def test_a_state_that_does_not_count_earns_nothing_and_a_singular_covariance_has_the_least_score():
     sure = ESTIMATES.covs.copy()
     sure[..., 1, :] = sure[..., :, 1] = 0.0
     sure[..., 1, 1] = 1e-300
     scale = (0.3, math.inf, 0.3)
     np.testing.assert_allclose(scores(scale, sure), by_hand([0, 2]), rtol=1e-9)
-
-
-def test_a_singular_covariance_has_the_least_score_and_is_not_left_out():
     singular = ESTIMATES.covs.copy()
     singular[1, 40:, 1, :] = singular[1, 40:, :, 1] = 0.0
     singular[2] = np.nan

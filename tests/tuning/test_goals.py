@@ -261,12 +261,14 @@ def test_a_study_of_an_objective_that_has_a_gradient_tries_where_it_leads_and_fi
     assert result.best_value == pytest.approx(found.best.level, rel=1e-6)
 
 
-def test_objectives_on_true_states_need_them():
+def test_objectives_on_true_states_need_them_and_a_gradient_takes_no_budget():
     data = MISMATCH.data(range(2))
     with pytest.raises(ValueError, match="must be 'likelihood' without true states, but got 'mse'"):
         tune_by_gradient("ekf", MISMATCH, data._replace(states=None), objective="mse")
     with pytest.raises(ValueError, match="objective must be one of likelihood, score, mse, .*, but got 'nees'"):
         tune_by_gradient("ekf", MISMATCH, data, objective="nees")
+    with pytest.raises(ValueError, match="must come without a budget, but got budget"):
+        tuning.tune("mismatch", "ekf", budget=1.0, method="gradient")
 
 
 @pytest.mark.slow
@@ -289,10 +291,15 @@ def test_a_study_of_the_score_follows_its_gradient_only_where_there_are_many_num
 FULL = Plan("ekf", (MISMATCH,), full_q=True)
 
 
-def test_for_two_states_the_number_is_the_correlation_with_its_sign():
+def test_full_covariances_have_the_correlations_that_they_are_made_of():
     cov = full_covariance((4.0, 9.0), [-0.5])
     np.testing.assert_allclose(cov, [[4.0, -3.0], [-3.0, 9.0]], rtol=1e-15)
     assert (full_covariance((4.0, 9.0), [0.0]) == np.diag([4.0, 9.0])).all()
+    cov = full_covariance((1.0, 2.0, 3.0), [0.3, -0.6, 0.7])
+    known = cov[1:, 1:] - np.outer(cov[1:, 0], cov[0, 1:]) / cov[0, 0]
+    assert known[0, 1] / np.sqrt(known[0, 0] * known[1, 1]) == pytest.approx(0.7)
+    cov = full_covariance((1.0, 0.0, 4.0), [0.3, 0.5, -0.2])
+    assert (cov[1] == 0.0).all() and cov[0, 2] == pytest.approx(0.5 * 2.0)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
@@ -305,17 +312,6 @@ def test_any_numbers_within_their_ranges_give_a_covariance_and_come_back(n):
         assert (cov == cov.T).all() and np.linalg.eigvalsh(cov)[0] > 0
         np.testing.assert_allclose(np.diag(cov), variances, rtol=1e-12)
         np.testing.assert_allclose(correlations_of(cov), correlations, rtol=1e-6, atol=1e-9)
-
-
-def test_the_last_of_three_is_the_correlation_once_the_first_state_is_known():
-    cov = full_covariance((1.0, 2.0, 3.0), [0.3, -0.6, 0.7])
-    known = cov[1:, 1:] - np.outer(cov[1:, 0], cov[0, 1:]) / cov[0, 0]
-    assert known[0, 1] / np.sqrt(known[0, 0] * known[1, 1]) == pytest.approx(0.7)
-
-
-def test_a_state_without_noise_has_neither_variance_nor_covariances():
-    cov = full_covariance((1.0, 0.0, 4.0), [0.3, 0.5, -0.2])
-    assert (cov[1] == 0.0).all() and cov[0, 2] == pytest.approx(0.5 * 2.0)
 
 
 @pytest.mark.parametrize(
@@ -369,11 +365,6 @@ def test_a_consistent_twin_has_the_same_correlation():
         assert rescaled.params["correlation_12"] == trial.params["correlation_12"]
         of_q, of_r = (rescaled.params[name] / trial.params[name] for name in ("Q11", "R"))
         assert of_r == pytest.approx(of_q)
-
-
-def test_the_gradient_refuses_a_budget_with_one_clear_line():
-    with pytest.raises(ValueError, match="must come without a budget, but got budget"):
-        tuning.tune("mismatch", "ekf", budget=1.0, method="gradient")
 
 
 @pytest.mark.parametrize("correlations", [[0.3, -0.6, 0.7, 0.0, 0.98, -0.2], [0.0] * 6])

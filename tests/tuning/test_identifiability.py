@@ -65,12 +65,15 @@ def test_standard_errors_on_a_linear_plant_are_the_size_of_the_errors():
     assert (size > 0.3).all() and (size < 1.85).all()
 
 
-def test_a_state_that_nothing_measures_keeps_its_variance_to_itself():
+def test_a_state_that_nothing_measures_keeps_its_variance_and_noise_is_no_information():
     log_likelihoods = likelihood_of([[0.0, 1.0]])
     at, errors, identified = known(log_likelihoods, [TRUE, TRUE + 1.0])
     assert identified.tolist() == [False, True, True]
     assert errors[0] == pytest.approx(np.log(10.0), rel=1e-3)  # no more than what is known before
     assert (abs(at - TRUE)[1:] < 3 * errors[1:]).all()
+    chance = np.random.default_rng(0)
+    cov = covariance(curvatures(lambda logarithms: chance.normal(size=40), np.zeros(2)))
+    assert (np.sqrt(np.diag(cov)) > 0.3).all()
 
 
 def test_two_variances_of_which_only_the_sum_shows_make_up_for_one_another():
@@ -97,12 +100,6 @@ def test_a_number_without_a_limit_below_is_not_determined_though_the_likelihood_
     cov = covariance(curvatures(log_likelihoods, at))
     assert np.exp(1.96 * np.sqrt(cov[0, 0])) < 100
     assert not is_identified(log_likelihoods, at, np.array([[0.25]]), bounds).any()
-
-
-def test_noise_is_no_information():
-    chance = np.random.default_rng(0)
-    cov = covariance(curvatures(lambda logarithms: chance.normal(size=40), np.zeros(2)))
-    assert (np.sqrt(np.diag(cov)) > 0.3).all()
 
 
 def test_an_ekf_has_the_intervals_of_the_gradient_method_from_a_bad_choice():

@@ -262,14 +262,11 @@ def test_a_gate_leaves_noise_and_constants_as_they_are(gate):
         identify(recorded(2, 50), pendulum, FREE, gate=1.5)
 
 
-def test_what_a_gate_leaves_of_a_normal_distribution():
+def test_what_a_gate_leaves_of_a_normal_distribution_and_how_a_probability_reads():
     drawn = np.random.default_rng(0).normal(size=1_000_000)
     for gate in (1.0, 2.0, 3.0):
         kept = drawn[np.abs(drawn) <= gate] ** 2
         assert kept_variance(gate) == pytest.approx(kept.mean(), rel=5e-3)
         assert lost_information(gate) == pytest.approx(2 / kept.var(), rel=1e-2)
     assert kept_variance(math.inf) == lost_information(math.inf) == kept_variance(60.0) == 1.0
-
-
-def test_a_probability_reads_as_a_table_has_it():
     assert NullTest(0.0, True, -1.0, 0.4321).said == "0.43" and NullTest(0.0, True, -1.0, 1e-9).said == "< 0.001"

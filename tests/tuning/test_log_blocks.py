@@ -148,9 +148,10 @@ def test_short_logs_have_shorter_lead_ins_and_blocks_and_it_is_said(rows, lead):
     assert LogProblem(logs_of(200), GUESS).remarks == () and LogProblem(logs_of(200), GUESS).parts.lead == 50
 
 
-def test_a_lead_in_that_is_given_stays():
+def test_a_lead_in_that_is_given_stays_and_logs_that_were_not_read_have_no_recording():
     problem = LogProblem(logs_of(23, 24, 20), GUESS, lead=0)
     assert problem.parts.lead == 0 and [block.rows for block in problem.parts.blocks] == [6] * 11  # of 70 rows
+    assert logs_of(100)[0].recording == Recording() and logs_of(100)[0].pieces == ((0, 101),)
 
 
 @pytest.mark.parametrize(("steps", "count"), [((1500, 1500, 1500), 72), ((900, 130, 400), 51), ((4000,), 73)])
@@ -161,10 +162,6 @@ def test_blocks_of_all_logs_have_one_length_and_few_rows_are_left_out(steps, cou
     assert sum(steps) - 50 * len(steps) - count * (lengths.pop() - 50) <= 0.1 * sum(steps)
     assert len(parts.sizes) * 3 <= len(parts.training) + len(parts.sizes) < (len(parts.sizes) + 1) * 3
     assert {parts.blocks[i].run for i in parts.sizes} == {parts.blocks[i].run for i in parts.training}
-
-
-def test_recordings_of_logs_that_were_not_read_are_empty():
-    assert logs_of(100)[0].recording == Recording() and logs_of(100)[0].pieces == ((0, 101),)
 
 
 CART = affine_model(

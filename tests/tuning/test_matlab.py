@@ -91,10 +91,15 @@ def truncating(x, u, c):
     return (float(int(x[0])),)
 
 
-def test_what_cannot_be_written_out_says_where():
+def test_what_cannot_be_written_out_says_where_and_why():
     with pytest.raises(ValueError, match=r"but truncating \(test_matlab.py, line \d+\) cannot be .*int") as caught:
         lines_of(truncating, (["x(1)"], []), (), 1)
     assert "\n" not in str(caught.value)
+    model = state_space(truncating, lambda x, c: (x[0],), q=[1.0], r=[1.0], mean=[0.0], cov=[1.0])
+    text = matlab_function(Choice("ekf", {}, {}), model, "mine", None)
+    assert "%   Why: a function that is written out must" in text and "test_matlab.py, line" in text
+    assert "m.f and m.h are yours to add" in text and "@transition" not in text and "m.dt" not in text
+    assert function_name("ekf", "auv:motion") == "ekf_auv_motion" and function_name("1.csv") == "f_1_csv"
 
 
 def test_the_template_that_thruster_new_writes_can_be_exported():
@@ -128,14 +133,3 @@ def test_an_affine_model_is_its_matrices():
     text = matlab_function(choice, model, problem.name, problem.dt)
     rows = re.search(r"m\.A = \[(.*)\];", text)[1].split("; ")
     np.testing.assert_array_equal([np.array(row.split(", "), float) for row in rows], model.matrices()[0])
-
-
-def test_a_model_that_cannot_be_written_out_says_so():
-    model = state_space(truncating, lambda x, c: (x[0],), q=[1.0], r=[1.0], mean=[0.0], cov=[1.0])
-    text = matlab_function(Choice("ekf", {}, {}), model, "mine", None)
-    assert "%   Why: a function that is written out must" in text and "test_matlab.py, line" in text
-    assert "m.f and m.h are yours to add" in text and "@transition" not in text and "m.dt" not in text
-
-
-def test_names_are_those_that_matlab_takes():
-    assert function_name("ekf", "auv:motion") == "ekf_auv_motion" and function_name("1.csv") == "f_1_csv"

@@ -32,13 +32,13 @@ CHOICE = untuned_choice("kf", PROBLEM)
         (
             "likelihood",
             "log L",
-            "costs 3 of log L on the training blocks: the best trial of all has -56, the best in",
+            "costs 3 of log L on the training blocks: the best trial of all has -56, the best",
         ),
         ("log-score", "log score", "costs 3 of log score on the training blocks: the best trial of all has -56, "),
         (
             "score",
             "score",
-            "costs 5.4 % of score on the training blocks: the best trial of all has 56, the best in ",
+            "costs 5.4 % of score on the training blocks: the best trial of all has 56, the best in",
         ),
     ],
 )

@@ -36,29 +36,27 @@ def by_label(name):
     return found
 
 
-def test_the_page_has_every_table():
+def test_pages_have_every_table_with_half_intervals_and_full_q_where_they_say_so():
     assert set(TABLES) < set(re.findall(r"<!-- table (\w+) -->", PAGE))
     scenarios = [row[0].strip("`") for row in printed("filters_motion")]
     assert scenarios == [name for name in MOTION for _ in FILTERS]
     assert {row[0].strip("`") for row in printed("filters_navigation")} <= set(NAVIGATION)
+    assert about(Interval(21.374, 20.47, 22.27)) == "21.37 ± 0.90"
+    assert about(Interval(161160.6, 112706.8, 217080.6)) == "161000 ± 52000"
+    assert [plan.full_q for plan in plans().values()] == [False, True, False, False, False, False]
+    assert all("`ekf` + " not in name for name in plans()) and len(UNKNOWNS) == 5
 
 
-def test_there_members_cost_consistency_until_300_and_more():
+def test_members_cost_consistency_until_300_relaxation_cures_50_and_nothing_at_1_khz():
     found = by_label("filters_members")
     for label, nees in {"ekf": 8.0, "ukf": 8.0}.items():
         assert found[label][0][0] == pytest.approx(nees, abs=0.15)
     for size, nees in {50: 21.0, 100: 13.0, 200: 10.2, 300: 9.5}.items():
         assert found[f"enkf {size}"][0][0] == pytest.approx(nees, rel=0.08)
-
-
-def test_there_a_transform_with_relaxation_is_consistent_enough_with_50_members():
     found = by_label("filters_cures")
     for label in ("etkf 50 relaxation 0.45", "etkf 50 inflation 1.02 relaxation 0.3"):
         (nees, half), nis, ratio = found[label]
         assert nees + half < 10 and BAND[0] < nis < BAND[1] and ratio < 1.15
-
-
-def test_there_nothing_cures_50_members_at_1_khz():
     found = by_label("filters_fast")
     for label, (nees, _), _, ratio in ((label, *rest) for label, rest in found.items()):
         if " 50" in label:
@@ -83,11 +81,6 @@ def test_restless_angles_are_the_model_s_and_no_other_number_changes():
     before, after = known.model.process_noise_cov.diagonal(), changed.model.process_noise_cov.diagonal()
     assert after[6:].tolist() == [1e-6, 1e-6] and after[:6].tolist() == before[:6].tolist()
     assert changed.size == known.size == 50
-
-
-def test_numbers_are_printed_with_half_their_interval():
-    assert about(Interval(21.374, 20.47, 22.27)) == "21.37 ± 0.90"
-    assert about(Interval(161160.6, 112706.8, 217080.6)) == "161000 ± 52000"
 
 
 def test_only_the_table_that_is_asked_for_is_made(tmp_path, monkeypatch):
@@ -124,8 +117,3 @@ def test_lift_and_voltage_gain_as_states_buy_what_no_q_can():
     assert [row[0] for row in rows] == ["`ekf`, scaled default", *names]
     assert ratios[0] == 1.0 and 0.25 < ratios[3] < ratios[2] < 0.6 < ratios[1] < 1.0  # by the baselines alone
     assert float(rows[2][4]) < 3.0 < 10.0 < float(rows[0][4])  # the NEES says that no covariance holds a bias
-
-
-def test_a_full_q_is_searched_where_the_table_says_so():
-    assert [plan.full_q for plan in plans().values()] == [False, True, False, False, False, False]
-    assert all("`ekf` + " not in name for name in plans()) and len(UNKNOWNS) == 5

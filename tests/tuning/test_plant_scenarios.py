@@ -268,11 +268,14 @@ def test_anyone_can_compute_a_scale_anew_and_that_of_the_published_tunnel_is_the
     assert capsys.readouterr().out == "published_tunnel: (0.8066, 0.1457), stored (0.8066, 0.1457)\n"
 
 
-def test_scenarios_with_the_same_gaussian_core_share_its_scale():
+def test_scales_are_shared_where_the_core_is_and_untuned_is_one_per_cent_of_each_range():
     for name in ("mismatch", "ambient", "outliers", "dropout"):
         assert SCENARIOS[name].scale == NOMINAL.scale
     assert SCENARIOS["deadband"].scale == SCENARIOS["quantised"].scale
     assert dict(SCENARIOS["mismatch"].parameter_factors) == {"lift_coefficient": 1.15, "voltage_gain": 0.95}
+    # 24 V: 387.515 rad/s and 7.347 m/s, so the ranges over +-24 V are twice that
+    np.testing.assert_allclose(np.sqrt(NOMINAL.untuned["process_noise_cov"]), [7.7503, 0.14694], rtol=1e-4)
+    assert NOMINAL.untuned["measurement_noise_cov"] == 0.25
 
 
 def test_where_q_is_singular_a_score_is_skill_against_the_open_loop_that_knows_the_plant(file):
@@ -349,12 +352,6 @@ def test_voltages_hold_their_level_fill_the_range_and_are_cut_off_as_the_env_doe
     assert abs(levels[:, :, 0].mean()) < 5 * 0.245
     assert abs((levels[:, :, 0] ** 2).mean() - 48.0) < 5 * 48.0 * np.sqrt(0.8 / 800)
     assert np.abs(NOMINAL.replace(max_voltage=6.0).data(range(3)).inputs).max() == 6.0
-
-
-def test_untuned_is_one_per_cent_of_each_range_and_the_sheets_noise():
-    # 24 V: 387.515 rad/s and 7.347 m/s, so the ranges over +-24 V are twice that
-    np.testing.assert_allclose(np.sqrt(NOMINAL.untuned["process_noise_cov"]), [7.7503, 0.14694], rtol=1e-4)
-    assert NOMINAL.untuned["measurement_noise_cov"] == 0.25
 
 
 @pytest.mark.parametrize("name", ["mismatch", "published_tunnel", "deadband"])

@@ -276,10 +276,7 @@ def test_a_closed_loop_is_that_of_the_tracking_env_under_pi(name):
         (lambda: MultiSine(periods=(1.0, 0.0)), "periods must be positive, but got 0.0"),
         (lambda: Dwells(zeros=2.0), "zeros must be within plus and minus 1, but got 2.0"),
         (lambda: ClosedLoop(low=1.0, high=0.0), "low must be at most high, but got 1.0 and 0.0"),
-        (
-            lambda: EXCITATIONS.make([{"name": "noise"}]),
-            "each entry of excitation must be a mapping whose name is",
-        ),
+        (lambda: EXCITATIONS.make([{"name": "noise"}]), "entry of excitation must be a mapping whose name is"),
     ],
 )
 def test_wrong_arguments_are_refused_with_the_rule_and_the_value(make, rule):

@@ -271,13 +271,10 @@ def test_units_are_typeset_in_words_and_tables(unit, page):
     assert page in Table("", ["", f"q [{unit}]"], [["a", "1"]]).html()
 
 
-def test_a_number_that_rounds_to_zero_has_no_minus():
+def test_numbers_that_round_to_zero_have_no_minus_and_small_errors_powers_of_ten():
     values = (-0.3, "+.0f"), (-0.004, ".2f"), (-1.2, "+.0f"), (nan, "")
     cells = [unless_blank(value, form) for value, form in values]
     assert cells == ["0", "0.00", "-1", ""]
-
-
-def test_small_errors_on_a_terminal_have_powers_of_ten():
     value = Interval(8.59e-6, 8.37e-6, 8.81e-6)
     assert about(value, 8) == "8.59e-06 ±2e-07" and limit_cell(7.5e-6, 8) == "7.50e-06"
     assert about(value._replace(value=0.1, low=0.09, high=0.11), 4) == "0.1000 ±0.0100"

@@ -181,22 +181,16 @@ def test_resolution_of_values(values, step):
     assert resolution_of_values(values) == pytest.approx(step, rel=1e-6)
 
 
-def test_rounding_that_looks_like_signal_is_said():
+def test_rounding_is_said_where_it_looks_like_signal():
     level = np.round(20.0 + 2.0 * np.sin(ROWS / 700.0), 1)
     fit = tuning.fit(level, dt=1.0, model="local-trend")
     text = " ".join(fit.sentences())
     assert fit.r < 1e-4
     assert "z changes in steps of 0.1, and 9" in text and "R is at least 0.1^2/12 = 0.000833" in text
     assert fit.jumps and "jumps" not in text and fit.as_dict()["jumps"] == []  # by one step of the resolution each
-
-
-def test_rounding_below_the_noise_is_not():
     fit = tuning.fit(NOISY, dt=1.0, model="constant")
     assert "in steps of" not in " ".join(fit.sentences())
     assert fit.r == pytest.approx(0.09, rel=0.2)
-
-
-def test_a_state_of_charge_has_all_its_rows():
     fit = tuning.fit(CHARGE, dt=1.0, model="constant-velocity")
     assert len(fit.column.values) == 1000 and "repeats are left out" not in str(fit)
     assert "R is at least 1^2/12 = 0.0833" in " ".join(fit.sentences())

@@ -168,13 +168,10 @@ def sentences(*columns):
     return " ".join(fit.sentences())
 
 
-def test_two_sensors_of_one_quantity_are_said():
+def test_two_sensors_of_one_quantity_are_said_and_axes_with_own_signals_are_not():
     text = sentences(LEVEL + A, LEVEL + B)
     assert "z_1 and z_2 differ by their noise alone" in text and "filter both with one state" in text
     assert "by their noise" in sentences(LEVEL + A, LEVEL + B + 7.0)  # with a bias
-
-
-def test_axes_with_signals_of_their_own_have_not():
     missing = np.where(np.arange(300) % 2 == 0, np.nan, OTHER + B)
     assert "by their noise" not in sentences(LEVEL + A, OTHER + B)
     assert "by their noise" not in sentences(LEVEL + A, missing)

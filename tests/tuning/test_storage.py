@@ -124,9 +124,10 @@ def test_patience_has_an_end(flaky, monkeypatch):
         study.set_user_attr("a", 1)
 
 
-def test_a_driver_that_is_missing_is_named_with_the_extra_that_brings_it():
+def test_a_missing_driver_and_a_proxy_without_a_host_are_named():
     with pytest.raises(ValueError, match=r"but got postgresql\+pg8000://host/s: .*: pip install '\.\[db\]' in"):
         database.open_storage("postgresql+pg8000://host/s")
+    refused("got grpc://:13000: it names no host", database.open_storage, "grpc://:13000")
 
 
 def test_several_workers_on_sqlite_are_warned(monkeypatch):
@@ -134,10 +135,6 @@ def test_several_workers_on_sqlite_are_warned(monkeypatch):
     plan, console = Plan("ekf", (find_problem("nominal"),)), Console(quiet=True)
     with pytest.warns(UserWarning, match="so 2 workers wait"), pytest.raises(ValueError, match="stor"):
         run_tuning(plan, 3, console, "sqlite:///s.db", workers=2)
-
-
-def test_a_proxy_must_have_a_host():
-    refused("got grpc://:13000: it names no host", database.open_storage, "grpc://:13000")
 
 
 @pytest.mark.slow
@@ -312,11 +309,7 @@ def test_scheme_host_and_database_are_shown_and_nothing_else(storage, shown):
         ),
         ("grpc://tuner:secret/x", "Port could not be cast to integer value as 'secret'", "value as '***'"),
         ("mysql://tuner:p%40ss@host/s", "access denied with p@ss or p%40ss, passed", "with *** or ***, passed"),
-        (
-            "postgresql://host/s?password=hush",
-            'invalid dsn: "host=host password=hush"',
-            '"host=host password=***"',
-        ),
+        ("postgresql://host/s?password=hush", 'dsn: "host=host password=hush"', '"host=host password=***"'),
         ("postgresql://tuner:pw@host/s", 'authentication failed for user "tuner"', 'for user "tuner"'),
         ("out/studies.journal", "a journal: out", "a journal: out"),
     ],
@@ -334,6 +327,7 @@ SECRET = [
     "grpc://tuner:secret/s",
     "nonsense://tuner:secret@localhost/s",
     "postgresql:/tuner:secret@localhost/s",
+    "sqlite:////no/such/folder/x.db",
 ]
 
 

@@ -244,15 +244,12 @@ def test_a_damaged_file_is_as_none(ask, tmp_path, content):
     assert ask().tolist() == [0.1, 1e-300] and ask.computed == 2
 
 
-def test_without_a_folder_they_last_as_long_as_the_process(ask, tmp_path):
+def test_without_a_folder_or_where_they_are_not_finite_numbers_last_as_long_as_the_process(ask, tmp_path):
     ask(folder=None), ask(folder=None, fresh=False)
     assert ask.computed == 1
     blocked = tmp_path / "file"
     blocked.write_text("")
     assert ask(folder=blocked / "below").tolist() == [0.1, 1e-300] and os.path.isfile(blocked)
-
-
-def test_numbers_that_are_not_finite_are_not_kept(ask):
     assert np.isnan(ask(value=(np.nan, 1.0))).any() and ask().tolist() == [0.1, 1e-300]
 
 

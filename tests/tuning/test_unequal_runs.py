@@ -398,16 +398,13 @@ def test_a_problem_s_object_is_checked_as_one_that_is_found_by_its_name(use):
     refused("states of problem linear-3 must be finite, but those of seed 0 are not", use, Broken())
 
 
-def test_what_is_off_in_later_seeds_is_refused_where_these_are_drawn():
+def test_what_is_off_in_later_seeds_is_refused_there_and_an_object_is_checked_once():
     for use in (
         lambda: tuning.evaluate("kf", problem=Broken(2), seeds=4, progress=False),
         lambda: tuning.compare(["kf"], Broken(2), seeds=4, progress=False),
         lambda: tuning.tune(Broken(500_000), "kf", trials=1, progress=False),
     ):
         refused("states of problem linear-3 must be finite, but those of seed", use)
-
-
-def test_an_object_is_checked_once():
     problem = Broken(first=10**9)
     for _ in range(2):
         Plan("kf", (problem,)).checked()

@@ -249,7 +249,4 @@ def test_a_study_of_an_estimator_whose_code_changed_is_refused(tmp_path, monkeyp
     second = plan_of(tmp_path, 2.0, monkeypatch)
     refused("the code of of_somebody:make is not what 'mine' was made with", open_study, "mine", second, storage)
     sys.modules.pop("of_somebody", None)
-
-
-def test_a_study_of_a_filter_has_the_identity_that_it_had():
     assert "estimators" not in Plan("kf", (LinearProblem(),)).identity

@@ -390,7 +390,7 @@ def test_every_second_trial_is_near_the_best_one_within_its_range_and_the_same_e
     assert is_local(plan, 11) and not is_local(plan, 12) and not is_local(plan._replace(sampler="random"), 11)
 
 
-def test_own_numbers_are_evaluated_and_compared():
+def test_own_numbers_are_evaluated_compared_and_written_so_that_they_differ():
     problem = pair()
     model = problem.model(process_noise_cov=[1.0, 1.0, 1.0])
     found = tuning.evaluate(make_filter("kf", model), problem, seeds=10, progress=False)
@@ -402,8 +402,5 @@ def test_own_numbers_are_evaluated_and_compared():
     with pytest.raises(ValueError, match="own numbers must be of the model of"):
         tuning.evaluate(altitude_problem.model(), problem, progress=False)
     refused("a filter or model must come with a problem", tuning.evaluate, model, progress=False)
-
-
-def test_two_numbers_are_written_so_that_they_differ():
     assert apart(0.00412341, 0.00412343) == ["0.00412341", "0.00412343"] and apart(1.0, 2.0) == ["1", "2"]
     assert apart(0.5, 0.5) == ["0.5", "0.5"]

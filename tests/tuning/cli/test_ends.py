@@ -107,9 +107,11 @@ def test_ctrl_c_while_code_is_compiled_is_one_line(tmp_path):
     assert not (tmp_path / "run.csv").exists()
 
 
-def test_ctrl_c_when_all_is_done_is_one_line():
+def test_ctrl_c_at_the_end_is_one_line_or_changes_nothing():
     done = process(AT_THE_END, "thruster", stdout=subprocess.DEVNULL)
     assert (done.returncode, done.stderr) == (130, INTERRUPTED)
+    done = process(AFTER_HANDLERS, "thruster", "--version", stdout=subprocess.PIPE)
+    assert (done.returncode, done.stderr, done.stdout.split()[0]) == (0, "", "thruster-env")
 
 
 @pytest.mark.parametrize("arguments", slow_but(["filters kf", "filters kf --json -", "--help"], ["filters kf"]))
@@ -118,11 +120,6 @@ def test_ctrl_c_while_results_are_printed_leaves_them_whole(arguments):
     done = process(AT_FIRST_OUTPUT, "thruster", arguments, stdout=subprocess.PIPE)
     assert (done.returncode, done.stderr, done.stdout.rstrip()) == (130, INTERRUPTED, whole.stdout.rstrip())
     assert whole.returncode == 0 and len(whole.stdout) > 200
-
-
-def test_ctrl_c_after_python_has_put_its_handlers_away_changes_nothing():
-    done = process(AFTER_HANDLERS, "thruster", "--version", stdout=subprocess.PIPE)
-    assert (done.returncode, done.stderr, done.stdout.split()[0]) == (0, "", "thruster-env")
 
 
 def test_a_second_ctrl_c_ends_a_command_whose_output_nobody_reads():

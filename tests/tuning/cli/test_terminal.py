@@ -36,14 +36,11 @@ def test_what_is_random_has_a_seed_and_all_write_json(thruster):
         assert "--json " in thruster(*name.split(), "--help").stdout
 
 
-def test_names_are_taken_in_any_case(as_json):
+def test_names_are_taken_in_any_case_and_in_python_told_apart_by_it(as_json):
     found = as_json("inspect", "--preset", "T200")
     assert found["preset"] == "t200"
     assert as_json("filters", "EnKF")["filters"][0]["name"] == "enkf"
     assert as_json("filters", "ekf", "--problem", "MisMatch")["problem"] == "mismatch"
-
-
-def test_names_in_python_are_told_apart_by_case():
     with pytest.raises(ValueError, match="filter must be one of kf, ekf, but got 'EKF'; did you mean 'ekf'?"):
         one_of("filter", "EKF", iter(["kf", "ekf"]))
     assert meant(3, ["ekf"]) == meant("", ["ekf"]) == ""

@@ -57,13 +57,10 @@ def test_chances_are_those_of_the_bootstrap(lengths):
     assert chance_if_no_worse(base, worse) == pytest.approx(1.0 - chance_if_no_worse(worse, base), rel=1e-9)
 
 
-def test_a_third_state_that_does_not_count_changes_nothing():
+def test_ends_of_chances_and_a_state_that_does_not_count():
     a, b = pair(3)
     other = Errors(a.mean_squares * [1.0, 1.0, 50.0], a.scale)
     assert chance_if_no_worse(other, b) == chance_if_no_worse(a, b)
-
-
-def test_ends_of_chances():
     a, b = pair(5)
     assert chance_if_no_worse(a, a) == 1.0
     assert chance_if_no_worse(Errors(b.mean_squares * 1.21, b.scale), b) == 0.0  # 10 % worse in each run alike
@@ -71,10 +68,11 @@ def test_ends_of_chances():
     refused("a p-value needs at least two runs, but got 1", chance_if_no_worse, *pair(5, runs=1))
 
 
-def test_holms_procedure_is_that_of_his_paper():
+def test_holms_procedure_is_that_of_his_paper_and_levels_are_the_pages():
     assert holm([0.01, 0.04, 0.03, 0.005], 0.05) == [True, False, False, True]  # 0.0125, 0.0167, then 0.03 > 0.025
     assert holm([0.02, 0.02], 0.05) == [True, True] and holm([0.03, 0.03], 0.05) == [False, False]
     assert holm([]) == []
+    assert users.LEVEL == 0.05 and users.TAIL == 0.025
 
 
 def test_the_verdict_counts_neither_the_oracle_nor_the_same_filter():
@@ -138,7 +136,3 @@ def test_problems_that_do_not_fit_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(users, "PANEL", ("no_such_module:problem",))
     with pytest.raises(ValueError, match="must be found in tests/users of the working folder, a checkout"):
         found_problems(["no_such_module:problem"])
-
-
-def test_levels_are_those_that_the_page_says():
-    assert users.LEVEL == 0.05 and users.TAIL == 0.025

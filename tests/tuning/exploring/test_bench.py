@@ -229,12 +229,9 @@ def test_unchanged_ones_leave_the_problem_as_it_is(name):
     assert disturbed(problem, values_of(problem)) is problem
 
 
-def test_a_scenario_without_its_disturbance_is_the_nominal_one():
+def test_disturbances_make_a_scenario_of_the_nominal_one_and_that_of_it():
     nominal, calm = find_problem("nominal"), disturbed(find_problem("outliers"), {"outliers": 0.0})
     assert np.array_equal(calm.data(SEEDS).measurements, nominal.data(SEEDS).measurements)
-
-
-def test_what_is_added_to_the_nominal_one_makes_the_scenario():
     nominal = find_problem("nominal")
     made = disturbed(nominal, {"outliers": 0.05, "outlier_size": 20.0})
     assert made.name == "nominal (changed)"
@@ -243,14 +240,11 @@ def test_what_is_added_to_the_nominal_one_makes_the_scenario():
     assert plain(wider.amplifier) == plain(find_problem("deadband").amplifier)
 
 
-def test_other_arguments_of_an_effect_stay():
+def test_other_arguments_of_an_effect_stay_and_sizes_are_of_each_channels_noise():
     problem = disturbed(find_problem("mixed"), {"outliers": 0.1, "outlier_size": 40.0})
     outliers, dropout = plain(problem.sensors)["thrust"]
     assert outliers == {"name": "outliers", "std": 20.0, "probability": 0.1}
     assert dropout == {"name": "dropout", "probability": 0.1, "mean_length": 5}
-
-
-def test_sizes_are_those_of_each_channels_noise():
     problem = disturbed(find_problem("auv:motion"), {"bias": 2.0})
     found = {channel: chain[0]["std"] for channel, chain in plain(problem.sensors).items()}
     assert found["u"] == pytest.approx(0.04) and found["phi"] == pytest.approx(0.01)
@@ -284,11 +278,8 @@ def test_a_scene_moves_knobs_that_there_are(scene):
     assert moved <= set(scene.knobs)
 
 
-def test_there_are_six():
+def test_there_are_six_scenes_and_along_the_ridge_every_estimate_stays():
     assert list(SCENES) == ["ridge", "lag", "outliers", "tangent", "ensemble", "constant"]
-
-
-def test_along_the_ridge_every_estimate_stays():
     before, after = (SCENES["ridge"].view(step) for step in (0, 1))
     assert after.estimate[:, 200:] == pytest.approx(before.estimate[:, 200:], rel=0.05, abs=0.2)
     assert after.deviation[:, 200:] == pytest.approx(30**0.5 * before.deviation[:, 200:], rel=0.1)
@@ -358,13 +349,14 @@ def test_figures_are_those_of_training_and_held_out_blocks(of_logs):
     assert not any(name.startswith("RMSE") for name in view.figures)
 
 
-def test_a_map_and_a_study_minimise_the_negative_log_likelihood(of_logs):
+def test_a_map_and_a_study_of_logs_minimise_the_negative_log_likelihood(of_logs):
     view, found = of_logs.view({"R": 250.0}), of_logs.map({}, "Q11", "R", 2)
     low = of_logs.knobs[0].low
     expected = -of_logs.view({"R": 250.0, "Q11": low}).figures["log-likelihood"].value
     assert found.score[1, 0] == pytest.approx(expected, rel=1e-12)
     first = next(iter(of_logs.study({"R": 250.0}, 1)))
     assert first.score == pytest.approx(-view.figures["log-likelihood"].value, rel=1e-12)
+    assert not any(knob.group == "disturbances" for knob in of_logs.knobs)
 
 
 def test_a_log_with_truth_has_errors_and_log_scores():
@@ -372,10 +364,6 @@ def test_a_log_with_truth_has_errors_and_log_scores():
     view = of_logs.view()
     assert of_logs.has_truth and view.truth.shape == (1, 701, 2) and view.nees.shape == (1, 701)
     assert {"RMSE omega_m", "NEES", "log score", "held-out NEES", "held-out log score"} <= set(view.figures)
-
-
-def test_a_log_has_no_disturbances(of_logs):
-    assert not any(knob.group == "disturbances" for knob in of_logs.knobs)
 
 
 def test_logs_on_their_own_stamps_are_drawn_over_these():

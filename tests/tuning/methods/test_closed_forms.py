@@ -139,10 +139,12 @@ def test_draws_by_gradients_have_the_mean_of_a_random_walk_and_end_with_the_budg
     np.testing.assert_array_equal(few[1], few[2])
 
 
-def test_without_nutpie_one_line_says_what_to_install(monkeypatch):
+def test_methods_lack_nutpie_or_variances_in_one_line(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ValueError, match="method 'nuts' needs nutpie, which is not installed: pip install nutpie"):
         find_method("nuts").run("nuts", task_of(linear()))
+    task = task_of(linear(), options={"prior": True})
+    refused("EM tunes only variances in Q and R, but P0 is tuned, too", find_method("em").run, "em", task)
 
 
 MOTIVATING = {  # of the ALS toolbox: Odelson, Rajamani, Rawlings
@@ -419,8 +421,3 @@ def test_em_ends_where_the_gradient_of_the_likelihood_ends(name, options):
         find_method(method).run(method, task)
         levels.append(values_of(task.best.filter(problem), task.data[0], problem.scale).log_likelihood)
     assert levels[0] == pytest.approx(levels[1], rel=1e-6)
-
-
-def test_em_refuses_numbers_that_are_no_variances():
-    task = task_of(linear(), options={"prior": True})
-    refused("EM tunes only variances in Q and R, but P0 is tuned, too", find_method("em").run, "em", task)

@@ -126,12 +126,16 @@ def test_a_damaged_file_is_one_clear_line_and_nothing_is_overwritten(name, how, 
         assert contents(copied) == before
 
 
-def test_a_damaged_checkpoint_is_refused(copied):
+def test_a_damaged_checkpoint_and_a_folder_of_other_things_are_refused_and_left_alone(copied, tmp_path):
     shutil.rmtree(copied / FINAL)
     damage(find_saved(copied) / "policy.zip", "cut")
     before = contents(copied)
     refused(r"policy.zip must be a whole file as it was saved, but cannot be read", learn, setup_of(), copied)
     assert contents(copied) == before
+    (tmp_path / "thesis.txt").write_text("precious")
+    for folder in (tmp_path, tmp_path / "thesis.txt"):
+        refused("must be new, empty or that of a training, but .* contains other files", learn, setup_of(), folder)
+    assert contents(tmp_path) == {(tmp_path / "thesis.txt").relative_to(tmp_path): b"precious"}
 
 
 @pytest.mark.parametrize("how", ["cut", "noise"])
@@ -159,13 +163,6 @@ def test_a_folder_of_another_setup_is_left_alone(change, named, copied):
     assert contents(copied) == before
 
 
-def test_a_folder_of_other_things_is_left_alone(tmp_path):
-    (tmp_path / "thesis.txt").write_text("precious")
-    for folder in (tmp_path, tmp_path / "thesis.txt"):
-        refused("must be new, empty or that of a training, but .* contains other files", learn, setup_of(), folder)
-    assert contents(tmp_path) == {(tmp_path / "thesis.txt").relative_to(tmp_path): b"precious"}
-
-
 def test_a_policy_needs_the_observation_it_was_trained_on(trained):
     with pytest.raises(ValueError, match="on observe='ekf' must see 4 numbers, but the env shows 2"):
         load(trained / FINAL, make_environments(setup_of("raw"), [0]))
@@ -178,7 +175,7 @@ def test_unknown_names_and_wrong_numbers_are_refused():
         ({"steps": 0}, "steps must be"),
         (
             {"observe": "raw", "filter_arguments": {"process_noise_cov": 1}},
-            "with an observation set that has a filter, but got",
+            "an observation set that has a filter, but",
         ),
     ]:
         refused(line, make_configuration, "tracking", find_scenario("nominal"), **{"observe": "ekf", **arguments})
