@@ -137,9 +137,7 @@ def test_a_part_of_a_training_run_cannot_be_held_out():
     log_problem([still], held_out=again, model=MODEL)
 
 
-@pytest.mark.parametrize(
-    ("rows", "lead"), [((24,), 2), ((50,), 12), ((21, 20, 22), 6), ((20,) * 9, 12), ((199,), 25)]
-)
+@pytest.mark.parametrize("rows, lead", [((24,), 2), ((50,), 12), ((21, 20, 22), 6), ((20,) * 9, 12), ((199,), 25)])
 def test_short_logs_have_shorter_lead_ins_and_blocks_and_it_is_said(rows, lead):
     problem = LogProblem(logs_of(*(count - 1 for count in rows)), GUESS)
     assert problem.parts.lead == problem.first_scored_step == lead

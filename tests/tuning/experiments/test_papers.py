@@ -164,20 +164,6 @@ def test_a_seed_fixes_the_result():
         assert (a.rmse != c.rmse).all()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "rule"),
-    [
-        ({"case": "ducted"}, "case must be one of"),
-        ({"q": 0.0}, "q must be positive"),
-        ({"runs": 1}, "runs must be a whole number of at least 2"),
-        ({"members": 1}, "members must be a whole number of at least 2"),
-        ({"seed": -1}, "seed must be a whole number of at least 0"),
-    ],
-)
-def test_wrong_arguments(arguments, rule):
-    refused(rule, thruster_papers.compare, **{"case": "tunnel", "q": 0.5, **arguments})
-
-
 def test_json_on_standard_output_is_whole(as_json):
     data = as_json("reproduce", "thruster-papers", "--runs", 4, "--members", 5, "--seed", 3)
     assert data["settings"] == {"runs": 4, "members": 5, "seed": 3}

@@ -411,9 +411,7 @@ def _second_choice(task, name):
     find_method(name).run(name, task)
 
 
-@pytest.mark.parametrize(
-    ("name", "options"), [("em", {}), ("squarem", {}), ("em", {"full_q": True, "full_r": True})]
-)
+@pytest.mark.parametrize("name, options", [("em", {}), ("squarem", {}), ("em", {"full_q": True, "full_r": True})])
 def test_em_ends_where_the_gradient_of_the_likelihood_ends(name, options):
     problem, levels = linear(runs=6, steps=80), []
     for method in (name, LIKELIHOOD):

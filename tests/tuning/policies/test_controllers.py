@@ -137,11 +137,6 @@ def test_a_policy_learns_and_is_scored(task, observe, tmp_path):
 
 
 @pytest.mark.slow
-def test_sac_learns_too(tmp_path):
-    assert learn(vehicle_setup("depth", "ekf", "sac"), tmp_path / "policy").steps == 256
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("observe", ["raw", "ekf", "true"])
 def test_pd_in_number_is_pd_on_a_single_env(observe):
     setup = vehicle_setup("depth", observe)

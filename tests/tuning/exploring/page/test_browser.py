@@ -157,7 +157,7 @@ def test_a_study_is_stopped(page):
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"), [("tuned", "tuned.json"), ("python", "explored.py"), ("png", "explored.png")]
+    "kind, name", [("tuned", "tuned.json"), ("python", "explored.py"), ("png", "explored.png")]
 )
 def test_what_is_seen_is_kept_as_a_file(page, kind, name, tmp_path):
     page.select_option("#kind", kind)

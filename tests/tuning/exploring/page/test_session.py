@@ -189,9 +189,7 @@ def test_a_study_tells_its_trials_and_stops(tab):
     assert len(tab.session.trials) < 500
 
 
-@pytest.mark.parametrize(
-    ("kind", "begins"), [("python", "from filters"), ("command", "thruster"), ("svg", "<?xml")]
-)
+@pytest.mark.parametrize("kind, begins", [("python", "from filters"), ("command", "thruster"), ("svg", "<?xml")])
 def test_what_is_seen_is_exported(tab, kind, begins):
     tab.ask("hello")
     tab.ask("export", kind=kind)
