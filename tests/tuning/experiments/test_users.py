@@ -69,7 +69,7 @@ def test_ends_of_chances_and_a_state_that_does_not_count():
 
 
 def test_holms_procedure_is_that_of_his_paper_and_levels_are_the_pages():
-    assert holm([0.01, 0.04, 0.03, 0.005], 0.05) == [True, False, False, True]  # 0.0125, 0.0167, then 0.03 > 0.025
+    assert holm([0.015, 0.04, 0.03, 0.005], 0.05) == [True, False, False, True]  # 0.0125, 0.0167, 0.03 > 0.025
     assert holm([0.02, 0.02], 0.05) == [True, True] and holm([0.03, 0.03], 0.05) == [False, False]
     assert holm([]) == []
     assert users.LEVEL == 0.05 and users.TAIL == 0.025
