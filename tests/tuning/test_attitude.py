@@ -14,7 +14,7 @@ from tests.data.broad import RATE, broad
 from thruster_env.logs.log import piece_of
 from thruster_env.logs.read import read_log
 from tuning.cli.main import main
-from tuning.logs.allan import allan_deviation, flicker_noise, noise_of
+from tuning.logs.allan import _fit, allan_deviation, flicker_noise, noise_of
 
 
 def table_of(trial):
@@ -132,6 +132,12 @@ def test_closed_forms_of_white_noise_walks_and_flicker():
         taus, deviations = allan_deviation(values, SAMPLE)
         some_samples = (taus > 4.0 * SAMPLE) & (taus < 10.0)
         np.testing.assert_allclose(deviations[some_samples], expected(taus[some_samples]), rtol=0.12)
+
+
+def test_the_fit_finds_the_terms_of_a_curve():
+    taus, terms = np.geomspace(SAMPLE, 100.0, 40), np.array([4e-6, 1e-8, 9e-8])
+    curve = terms[0] / taus + terms[1] * 2.0 * np.log(2.0) / np.pi + terms[2] * taus / 3.0
+    np.testing.assert_allclose(_fit(taus, np.sqrt(curve), 1200.0), terms, rtol=1e-6)
 
 
 def test_the_noise_of_a_record_lies_in_its_intervals():

@@ -155,6 +155,7 @@ def test_a_lead_in_that_is_given_stays_and_logs_that_were_not_read_have_no_recor
 @pytest.mark.parametrize(("steps", "count"), [((1500, 1500, 1500), 72), ((900, 130, 400), 51), ((4000,), 73)])
 def test_blocks_of_all_logs_have_one_length_and_few_rows_are_left_out(steps, count):
     parts = parts_of(logs_of(*steps), sizes=True)
+    assert not parts_of(logs_of(*steps)).sizes
     lengths = {block.rows for block in parts.blocks}
     assert len(lengths) == 1 and len(parts.blocks) == count
     assert sum(steps) - 50 * len(steps) - count * (lengths.pop() - 50) <= 0.1 * sum(steps)

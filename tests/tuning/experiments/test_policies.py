@@ -6,14 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.filters.checks import refused
-
 pytest.importorskip("stable_baselines3")
 
-import pytest
 from scipy.stats import t as student
 from scipy.stats import ttest_ind
 
+from tests.filters.checks import refused
 from tuning.experiments import policies as runs
 from tuning.experiments.policies import (
     BEST,

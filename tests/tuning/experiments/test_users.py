@@ -105,6 +105,18 @@ def test_an_error_is_kept_and_the_others_go_on(monkeypatch, tmp_path):
     assert users.rows_of([found])[0][-1] == "failed" and "failed: Matrix" in users.sentences([found])[-1]
 
 
+def test_ctrl_c_keeps_what_is_done(monkeypatch, tmp_path):
+    def second_is_interrupted(problem, *arguments):
+        if "battery" in problem.name:
+            raise KeyboardInterrupt
+        return case()
+
+    monkeypatch.setattr(users, "tuned_case", second_is_interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_panel(Panel(users.PANEL[:2], ("ekf",), 2), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["altitude-ekf-2-seed0.json"]
+
+
 @pytest.mark.slow
 def test_the_quick_study_goes_on_where_it_was(as_json, thruster, tmp_path, monkeypatch):
     arguments = "reproduce", "users", "--quick", "--trials", "3", "--out", str(tmp_path)

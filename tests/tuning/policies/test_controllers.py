@@ -6,17 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.filters.checks import refused
-
 pytest.importorskip("sb3_contrib")
 
-from dataclasses import replace
-
 import gymnasium as gym
-import numpy as np
-import pytest
 
 import thruster_env.auv  # noqa: F401 - registers the envs
+from tests.filters.checks import refused
 from tests.learners import COPIES, LIMIT, SMALL, learn, setup_of, short_episodes  # noqa: F401 - some are fixtures
 from tuning.policies.environments import make_environments, make_single
 from tuning.policies.saved import classical_policy, configuration_from_json, find_saved, load, run_episodes, score

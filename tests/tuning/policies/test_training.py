@@ -1,27 +1,21 @@
 """Learning: every arm and algorithm; it goes on after an interruption, a kill or a full disk; saved policies."""
 # ruff: noqa: F811 - fixtures come by import and go by name
 
+import errno
 import os
+import shutil
 import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.filters.checks import refused
-
 pytest.importorskip("sb3_contrib")
 pytest.importorskip("stable_baselines3")
 
-import errno
-import os
-import shutil
-
-import numpy as np
-import pytest
-
+from tests.filters.checks import refused
 from tests.fuzz.checkpoints import kill_training
-from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures  # noqa: E402, F401 - one is a fixture  # noqa: F401 - some are fixtures
+from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures
 from tuning.policies import saved
 from tuning.policies.algorithms import ALGORITHMS, OBSERVATION_SETS
 from tuning.policies.environments import make_environments

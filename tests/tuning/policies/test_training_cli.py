@@ -3,23 +3,17 @@
 
 import importlib.util
 import json
-import sys
-
-import numpy as np
-import pytest
-
-from tests.filters.checks import refused
-
-pytest.importorskip("sb3_contrib")
-
-import importlib.util
 import shutil
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.learners import COPIES, LIMIT, SMALL, contents, copied, learn, setup_of, short_episodes, trained  # noqa: F401 - some are fixtures  # noqa: F401 - some are fixtures
+pytest.importorskip("sb3_contrib")
+
+from tests.filters.checks import refused
+from tests.learners import COPIES, LIMIT, SMALL, contents, copied, learn, setup_of, short_episodes, trained  # noqa: F401 - some are fixtures
 from tuning.plants.thruster import find_scenario
 from tuning.policies.algorithms import ALGORITHMS, check_installed
 from tuning.policies.environments import make_environments
@@ -132,10 +126,12 @@ def test_a_damaged_checkpoint_and_a_folder_of_other_things_are_refused_and_left_
     before = contents(copied)
     refused(r"policy.zip must be a whole file as it was saved, but cannot be read", learn, setup_of(), copied)
     assert contents(copied) == before
-    (tmp_path / "thesis.txt").write_text("precious")
-    for folder in (tmp_path, tmp_path / "thesis.txt"):
+    thesis = tmp_path / "full" / "thesis.txt"
+    thesis.parent.mkdir()
+    thesis.write_text("precious")
+    for folder in (thesis.parent, thesis):
         refused("must be new, empty or that of a training, but .* contains other files", learn, setup_of(), folder)
-    assert contents(tmp_path) == {(tmp_path / "thesis.txt").relative_to(tmp_path): b"precious"}
+    assert contents(tmp_path / "full") == {thesis.relative_to(thesis.parent): b"precious"}
 
 
 @pytest.mark.parametrize("how", ["cut", "noise"])
@@ -243,11 +239,11 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "line"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+@pytest.mark.parametrize(("arguments", "line"), BAD, ids=[arguments for arguments, _ in BAD])
 def test_a_users_mistake_is_one_clear_line(arguments, line, thruster, copied, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("precious")
     before = contents(tmp_path)
-    done = thruster(*arguments)
+    done = thruster(*arguments.split())
     assert done.returncode == 2 and line in done.stderr and "Traceback" not in done.stderr
     assert contents(tmp_path) == before

@@ -1,33 +1,30 @@
 """Who gets an answer from the server of the page; where `tuning.explore` begins and what it refuses."""
 
 import asyncio
+import html
 import http.client
 import os
+import re
 import socket
+import stat
 import subprocess
 import sys
+import urllib.error
+import urllib.request
+import webbrowser
 from threading import Thread
 
 import pytest
 
-from tests.filters.checks import refused
-
 pytest.importorskip("bokeh")
 
-import html
-import re
-import stat
-import urllib.error
-import urllib.request
-import webbrowser
-
-import pytest
 from bokeh.models import ColumnDataSource, Div
 from bokeh.util.token import generate_jwt_token
 from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 import tuning
+from tests.filters.checks import refused
 from tests.linear_problem import LinearProblem
 from tuning.api import explore
 from tuning.api.explore import _forward
