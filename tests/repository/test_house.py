@@ -37,23 +37,42 @@ OF_TENSORS = "filters/tensors/", "filters/learned/", "tuning/learning.py", "thru
 
 
 @cache
-def tree_of(path):
-    return ast.parse(path.read_text(encoding="utf-8"))
+def nodes_of(path):
+    """The nodes of a file's syntax tree that tests read: a walk takes longer than all that they ask."""
+    kinds = ast.Import | ast.ImportFrom | ast.FunctionDef | ast.ClassDef | ast.arg | ast.Call | ast.Attribute
+    nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+    return [
+        node
+        for node in nodes
+        if isinstance(node, kinds) or (isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
+    ]
 
 
 @cache
-def imports_of(path, source=None):
-    """Modules that a file imports, anywhere in it, by full name: `from a import b` gives a and a.b."""
-    found = set()  # a caller must not change it: it is remembered
+def imports_of(path, typed=True):
+    """Modules that a file imports, anywhere in it, by full name: `from a import b` gives a and a.b.
+
+    Those that only a type checker sees can be left out.
+    """
+    modules = set()  # a caller must not change it: it is remembered
     package = path.relative_to(ROOT).parent.parts
-    for node in ast.walk(tree_of(path) if source is None else ast.parse(source)):
+    checked = range(0) if typed else lines_of_types(path.read_text(encoding="utf-8"))
+    for node in nodes_of(path):
+        if not isinstance(node, ast.Import | ast.ImportFrom) or node.lineno in checked:
+            continue
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
+            modules |= {alias.name for alias in node.names}
+        else:
             home = package[: len(package) - node.level + 1] if node.level else ()
             module = ".".join([*home, *([node.module] if node.module else [])])
-            found |= {module} | {f"{module}.{alias.name}" for alias in node.names}
-    return found
+            modules |= {module} | {f"{module}.{alias.name}" for alias in node.names}
+    return modules
+
+
+def lines_of_types(text):
+    """The lines of `if TYPE_CHECKING:`."""
+    block = re.search(r"^if TYPE_CHECKING:\n(?:    .*\n|\n)+", text, flags=re.MULTILINE)
+    return range(0) if block is None else range(*(text.count("\n", 0, end) + 1 for end in block.span()))
 
 
 def packages_of(path):
@@ -105,8 +124,7 @@ def test_imports_go_in_no_circle_of_more_than_two_files_not_even_within_function
     files = {name.removesuffix(".__init__"): path for name, path in files.items()}
     graph = {}
     for name, path in files.items():  # what only a type checker sees is left out, packages as well
-        text = re.sub(r"^if TYPE_CHECKING:\n(?:    .*\n|\n)+", "", path.read_text(), flags=re.MULTILINE)
-        known = imports_of(path, text) & files.keys()
+        known = imports_of(path, typed=False) & files.keys()
         graph[name] = {other for other in known if files[other].name != "__init__.py"} - {name}
     assert sum(map(len, graph.values())) > 1500
     pairs = {frozenset((a, b)) for a in graph for b in graph[a] if a in graph[b]}
@@ -123,7 +141,7 @@ def test_the_index_in_a_package_s_docstring_names_its_files():
     listed = 0
     for path in FILES:
         if path.name == "__init__.py":
-            text = ast.get_docstring(tree_of(path)) or ""
+            text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
             lines = [re.match(r"([a-z_]+(?:, [a-z_]+)*)  +[a-zA-Z`]", line) for line in text.splitlines()]
             names = [name for line in lines if line for name in line[1].split(", ")]
             missing = [
@@ -168,7 +186,7 @@ def opens_bytes(call):
 
 def test_text_files_are_utf_8_whatever_the_terminal_has():
     for path in FILES:
-        for call in (node for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)):
+        for call in (node for node in nodes_of(path) if isinstance(node, ast.Call)):
             opens = isinstance(call.func, ast.Name) and call.func.id == "open" and not opens_bytes(call)
             if opens or getattr(call.func, "attr", "") in ("read_text", "write_text"):
                 assert "encoding" in {keyword.arg for keyword in call.keywords}, f"{path}:{call.lineno}"

@@ -3,7 +3,7 @@
 import ast
 import re
 
-from tests.repository.test_house import ROOT, tree_of
+from tests.repository.test_house import ROOT, nodes_of
 
 PACKAGES = "thruster_env", "filters", "tuning", "docs", "benchmarks", "examples"
 PATHS = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
@@ -19,7 +19,7 @@ def words_to_avoid():
 def defined_in(path):
     """Names that a file defines: its own, functions, parameters, classes, fields."""
     yield path.stem
-    for one in ast.walk(tree_of(path)):
+    for one in nodes_of(path):
         if isinstance(one, ast.FunctionDef | ast.ClassDef):
             yield one.name
         if isinstance(one, ast.arg):
@@ -48,12 +48,11 @@ def variables_to_avoid():
 
 def variables_in(path):
     """Variables that a file assigns, but for fields of classes."""
-    tree = tree_of(path)
-    lines = [line for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for line in node.body]
+    nodes = nodes_of(path)
+    lines = [line for node in nodes if isinstance(node, ast.ClassDef) for line in node.body]
     fields = {id(line.target) for line in lines if isinstance(line, ast.AnnAssign)}
     fields |= {id(target) for line in lines if isinstance(line, ast.Assign) for target in line.targets}
-    names = (node for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
-    return {name.id for name in names if id(name) not in fields}
+    return {node.id for node in nodes if isinstance(node, ast.Name) and id(node) not in fields}
 
 
 def test_a_variable_says_what_it_holds():

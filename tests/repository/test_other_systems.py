@@ -9,7 +9,7 @@ import signal
 
 import pytest
 
-from tests.repository.test_house import FLOORS, ROOT, tree_of
+from tests.repository.test_house import FLOORS, ROOT, nodes_of
 from thruster_env.core import files, parallel
 from thruster_env.graphs import machine_code
 from tuning.api import explore
@@ -73,7 +73,7 @@ def test_what_windows_lacks_is_asked_for_before_it_is_used():
         assert not re.search(rf"^(import|from) ({MODULES})\b", source, flags=re.MULTILINE), path
         if not any(f".{name}" in source for name in names):
             continue
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.Attribute) and names.get(node.attr, "") == getattr(node.value, "id", None):
                 name = SAME.get(node.attr, node.attr)
                 pattern = rf"""hasattr\((os|signal), ["']({name}|{node.attr})["']\)"""

@@ -34,7 +34,7 @@ def used(number):
 
 
 def sizes():
-    while gc.collect():  # what a cycle held may have held another
+    while gc.collect():  # what a cycle had may have had another
         pass
     return {
         "texts": len(programs._TEXTS),
@@ -42,7 +42,7 @@ def sizes():
     }
 
 
-def test_a_hundred_models_that_were_dropped_leave_no_more_than_the_caches_keep(as_python):
+def test_a_hundred_models_that_were_dropped_leave_no_more_than_the_caches_keep(as_python, only_new_garbage):
     alive = [one for number in range(80) for one in used(0.1 + 1e-3 * number)]
     before = sizes()
     alive += [one for number in range(80, 110) for one in used(0.1 + 1e-3 * number)]

@@ -256,7 +256,7 @@ def builtin(x):
     return builtin_of(code_of(module, "call"), x)
 
 
-def test_a_builtin_works_on_its_arrays_and_keeps_its_code():
+def test_a_builtin_works_on_its_arrays_and_keeps_its_code(only_new_garbage):
     x = np.zeros(3)
     call = builtin(x)
     gc.collect()
@@ -276,7 +276,7 @@ def test_other_numbers_are_refused(number):
     assert machine(divided, None, None)(np.int32(7), 3) == 2001
 
 
-def test_code_is_freed_with_its_last_user():
+def test_code_is_freed_with_its_last_user(only_new_garbage):
     machine_code._loaded.clear()
     call = builtin(np.zeros(3))
     assert len(machine_code._loaded) == 1
@@ -291,7 +291,6 @@ def test_object_code_is_kept_and_damage_is_noticed(folder, monkeypatch):
     (file,) = folder.iterdir()
     content = file.read_bytes()
     for damaged in (content[:-1], b"", content[:40] + b"x" + content[41:]):
-        gc.collect()
         machine_code._loaded.clear()
         file.write_bytes(damaged)
         assert builtin(np.zeros(2))(1) == 3 and file.read_bytes() == content

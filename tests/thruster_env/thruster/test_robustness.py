@@ -225,7 +225,7 @@ def test_what_is_not_finite_is_observed_alike_by_both():
 
 
 @pytest.mark.parametrize("single", [True, False], ids=["single", "vector"])
-def test_memory_does_not_grow(single):
+def test_memory_does_not_grow(single, only_new_garbage):
     arguments = {"sensors": {"thrust": SENSORS}, "flow": FLOW, "reference": REFERENCE}
     if single:
         env = gym.make("BowThrusterTracking-v0", max_episode_steps=20, **arguments)
