@@ -293,27 +293,27 @@ inputs = [["tau", "tau", "N m"]]
 DT, ROWS, RUNS = 0.02, 1500, 24
 
 
-def flight(rng):
+def flights(rng):
     """True states, inputs and measurements of turns with changing forces, by the sensors' own equations."""
     t = DT * np.arange(ROWS)
     rates = np.column_stack([0.1 * np.sin(0.3 * t), 0.08 * np.cos(0.2 * t), 0.25 + 0.1 * np.sin(0.1 * t)])
     forces = np.column_stack([np.sin(0.25 * t), 0.5 * np.cos(0.4 * t), 9.81 + 0.3 * np.sin(0.5 * t)])
-    turn = rotations.exponential(np.deg2rad([2.0, 2.0, 5.0]) * rng.normal(size=3))
-    x = np.array([*turn, *(5.0 * rng.normal(size=3)), *(4.5 * rng.normal(size=3))])
-    bias = rng.normal(size=7) * [*[0.005] * 3, *[0.05] * 3, 20.0]
+    turn = rotations.exponential(np.deg2rad([2.0, 2.0, 5.0])[:, None] * rng.normal(size=(3, RUNS)))
+    x = np.array([*turn, *(5.0 * rng.normal(size=(3, RUNS))), *(4.5 * rng.normal(size=(3, RUNS)))])
+    bias = rng.normal(size=(RUNS, 7)) * [*[0.005] * 3, *[0.05] * 3, 20.0]
     walk = np.sqrt(DT) * np.array([*[1e-5] * 3, *[1e-4] * 3, 0.02])
     states, inputs = [], []
     for rate, force in zip(rates, forces, strict=True):
-        states.append([*x, *bias])
-        noise = rng.normal(size=6) * np.repeat([2e-4, 2e-3], 3) / np.sqrt(DT)
-        inputs.append([*rate, *force] + bias[:6] + noise)
+        states.append(np.hstack([x.T, bias]))
+        noise = rng.normal(size=(RUNS, 6)) * np.repeat([2e-4, 2e-3], 3) / np.sqrt(DT)
+        inputs.append([*rate, *force] + bias[:, :6] + noise)
         x = np.array(poses.strapdown(x, rate, force, (0.0, 0.0, -9.81), DT))
-        bias = bias + walk * rng.normal(size=7)
-    states = np.array(states)
-    heights = states[:, 9:10] + states[:, 16:] + 0.3 * rng.normal(size=(ROWS, 1))
-    z = np.hstack([states[:, 7:10] + 1.5 * rng.normal(size=(ROWS, 3)), heights])
-    z[np.arange(ROWS) % 10 != 0, :3], z[np.arange(ROWS) % 5 != 0, 3] = np.nan, np.nan
-    return states, np.array(inputs)[:-1], z
+        bias = bias + walk * rng.normal(size=(RUNS, 7))
+    states = np.stack(states, axis=1)
+    heights = states[..., 9:10] + states[..., 16:] + 0.3 * rng.normal(size=(RUNS, ROWS, 1))
+    z = np.concatenate([states[..., 7:10] + 1.5 * rng.normal(size=(RUNS, ROWS, 3)), heights], axis=-1)
+    z[:, np.arange(ROWS) % 10 != 0, :3], z[:, np.arange(ROWS) % 5 != 0, 3] = np.nan, np.nan
+    return states, np.stack(inputs[:-1], axis=1), z
 
 
 @pytest.fixture(scope="module")
@@ -323,8 +323,7 @@ def model():
 
 def test_errors_have_the_stated_covariance(model):
     """NEES of 16 within four deviations of its mean over runs, with a tenth for linearisation."""
-    rng = np.random.default_rng(0)
-    states, inputs, z = (np.array(part) for part in zip(*(flight(rng) for _ in range(RUNS)), strict=True))
+    states, inputs, z = flights(np.random.default_rng(0))
     estimates = filters.run(filters.make_filter("ekf", model), inputs=inputs, measurements=z)
     for row, yaw in ((100, 6.0), (-1, 2.0)):
         errors = np.array(
@@ -354,8 +353,9 @@ def test_the_noise_is_that_of_white_sensors_and_walking_biases(model):
 
 def test_innovations_of_slow_sensors_are_drawn_as_dots(model):
     """A line between rows without a neighbour has no length."""
-    _, inputs, z = flight(np.random.default_rng(1))
-    figure = filters.run(filters.make_filter("ekf", model), inputs=inputs[:200], measurements=z[:201]).plot()
+    rng, z = np.random.default_rng(1), np.full((201, 4), np.nan)
+    z[::10, :3], z[::5, 3] = rng.normal(size=(21, 3)), rng.normal(size=41)
+    figure = filters.run(filters.make_filter("ekf", model), inputs=np.zeros((200, 6)), measurements=z).plot()
     lines = [line for axis in figure.axes for line in axis.lines if line.get_label() == "innovation"]
     assert [(line.get_marker(), len(line.get_xdata())) for line in lines] == [(".", 21)] * 3 + [(".", 41)]
     for measured, sparse in ((np.array([True] * 9 + [False]), False), (np.arange(12) % 3 == 0, True)):
