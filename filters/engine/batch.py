@@ -478,8 +478,9 @@ class Beliefs:
 
     def start(self, which: np.ndarray, keys: np.ndarray, z: np.ndarray) -> None:
         """Set the prior in some copies with keys (len(which), 2), and update it with measurements z (N, m)."""
-        if len(which) == len(self._rows) and self._filter.kernels() is not self._kernels:  # other functions
-            type(self).__init__(self, self._filter, len(self._rows))
+        if len(which) == len(self._rows) and self._filter.kernel_model.reads_from_outside:
+            if self._filter.kernels() is not self._kernels:  # which has other functions now
+                type(self).__init__(self, self._filter, len(self._rows))
         self._rows[which, self._places.key_0] = keys[:, 0]
         self._rows[which, self._places.key_1] = keys[:, 1]
         tasks = np.full(len(self._rows), float(IDLE))

@@ -265,6 +265,8 @@ class Session:
 
     def read_functions(self) -> None:
         """Use the model's functions as they are now: values that they have from outside may be others since."""
+        if not self._filter.kernel_model.reads_from_outside:
+            return
         kernels = self._filter.kernels()
         if kernels is not self._kernels:
             self._kernels, self._operate = kernels, self._operate_first

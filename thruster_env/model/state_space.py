@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from thruster_env.core.checks import as_floats, at_least, covariance, covariance_root, one_of, short_repr, vector
-from thruster_env.core.compiled import as_function, as_made
+from thruster_env.core.compiled import as_function, as_made, functions_in
 from thruster_env.core.derivatives import by_complex_step, complex_step
 from thruster_env.core.equal_functions import first_equal
 from thruster_env.core.modules import error_line
@@ -214,6 +214,12 @@ class StateSpaceModel:
     def feeds(self) -> bool:
         """Whether h takes the input: measurements have feed-through."""
         return takes_input(self.observe)
+
+    @cached_property
+    def reads_from_outside(self) -> bool:
+        """Whether functions are a user's: their globals and closures may have other values than before."""
+        functions = self.transition, self.transition_jacobian, self.observe, self.observe_jacobian
+        return next(functions_in(*functions), None) is not None
 
     @property
     def shape(self) -> Shape:
