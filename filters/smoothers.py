@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from filters.engine.batch import Beliefs, Prepared, noise_rows, run, trajectories
-from filters.engine.belief import Kernels, constrained, memory_offsets, restart_if_lost
+from filters.engine.belief import Belief, Kernels, constrained, memory_offsets, restart_if_lost
 from filters.engine.compile import new_memory
 from filters.engine.session import Session
 from filters.ensembles.ensemble import EnsembleFilter, named
@@ -55,18 +55,20 @@ ROUNDING = 1e-12  # of a covariance in standard deviations
 
 
 def condition_on_later(
-    filter_: PageFilter, states: list[int], x, p, inputs, later, later_cov
+    filter_: PageFilter, prior: Belief, states: list[int], x, p, inputs, later, later_cov
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compare a mode's later states (B, n) with its filter's prediction from x (B, n) and P, and complete them.
+
+    The belief of its prior, which takes longer to make than a prediction, lends all parts but x and P.
 
     Returns:
         The log densities (B,) of the mode's `states` in the prediction, without a constant.
         Means and covariances of all later states; those that the mode lacks are predicted, given the others.
     """
-    levels, means, covs, begun = np.empty(len(x)), later.copy(), later_cov.copy(), filter_.init()
+    levels, means, covs = np.empty(len(x)), later.copy(), later_cov.copy()
     rest = [i for i in range(x.shape[1]) if i not in states]
     for b in range(len(x)):
-        predicted = filter_.predict(begun._replace(mean=x[b], cov=p[b]), inputs[b])
+        predicted = filter_.predict(prior._replace(mean=x[b], cov=p[b]), inputs[b])
         scale = np.sqrt(np.diag(predicted.cov))
         scale = np.where(scale > 0.0, scale, 1.0)
         cov = predicted.cov / np.outer(scale, scale)
@@ -201,6 +203,7 @@ def smoothed_modes(
     relations = [relation_of(filter_of_mode, "a mode of a smoother") for filter_of_mode in filter_.mode_filters]
     kinds: Any = filter_.mode_filters  # which have pages, as they have relations
     steps = [passes(kind, relation) for kind, relation in zip(kinds, relations, strict=True)]
+    priors = [kind.init() for kind in kinds]
     means, covs, logs, restarted, divergences = filtered(filter_, keys, inputs, measurements, step_filters)
     mu, angles = np.exp(logs), filter_.model.shape.state_angles
     count, times, modes, n = means.shape
@@ -222,7 +225,7 @@ def smoothed_modes(
         for i, j in np.ndindex(modes, modes):
             begun = means[:, k, i], covs[:, k, i]
             levels[:, i, j], later, later_cov = condition_on_later(
-                kinds[j], states_of_modes[j], *begun, inputs[:, k], x[:, j], p[:, j]
+                kinds[j], priors[j], states_of_modes[j], *begun, inputs[:, k], x[:, j], p[:, j]
             )
             ends = np.stack([begun[0], later], axis=1), np.stack([begun[1], later_cov], axis=1), anew
             corrected, cov = steps[j](ends, inputs[:, k : k + 1], 1, kinds[j].numbers[None])

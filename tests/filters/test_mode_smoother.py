@@ -185,7 +185,7 @@ def test_a_step_back_from_a_mode_of_fewer_states_tells_the_others_by_their_covar
     x, p, later, e = rng.normal(size=3), root @ root.T + np.eye(3), rng.normal(size=(2, 3)), 0.1 * less @ less.T
     step, found = passes(mode, relation_of(mode, "a test")), []
     for one in later:
-        level, mean, cov = condition_on_later(mode, [0, 1], x[None], p[None], u, one[None], e[None])
+        level, mean, cov = condition_on_later(mode, mode.init(), [0, 1], x[None], p[None], u, one[None], e[None])
         ends = np.stack([x, mean[0]])[None], np.stack([p, cov[0]])[None], np.zeros((1, 2), bool)
         found.append((level[0], *(it[0, 0] for it in step(ends, u[:, None], 1))))
     a = small.matrices()[0]

@@ -25,7 +25,8 @@ from thruster_env.core.checks import (
 from thruster_env.core.derivatives import jacobian, runge_kutta
 from thruster_env.core.equal_functions import makes_functions
 from thruster_env.core.sources import tuple_of, written_out
-from thruster_env.model.state_space import StateSpaceModel, takes_input
+from thruster_env.model.functions import takes_input
+from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import Turn, move, runge_kutta_munthe_kaas, slope_of_rates, with_rotations
 
 SAME_DT = 1e-6  # relative: sample times of logs that are read off stamps
