@@ -70,10 +70,10 @@ def wrong_slope(model, name: str, arguments: str) -> str:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             middle, stated = value(function, x), value(jacobian, x)
-            found = [slopes(factor * reach) for factor in (1e-4, -1e-4, 1e-5, -1e-5)]
+            differences = [slopes(factor * reach) for factor in (1e-4, -1e-4, 1e-5, -1e-5)]
     except Exception:  # no value there
         return ""
-    slope, spread = np.mean(found, axis=0), np.ptp(found, axis=0)
+    slope, spread = np.mean(differences, axis=0), np.ptp(differences, axis=0)
     change = (np.maximum(abs(slope), abs(stated)) * scales).max(axis=1, keepdims=True)
     off, largest = abs(stated - slope), np.maximum(abs(stated), abs(slope))
     wrong = (off > 0.1 * largest) & (off * scales > 1e-3 * change) & (off > 10.0 * spread)
