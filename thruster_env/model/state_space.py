@@ -318,19 +318,10 @@ class StateSpaceModel:
         return q.tobytes(), r.tobytes(), mean.tobytes(), cov.tobytes(), self.substeps, self.constants
 
     def _pack(self) -> np.ndarray:
-        matrices = (
-            self.process_noise_cov,
-            covariance_root(self.process_noise_cov),
-            self.measurement_noise_cov,
-            covariance_root(self.measurement_noise_cov),
-            self.prior_mean,
-            self.prior_cov,
-            covariance_root(self.prior_cov),
-            self.scales,
-            [self.substeps],
-            list(self.constants),
-        )
-        return np.concatenate([np.ravel(np.asarray(a, dtype=np.float64)) for a in matrices])
+        q, r, p = self.process_noise_cov, self.measurement_noise_cov, self.prior_cov
+        noise = q, covariance_root(q), r, covariance_root(r)
+        parts = *noise, self.prior_mean, p, covariance_root(p), self.scales, [self.substeps], list(self.constants)
+        return np.concatenate([np.ravel(np.asarray(part, dtype=np.float64)) for part in parts])
 
     @property
     def scales(self) -> np.ndarray:
