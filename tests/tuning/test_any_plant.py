@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 import tuning
+from filters import make_filter
 from filters.consistency.nees import normalized_squares
 from filters.consistency.report import NO_TRUTH, sentences
 from filters.engine.batch import run
@@ -74,6 +75,12 @@ def test_an_evaluation_has_one_of_everything_for_each_state_channel_and_output(c
     energies = 0.5 * estimates.means[..., 1] ** 2 - data.outputs["E"]
     assert found.output_rmse["E"].value == pytest.approx(np.sqrt((energies[:, late] ** 2).mean()), rel=1e-12)
     assert summary(found)["energy_rmse"] == list(found.output_rmse["E"])
+    model = problem.model()
+    phase = Quantity("phase", "E", "rad", angle=True)
+    turning = model.replace(outputs={"E": (phase, model.outputs["E"].function)})
+    turned = data._replace(outputs={"E": data.outputs["E"] + 2.0 * np.pi})  # a whole turn is no error of an angle
+    of_angle = evaluate(make_filter("kf", turning), turned, problem.scale).output_rmse["E"]
+    assert of_angle.value == pytest.approx(found.output_rmse["E"].value, rel=1e-9)
     # Of two channels one measurement in ten is missing: the mean NIS of a filter that is right is less than two.
     there = (~np.isnan(data.measurements[:, late])).sum(-1)
     assert found.expected_nis == there[there > 0].mean() and 1.7 < found.expected_nis < 1.9
