@@ -13,26 +13,8 @@ from tests.linear_problem import LinearProblem
 from tests.models import wide_model
 from tests.small_problems import UNITS, pair, thruster
 from thruster_env.core.compiled import interpreted
-from tuning.evaluation.baselines import (
-    GIVEN,
-    NOISE,
-    ORACLE,
-    RULE,
-    SCALED,
-    TUNED,
-    baselines,
-    competing_baselines,
-    full_noise,
-    given_noise,
-    nearest,
-    noise_estimated,
-    oracle,
-    rule_label,
-    rule_of_thumb,
-    same_filter,
-    scaled,
-    scaled_default,
-)
+from tuning.evaluation import baselines as rules
+from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED
 from tuning.evaluation.compare import contender
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison, evaluate_held_out, summarised, summary
@@ -55,10 +37,10 @@ def test_what_the_model_of_a_user_came_with_is_a_baseline_and_comes_first():
     own = wide_model(**UNITS).replace(process_noise_cov=[0.5, 0.5, 0.5])
     problem = pair(assumed=own)
     assert problem.given["process_noise_cov"] == (0.5, 0.5, 0.5)
-    found = baselines("kf", problem)
+    found = rules.baselines("kf", problem)
     assert list(found) == [GIVEN, SCALED, RULE, NOISE, ORACLE]
     np.testing.assert_array_equal(found[GIVEN].filter(problem).model.process_noise_cov, np.diag([0.5] * 3))
-    comparison = evaluate_held_out(rule_of_thumb("kf", problem), problem, 0, 20)
+    comparison = evaluate_held_out(rules.rule_of_thumb("kf", problem), problem, 0, 20)
     assert list(comparison.evaluations) == [GIVEN, RULE, SCALED, NOISE, TUNED, ORACLE]
     assert list(comparison.ratios)[0] == GIVEN and comparison.ratios[RULE] == (1.0, 1.0, 1.0)
     assert " against the given filter" in tuning_effect(comparison).partition(" and ")[0]
@@ -67,21 +49,21 @@ def test_what_the_model_of_a_user_came_with_is_a_baseline_and_comes_first():
 
 def test_a_model_with_the_noise_of_its_plant_is_given_and_the_oracle_and_competes_with_no_trial():
     problem = pair()
-    assert given_noise("kf", problem) == oracle("kf", problem) == baselines("kf", problem)[GIVEN]
-    assert list(competing_baselines("kf", problem)) == [SCALED, RULE, NOISE]
-    comparison = evaluate_held_out(rule_of_thumb("kf", problem), problem, 0, 4)
+    assert rules.given_noise("kf", problem) == rules.oracle("kf", problem) == rules.baselines("kf", problem)[GIVEN]
+    assert list(rules.competing_baselines("kf", problem)) == [SCALED, RULE, NOISE]
+    comparison = evaluate_held_out(rules.rule_of_thumb("kf", problem), problem, 0, 4)
     assert list(comparison.evaluations) == [GIVEN, RULE, SCALED, NOISE, TUNED, ORACLE]
     assert list(comparison.ratios)[-2:] == [GIVEN, ORACLE] and "given" not in tuning_effect(comparison)
     assert gains(comparison, "seeds")[-1].startswith("The given Q and R are the plant's own")
-    assert contender("kf", "given").choose(problem) == oracle("kf", problem)
+    assert contender("kf", "given").choose(problem) == rules.oracle("kf", problem)
     assert thruster().given is None
 
 
 def test_the_default_of_the_user_s_function_is_the_rule_of_thumb_and_given():
     problem = altitude_problem.problem()
     assert problem.untuned == problem.given == altitude_problem.GIVEN
-    assert list(baselines("ekf", problem)) == [GIVEN, SCALED, NOISE, ORACLE]
-    comparison = evaluate_held_out(given_noise("ekf", problem), problem, 0, 4)
+    assert list(rules.baselines("ekf", problem)) == [GIVEN, SCALED, NOISE, ORACLE]
+    comparison = evaluate_held_out(rules.given_noise("ekf", problem), problem, 0, 4)
     assert list(comparison.evaluations) == [GIVEN, SCALED, NOISE, TUNED, ORACLE]
 
 
@@ -89,11 +71,11 @@ def test_own_numbers_are_nearest_to_noise_estimation_from_any_start():
     true, far = altitude_problem.model(**altitude_problem.TRUE), {"sigma_a": 1e2, "sigma_b": 1e-6, "r_range": 1e4}
     for start in ({}, far):  # Q is singular: of two noises for three states
         problem = altitude_problem.problem(untuned=start)
-        found = nearest(problem, true.process_noise_cov, true.measurement_noise_cov)
+        found = rules.nearest(problem, true.process_noise_cov, true.measurement_noise_cov)
         assert found == pytest.approx(altitude_problem.TRUE, rel=1e-3)
-    found = noise_estimated("ekf", altitude_problem.problem()).model
+    found = rules.noise_estimated("ekf", altitude_problem.problem()).model
     assert found == pytest.approx(altitude_problem.TRUE, rel=0.05)
-    full = full_noise("ekf", altitude_problem.problem()).model
+    full = rules.full_noise("ekf", altitude_problem.problem()).model
     assert full.keys() - found.keys() == {"process_noise_cov", "measurement_noise_cov"}
 
 
@@ -105,17 +87,17 @@ def test_own_numbers_are_within_their_ranges_always():
     assert told.given["sigma_a"] == 500.0 == told.parameters[0].high
     free, assumed = [Parameter("x", 0.1, 10.0)], (lambda x: altitude_problem.model(sigma_a=x))
     none = altitude_problem.problem(parameters=free, assumed=assumed)
-    assert none.given is None and none.untuned == {"x": pytest.approx(1.0)} and rule_label(none) == RULE
+    assert none.given is None and none.untuned == {"x": pytest.approx(1.0)} and rules.rule_label(none) == RULE
 
 
 def test_noise_estimation_finds_the_noise_of_a_simulation_and_what_a_model_lacks_in_the_mean():
     problem = LinearProblem()
-    q, r = (noise_estimated("kf", problem).model[f"{name}_noise_cov"] for name in ("process", "measurement"))
+    q, r = (rules.noise_estimated("kf", problem).model[f"{name}_noise_cov"] for name in ("process", "measurement"))
     np.testing.assert_allclose(q, 0.02 * np.eye(3), atol=0.003)
     np.testing.assert_allclose(r, 0.1 * np.eye(2), atol=0.015)
     biased = thruster(parameter_factors={"voltage_gain": 0.5})
     assert abs(noise_estimation(biased).measurement_mean[0]) < 0.1
-    assert noise_estimated("open-loop", problem) is None
+    assert rules.noise_estimated("open-loop", problem) is None
     assert noise_estimation(LinearProblem(truth=False)).reason == "there is no truth"
 
 
@@ -159,7 +141,7 @@ def test_a_score_that_falls_to_a_small_part_is_a_factor_and_no_percentage():
     assert gain(small, 8) == "lowers the score by a factor of 250 [200, 333]"
     assert gain(Interval(40.0, 30.0, 50.0), 8) == "raises the score by a factor of 40 [30, 50]"
     assert gain(Interval(0.4, 0.3, 0.5), 8) == "lowers the score by 60 % [50, 70]"
-    comparison = evaluate_held_out(rule_of_thumb("kf", LinearProblem()), LinearProblem(), 0, 4)
+    comparison = evaluate_held_out(rules.rule_of_thumb("kf", LinearProblem()), LinearProblem(), 0, 4)
     ratios = dict.fromkeys(comparison.ratios, small)
     said = gains(comparison._replace(stored_ratios=ratios), "seeds")[0]
     assert "Tuning lowers the error by a factor of 250 [200, 333] against the " in said
@@ -167,7 +149,7 @@ def test_a_score_that_falls_to_a_small_part_is_a_factor_and_no_percentage():
 
 def test_noise_estimation_gives_no_noise_to_a_model_whose_residuals_are_rounding():
     quiet = noise_free_problem(lorenz63.model(), steps=40, first_scored_step=10, scale=[1.0] * 3)
-    assert noise_estimated("ekf", quiet).model["process_noise_cov"] == (0.0, 0.0, 0.0)
+    assert rules.noise_estimated("ekf", quiet).model["process_noise_cov"] == (0.0, 0.0, 0.0)
 
 
 def test_residuals_are_those_of_the_model_step_by_step():
@@ -184,12 +166,12 @@ def test_residuals_are_those_of_the_model_step_by_step():
 
 
 def test_equal_filters_are_known_as_equal_and_a_contender_may_know_the_scaled_default():
-    one = rule_of_thumb("kf", LinearProblem())
-    assert same_filter(one, rule_of_thumb("kf", LinearProblem()))
-    assert not same_filter(one, one._replace(name="ekf"))
-    choices = baselines("ekf", MISMATCH, 2)
+    one = rules.rule_of_thumb("kf", LinearProblem())
+    assert rules.same_filter(one, rules.rule_of_thumb("kf", LinearProblem()))
+    assert not rules.same_filter(one, one._replace(name="ekf"))
+    choices = rules.baselines("ekf", MISMATCH, 2)
     assert contender("ekf", "scaled", seed=2).choose(MISMATCH) == choices[SCALED]
-    assert scaled(choices[RULE], scaled_default("ekf", MISMATCH, 2).factor) == choices[SCALED]
+    assert rules.scaled(choices[RULE], rules.scaled_default("ekf", MISMATCH, 2).factor) == choices[SCALED]
 
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
@@ -197,7 +179,7 @@ MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
 
 @pytest.mark.parametrize(("name", "scenario"), [("ekf", MISMATCH), ("enkf", MISMATCH), ("ekf", OUTLIERS)])
 def test_the_factor_brings_the_mean_nis_of_the_training_runs_to_one_and_leaves_r(name, scenario):
-    found, rule = scaled_default(name, scenario, 3), untuned_choice(name, scenario)
+    found, rule = rules.scaled_default(name, scenario, 3), untuned_choice(name, scenario)
     data = scenario.data(training_seeds(3, TRAINING_SEEDS))
     before, after = (evaluate(c.filter(scenario), data, scenario.scale) for c in (rule, found.choice))
     assert nis_ratio(after) == found.nis == pytest.approx(1.0, abs=2e-3)
@@ -209,16 +191,16 @@ def test_the_factor_brings_the_mean_nis_of_the_training_runs_to_one_and_leaves_r
 
 
 def test_it_depends_on_the_seed_of_the_study_and_on_nothing_else():
-    found = [scaled_default.__wrapped__("ekf", MISMATCH, seed).factor for seed in (0, 0, 1)]
+    found = [rules.scaled_default.__wrapped__("ekf", MISMATCH, seed).factor for seed in (0, 0, 1)]
     assert found[0] == found[1] != found[2] == pytest.approx(found[0], rel=0.1)
 
 
 def test_where_there_is_no_scaled_default_it_says_why():
-    assert scaled_default("open-loop", MISMATCH) == (
+    assert rules.scaled_default("open-loop", MISMATCH) == (
         None, None, None, "open-loop has no NIS by which its Q could be scaled"
     )  # fmt: skip
     startup = find_scenario("startup")
-    found = scaled_default("ekf", startup)
+    found = rules.scaled_default("ekf", startup)
     assert found.choice is None
     assert found.reason.startswith("no factor on Q from 0.0001 to 10000 brings the mean NIS of ekf to 1: it is 4.")
     comparison = evaluate_held_out(untuned_choice("ekf", startup), startup, 0, 4)
@@ -236,9 +218,9 @@ def test_where_there_is_no_scaled_default_it_says_why():
 def test_a_baseline_beyond_reason_is_left_out():
     tiny = {"process_noise_cov": (1e-9, 1e-11)}
     loose = ModelProblem(MISMATCH.model(), steps=60, inputs=Steps(12.0), untuned=tiny, scale=[1.0, 1.0])
-    found = scaled_default("ekf", loose)
+    found = rules.scaled_default("ekf", loose)
     assert found.choice is None and "from 0.0001 to 10000 brings" in found.reason and "with 10000" in found.reason
-    assert SCALED not in baselines("ekf", loose)
+    assert SCALED not in rules.baselines("ekf", loose)
 
 
 def test_a_nis_that_jumps_over_one_has_no_factor_either(monkeypatch):
@@ -250,7 +232,7 @@ def test_a_nis_that_jumps_over_one_has_no_factor_either(monkeypatch):
         return found._replace(nis=found.nis._replace(value=nis), expected_nis=4.0)  # as of four channels
 
     monkeypatch.setattr(module, "values_of", jumps)
-    reason = scaled_default.__wrapped__("ekf", MISMATCH, 0).reason
+    reason = rules.scaled_default.__wrapped__("ekf", MISMATCH, 0).reason
     assert re.match(r"no factor on Q brings the mean NIS of ekf to 4: it jumps to [28] with", reason)
 
 
@@ -260,7 +242,7 @@ def test_a_proof_holds_all_baselines_on_the_same_seeds_and_names_the_one_that_co
     assert list(comparison.evaluations) == [RULE, SCALED, NOISE, TUNED, ORACLE]
     assert list(comparison.ratios) == [SCALED, RULE, NOISE, ORACLE]
     data = MISMATCH.data(held_out_seeds(0, 40))
-    default = evaluate(scaled_default("ekf", MISMATCH, 0).choice.filter(MISMATCH), data, MISMATCH.scale)
+    default = evaluate(rules.scaled_default("ekf", MISMATCH, 0).choice.filter(MISMATCH), data, MISMATCH.scale)
     assert comparison.ratios[SCALED] == score_ratio(comparison.tuned, default)
     assert comparison.ratios[ORACLE] == (1.0, 1.0, 1.0)
     assert comparison.ratios[RULE].high < comparison.ratios[SCALED].low  # the rule of thumb is easier to beat

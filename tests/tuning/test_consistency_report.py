@@ -10,18 +10,8 @@ from scipy.stats import norm
 
 import tuning
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run
+from filters.consistency import report as words
 from filters.consistency.nees import Interval, gaussian_crps, mean_interval, normalized_squares, rmse_ratios
-from filters.consistency.report import (
-    confidence,
-    consistency_report,
-    coverage_sentence,
-    crps_sentence,
-    divergence_sentence,
-    mean_sentence,
-    remedy_sentence,
-    rounded,
-    sentences,
-)
 from filters.engine.batch import Estimates
 from filters.ensembles.square_root import Members, record_members
 from filters.tuned_file import NOISE
@@ -76,7 +66,7 @@ def scalar_estimates(drawn, **assumed):
 
 
 def scalar_report(drawn, **assumed):
-    return consistency_report(scalar_estimates(drawn, **assumed), drawn.states, first_step=20)
+    return words.consistency_report(scalar_estimates(drawn, **assumed), drawn.states, first_step=20)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +82,7 @@ def scalar_report(drawn, **assumed):
     ],
 )
 def test_the_remedy_undoes_what_was_done(scalar_truth, assumed, remedy):
-    assert remedy_sentence(scalar_report(scalar_truth, **assumed)) == remedy
+    assert words.remedy_sentence(scalar_report(scalar_truth, **assumed)) == remedy
 
 
 def test_where_errors_last_a_constant_as_a_state_comes_first_and_nothing_is_called_consistent(scalar_truth):
@@ -100,16 +90,16 @@ def test_where_errors_last_a_constant_as_a_state_comes_first_and_nothing_is_call
     assert report.nees.mean.low > 1 and report.whiteness.p_value < 0.05
     mild = report.whiteness._replace(correlations=0.1 * report.whiteness.correlations)
     expected = report.nis._replace(mean=report.nis.mean._replace(value=1.0))
-    said = remedy_sentence(report._replace(nis=expected, whiteness=mild, constants=("outflow", "area")))
+    said = words.remedy_sentence(report._replace(nis=expected, whiteness=mild, constants=("outflow", "area")))
     assert said.startswith("To try: estimate a constant of the model that may be off (it has outflow, area) as")
     assert said.endswith("; or raise Q where nothing is measured, or repair the model there.")
     white = mild._replace(p_value=0.5)
-    said = remedy_sentence(report._replace(nis=expected, whiteness=white))
+    said = words.remedy_sentence(report._replace(nis=expected, whiteness=white))
     assert said.endswith("; the innovations are consistent.") and "constant" not in said
 
 
 def test_of_the_right_filter_every_sentence_is_good_news(scalar_truth):
-    said = sentences(scalar_report(scalar_truth))
+    said = words.sentences(scalar_report(scalar_truth))
     assert len(said) == 8
     assert said[0].startswith("Consistent: mean NEES") and said[1].startswith("The distribution of NEES is that")
     assert said[4].startswith("Innovations are white")
@@ -134,17 +124,19 @@ def test_missing_measurements_lower_the_right_mean_of_no_check(scalar_truth):
     measurements = scalar_truth.measurements.copy()
     measurements[np.random.default_rng(0).random(measurements.shape) < 0.4] = np.nan
     estimates = scalar_estimates(scalar_truth._replace(measurements=measurements))
-    report = consistency_report(estimates, scalar_truth.states, measurements)
+    report = words.consistency_report(estimates, scalar_truth.states, measurements)
     assert report.nis.dimension == 1 and report.nis.mean.covers(1.0) and report.whiteness.p_value > 0.01
 
 
 def test_a_report_refuses_what_does_not_fit(scalar_truth):
     estimates = scalar_estimates(scalar_truth)
     with pytest.raises(ValueError, match="states must have the shape of the estimates"):
-        consistency_report(estimates, scalar_truth.states[:, 1:])
+        words.consistency_report(estimates, scalar_truth.states[:, 1:])
     one = Estimates(*(part[:1] for part in estimates))
-    refused("at least two runs", consistency_report, one, scalar_truth.states[:1])
-    refused("names must be 1, one a state", consistency_report, estimates, scalar_truth.states, names=("a", "b"))
+    refused("at least two runs", words.consistency_report, one, scalar_truth.states[:1])
+    refused(
+        "names must be 1, one a state", words.consistency_report, estimates, scalar_truth.states, names=("a", "b")
+    )
 
 
 def test_recorded_members_are_those_of_the_run(scalar_truth):
@@ -171,7 +163,7 @@ def exchangeable(size, runs=60, steps=80):
         np.zeros((runs, steps)),
         np.zeros(runs),
     )
-    return consistency_report(estimates, states, members=Members(members, None, np.arange(steps)))
+    return words.consistency_report(estimates, states, members=Members(members, None, np.arange(steps)))
 
 
 def test_a_small_ensemble_is_overconfident_though_its_members_are_right_and_is_told_to_grow():
@@ -180,28 +172,30 @@ def test_a_small_ensemble_is_overconfident_though_its_members_are_right_and_is_t
     assert report.ensemble.size == 8 and len(report.ensemble.ranks[0].frequencies) == 9
     fair = 1 / np.sqrt(np.pi)
     assert report.ensemble.crps[0].covers(fair + fair / 8)  # that of N members is larger by the N-th part
-    said = sentences(report)
+    said = words.sentences(report)
     assert "that of the members themselves is 0.6" in said[6]
     assert said[7].startswith("Ranks of the truth among the 8 members, state 1: even")
     assert said[-1] == "To try: more members; their ranks are right, but their covariance is a rough estimate."
 
 
 def test_sentences_follow_their_numbers():
-    assert confidence(Interval(2.05, 1.95, 2.1), 2) == "consistent"
-    assert confidence(Interval(2.2, 2.1, 2.3), 2) == "slightly overconfident"
-    assert confidence(Interval(1.0, 0.9, 1.1), 2) == "underconfident"
-    said = mean_sentence("NEES", Interval(5.1, 4.9, 5.3), 2)
+    assert words.confidence(Interval(2.05, 1.95, 2.1), 2) == "consistent"
+    assert words.confidence(Interval(2.2, 2.1, 2.3), 2) == "slightly overconfident"
+    assert words.confidence(Interval(1.0, 0.9, 1.1), 2) == "underconfident"
+    said = words.mean_sentence("NEES", Interval(5.1, 4.9, 5.3), 2)
     assert said == "Overconfident: mean NEES 5.1 [4.9, 5.3] where 2 is right."
-    assert mean_sentence("NIS", Interval(np.nan, np.nan, np.nan), 1).startswith("No NIS")
-    assert coverage_sentence("x", Interval(0.9, 0.89, 0.91)).endswith("90.0 % [89.0, 91.0] of cases: too rarely.")
-    assert coverage_sentence("x", Interval(0.98, 0.97, 0.99)).endswith("more often than stated.")
-    said = crps_sentence("x [m]", Interval(0.6, 0.5, 0.7), 0.3)
+    assert words.mean_sentence("NIS", Interval(np.nan, np.nan, np.nan), 1).startswith("No NIS")
+    assert words.coverage_sentence("x", Interval(0.9, 0.89, 0.91)).endswith(
+        "90.0 % [89.0, 91.0] of cases: too rarely."
+    )
+    assert words.coverage_sentence("x", Interval(0.98, 0.97, 0.99)).endswith("more often than stated.")
+    said = words.crps_sentence("x [m]", Interval(0.6, 0.5, 0.7), 0.3)
     assert said == "CRPS of x [m]: 0.6 [0.5, 0.7], 2 times its expected value under the covariance."
     assert comparison_sentence("x", "ekf", "kf", Interval(0.9, 0.8, 0.95)).endswith("ekf is better.")
     assert comparison_sentence("x", "ekf", "kf", Interval(1.0, 0.9, 1.1)).endswith("a tie.")
-    said = divergence_sentence(5, 3, 200)
+    said = words.divergence_sentence(5, 3, 200)
     assert said == "3 of 200 runs diverged and restarted from the prior, 5 times in all."
-    assert [rounded(value) for value in (3460.4, 0.012345, 2e9)] == ["3460", "0.0123", "2e+09"]
+    assert [words.rounded(value) for value in (3460.4, 0.012345, 2e9)] == ["3460", "0.0123", "2e+09"]
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +208,7 @@ def nominal():
 def test_on_the_thruster_a_filter_that_knows_the_plant_is_honest(nominal, kind):
     model, data = nominal
     estimates = run(kind(model=model), data.filter_keys, data.inputs, data.measurements)
-    report = consistency_report(estimates, data.states, data.measurements, first_step=50)
+    report = words.consistency_report(estimates, data.states, data.measurements, first_step=50)
     for check in (report.nees, report.nis):
         assert check.share_inside >= 0.9 and check.mean.covers(check.dimension)
     assert report.whiteness.p_value > 0.01
@@ -241,8 +235,8 @@ def test_the_figure_is_drawn(scalar_truth, kind, tmp_path):
     if kind == "without covariance":
         steps, covs = np.zeros((40, 151)), np.zeros((40, 151, 1, 1))
         nothing = Estimates(scalar_truth.states + 1.0, covs, np.zeros((40, 151, 1)), covs, steps, np.zeros(40))
-        report = consistency_report(nothing, scalar_truth.states)
-        assert sentences(report) == [
+        report = words.consistency_report(nothing, scalar_truth.states)
+        assert words.sentences(report) == [
             "No NEES: the filter gives no covariance, or a singular one.",
             "No NIS: the filter gives no covariance, or a singular one.",
             "No test of whiteness: the filter gives no innovation covariance, or nothing was measured.",

@@ -18,18 +18,8 @@ from tests.linear_problem import LinearProblem
 from tests.small_problems import pair, thruster
 from tests.tuning.test_log_problem import MODEL, logs_of
 from tuning.api.study import user_choice
-from tuning.evaluation.baselines import (
-    FULL_Q,
-    GIVEN,
-    NOISE,
-    ORACLE,
-    RULE,
-    SCALED,
-    baseline_size,
-    oracle,
-    scaled,
-    scaled_default,
-)
+from tuning.evaluation import baselines as rules
+from tuning.evaluation.baselines import FULL_Q, GIVEN, NOISE, ORACLE, RULE, SCALED
 from tuning.evaluation.tuned import read_tuned
 from tuning.problems.excitation import Steps
 from tuning.problems.log_problem import LogProblem
@@ -52,19 +42,7 @@ from tuning.search.plan import (
 from tuning.search.space import untuned_choice
 from tuning.search.study import StudyResult, answered_by, finalists_of, open_study, run_study
 from tuning.search.trials import near
-from tuning.search.validation import (
-    Failure,
-    Met,
-    Validation,
-    _baselines_of,
-    _best_of,
-    _by_log_score,
-    _rescaled,
-    _wins,
-    as_data,
-    choice_from,
-    validate,
-)
+from tuning.search.validation import Failure, Met, Validation
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +67,7 @@ def test_four_numbers_of_an_altitude_model_are_no_worse_than_any_baseline_and_tw
 def test_a_tuned_file_keeps_the_choice_as_data_and_own_numbers(altitude):
     problem, study, file = altitude
     met, content = study.result.validation, read_tuned_file(file)
-    assert content["choice"] == json.loads(json.dumps(as_data(met)))
+    assert content["choice"] == json.loads(json.dumps(validation.as_data(met)))
     assert set(content["choice"]["met"][0]) >= {"name", "value", "over", "proper", "nis", "consistent"}
     assert content["held_out"][problem.name]["given"]["score"] == list(study.held_out.evaluations[GIVEN].score)
     assert set(study.choice.model) == set(altitude_problem.TRUE)
@@ -97,7 +75,9 @@ def test_a_tuned_file_keeps_the_choice_as_data_and_own_numbers(altitude):
     np.testing.assert_allclose(again.process_noise_cov, study.filter.model.process_noise_cov, rtol=1e-9)
     np.testing.assert_allclose(again.measurement_noise_cov, study.filter.model.measurement_noise_cov, rtol=1e-9)
     kept = content["choice"]["met"][-1]["choice"]
-    assert choice_from(kept) == choice_from(json.loads(json.dumps(met.met[-1].choice._asdict())))
+    assert validation.choice_from(kept) == validation.choice_from(
+        json.loads(json.dumps(met.met[-1].choice._asdict()))
+    )
 
 
 def test_validation_seeds_are_neither_training_nor_held_out_nor_those_of_sizes():
@@ -124,24 +104,29 @@ def _met(name, value, low, high, consistent=True, proper=0.0):
 
 def test_what_is_not_significantly_better_gives_way_unless_it_is_equal_and_alone_consistent():
     plan = Plan("kf", (LinearProblem(),))
-    assert _wins(_met("trial 1", 0.9, 0.8, 0.99), _met(RULE, 1.0, 1.0, 1.0), plan, True)
-    assert not _wins(_met("trial 1", 0.9, 0.8, 1.01), _met(RULE, 1.0, 1.0, 1.0), plan, True)
+    assert validation._wins(_met("trial 1", 0.9, 0.8, 0.99), _met(RULE, 1.0, 1.0, 1.0), plan, True)
+    assert not validation._wins(_met("trial 1", 0.9, 0.8, 1.01), _met(RULE, 1.0, 1.0, 1.0), plan, True)
     even, wrong = _met("trial 1", 1.00001, 0.99998, 1.00004), _met(RULE, 1.0, 1.0, 1.0, consistent=False)
-    assert _wins(even, wrong, plan, True) and not _wins(even, _met(RULE, 1.0, 1.0, 1.0), plan, True)
-    assert not _wins(_met("trial 1", 1.00001, 0.999, 1.001), wrong, plan, True)
-    assert not _wins(_met("trial 1", 1.00001, 0.99998, 1.00004, consistent=False), wrong, plan, True)
-    assert not _wins(even, wrong, plan._replace(consistent=False), True)
-    assert _wins(_met("trial 1", -5.0, -9.0, -1.0), _met(RULE, 0.0, 0.0, 0.0), plan, False)
+    assert validation._wins(even, wrong, plan, True) and not validation._wins(
+        even, _met(RULE, 1.0, 1.0, 1.0), plan, True
+    )
+    assert not validation._wins(_met("trial 1", 1.00001, 0.999, 1.001), wrong, plan, True)
+    assert not validation._wins(_met("trial 1", 1.00001, 0.99998, 1.00004, consistent=False), wrong, plan, True)
+    assert not validation._wins(even, wrong, plan._replace(consistent=False), True)
+    assert validation._wins(_met("trial 1", -5.0, -9.0, -1.0), _met(RULE, 0.0, 0.0, 0.0), plan, False)
 
 
 def test_consistency_is_wanted_up_to_five_per_cent_and_then_the_proper_score_decides():
     plan, none = Plan("kf", (LinearProblem(),)), (np.ones(3),)
     good, costly = Measured(1.0, none, -3.0, (2.0,)), Measured(2.74, none, -9.0, (1.0,))
     close, fair = Measured(1.04, none, -1.0, (1.5,)), Measured(1.04, none, -9.0, (1.0,))
-    assert _best_of(plan, {"a": good, "b": fair}, True) == ("b", pytest.approx(0.04))
-    assert _best_of(plan, {"a": good, "b": costly, "c": close}, True) == ("c", pytest.approx(1.74))
-    assert _best_of(plan._replace(consistent=False), {"a": good, "b": fair}, True) == ("a", None)
-    assert _best_of(plan, {"a": good}, True) == ("a", None) and _best_of(plan, {}, True) == (None, None)
+    assert validation._best_of(plan, {"a": good, "b": fair}, True) == ("b", pytest.approx(0.04))
+    assert validation._best_of(plan, {"a": good, "b": costly, "c": close}, True) == ("c", pytest.approx(1.74))
+    assert validation._best_of(plan._replace(consistent=False), {"a": good, "b": fair}, True) == ("a", None)
+    assert validation._best_of(plan, {"a": good}, True) == ("a", None) and validation._best_of(plan, {}, True) == (
+        None,
+        None,
+    )
 
 
 def _with_truth(value, proper, nees=1.0, scatter=0.001):
@@ -153,32 +138,39 @@ def _with_truth(value, proper, nees=1.0, scatter=0.001):
 def test_of_filters_within_five_per_cent_the_best_log_score_wins_and_none_is_worse_than_the_best_baseline():
     plan = Plan("kf", (LinearProblem(),))
     singular, right = _with_truth(0.956, -1e5, 5e4), _with_truth(1.0, -3.0, 9.4)
-    assert _by_log_score({"trial 1": singular, GIVEN: right}, "trial 1", GIVEN) == GIVEN
+    assert validation._by_log_score({"trial 1": singular, GIVEN: right}, "trial 1", GIVEN) == GIVEN
     better, slower = _with_truth(0.94, -1e5, 5e4), _with_truth(1.004, -2.0, scatter=0.0)
-    assert _by_log_score({"trial 1": better, GIVEN: right}, "trial 1", GIVEN) == "trial 1"  # 6.4 % is too much
-    assert _by_log_score({GIVEN: right, NOISE: slower}, GIVEN, GIVEN) == NOISE  # 0.4 % is practically nothing
+    assert (
+        validation._by_log_score({"trial 1": better, GIVEN: right}, "trial 1", GIVEN) == "trial 1"
+    )  # 6.4 % is too much
+    assert (
+        validation._by_log_score({GIVEN: right, NOISE: slower}, GIVEN, GIVEN) == NOISE
+    )  # 0.4 % is practically nothing
     worse = _with_truth(1.03, -2.0, scatter=0.0)
-    assert _by_log_score({GIVEN: right, NOISE: worse}, GIVEN, GIVEN) == GIVEN
+    assert validation._by_log_score({GIVEN: right, NOISE: worse}, GIVEN, GIVEN) == GIVEN
     apart = (-3.01 + 0.02 * np.random.default_rng(1).standard_normal(50),)
     unsure, close = _with_truth(0.99, -3.01)._replace(log_scores=apart), _with_truth(1.0, -3.0)
-    assert _by_log_score({"trial 1": unsure, GIVEN: close}, "trial 1", GIVEN) == "trial 1"
+    assert validation._by_log_score({"trial 1": unsure, GIVEN: close}, "trial 1", GIVEN) == "trial 1"
     wrong = unsure._replace(state_nees=0.2)
-    assert _by_log_score({"trial 1": wrong, GIVEN: close}, "trial 1", GIVEN) == GIVEN
+    assert validation._by_log_score({"trial 1": wrong, GIVEN: close}, "trial 1", GIVEN) == GIVEN
     trials = {"a": singular, "b": _with_truth(0.96, -4.0), "c": _with_truth(1.2, -1.0)}
-    assert _best_of(plan, trials, True, right)[0] == "b" and _best_of(plan, trials, True, right)[1] == 0.0
+    assert (
+        validation._best_of(plan, trials, True, right)[0] == "b"
+        and validation._best_of(plan, trials, True, right)[1] == 0.0
+    )
     # Of trials that are better than the best baseline: "d" has the best log score, but does not differ from it.
-    assert _best_of(plan, {**trials, "d": _with_truth(1.0, -2.0)}, True, right)[0] == "b"
+    assert validation._best_of(plan, {**trials, "d": _with_truth(1.0, -2.0)}, True, right)[0] == "b"
 
 
 def test_a_rescaled_trial_has_the_estimates_of_the_trial_and_the_right_nees():
     plan, data = Plan("kf", (LinearProblem(),)), [LinearProblem().data(range(20))]
     noise = {"process_noise_cov": (2e-5,) * 3, "measurement_noise_cov": (1e-4,) * 2}
     trial = untuned_choice("kf", LinearProblem())._replace(model=noise)
-    found = _rescaled({"trial 1": trial}, plan, data)
+    found = validation._rescaled({"trial 1": trial}, plan, data)
     before, after = (measured(one, plan, data) for one in (trial, found["trial 1 rescaled"]))
     assert before.nees > 100.0 and after.nees == pytest.approx(1.0, rel=0.1)
     assert after.value == pytest.approx(before.value, rel=0.02) and after.proper > before.proper + 100.0
-    assert _rescaled({"trial 1": trial}, plan._replace(hold_r=True), data) == {}
+    assert validation._rescaled({"trial 1": trial}, plan._replace(hold_r=True), data) == {}
 
 
 def test_trials_are_rescaled_and_validated_with_the_size_that_they_end_with_and_so_are_baselines(monkeypatch):
@@ -192,36 +184,36 @@ def test_trials_are_rescaled_and_validated_with_the_size_that_they_end_with_and_
     asked = []
     finalists = finalists_of(plan, trials, lambda one, _: asked.append(one) or one.with_size(size))
     assert {one.numbers["ensemble_size"] for one in finalists.values()} == {size} and len(asked) == 1
-    first, rescaled = next(iter(finalists.values())), _rescaled(finalists, plan, data)
+    first, rescaled = next(iter(finalists.values())), validation._rescaled(finalists, plan, data)
     assert measured(next(iter(rescaled.values())), plan, data).nees == pytest.approx(1.0, rel=0.3)
     assert measured(first, plan, data).nees > 3.0
-    found = _baselines_of(plan, first, data)
+    found = validation._baselines_of(plan, first, data)
     assert {one.numbers["ensemble_size"] for one in found.values()} == {size}
-    of_size = scaled_default("enkf", problem, 0, size).choice
-    assert found[SCALED] == of_size != scaled_default("enkf", problem).choice
-    assert (baseline_size(first), baseline_size(first.with_size(6))) == (size, 30)
+    of_size = rules.scaled_default("enkf", problem, 0, size).choice
+    assert found[SCALED] == of_size != rules.scaled_default("enkf", problem).choice
+    assert (rules.baseline_size(first), rules.baseline_size(first.with_size(6))) == (size, 30)
     monkeypatch.setattr(validation, "cost_of", lambda one, *_: one.numbers["ensemble_size"])
     for budget, member in ((60.0, 60), (59.0, 30)):
-        dear = _baselines_of(plan._replace(budget=budget), first, data)
+        dear = validation._baselines_of(plan._replace(budget=budget), first, data)
         assert dear.keys() == found.keys() and {one.numbers["ensemble_size"] for one in dear.values()} == {member}
-    assert _baselines_of(plan._replace(budget=29.0), first, data) == {}
-    assert baseline_size(untuned_choice("kf", problem)) is None
+    assert validation._baselines_of(plan._replace(budget=29.0), first, data) == {}
+    assert rules.baseline_size(untuned_choice("kf", problem)) is None
 
 
 def test_the_answer_of_a_gradient_gives_way_to_a_baseline_as_trials_do(monkeypatch):
     problem = LinearProblem(2, 1, steps=30)
     plan, result = Plan("kf", (problem,)), StudyResult(untuned_choice("kf", problem), 1.0, [], [], 0.0, False)
-    bad = scaled(oracle("kf", problem), 1e4)
+    bad = rules.scaled(rules.oracle("kf", problem), 1e4)
     found = answered_by(result, plan, "optimum of the likelihood", bad)
     met = found.validation
     assert met.gave_way and found.choice == met.named(met.baseline).choice != bad
-    (said, *_) = choice_sentences(as_data(met), plan)
+    (said, *_) = choice_sentences(validation.as_data(met), plan)
     assert said.startswith("The study returns the noise estimation: on 100 validation seeds the optimum of the ")
     assert "is not significantly better (its score is " in said
     assert found.best_value < measured(bad, plan, plan.training_data()).value
     monkeypatch.setattr(validation, "competing_baselines", lambda *_: {GIVEN: bad})
-    found = answered_by(result, plan, "optimum of the likelihood", oracle("kf", problem))
-    assert found.choice == oracle("kf", problem) and found.validation.chosen == "optimum of the likelihood"
+    found = answered_by(result, plan, "optimum of the likelihood", rules.oracle("kf", problem))
+    assert found.choice == rules.oracle("kf", problem) and found.validation.chosen == "optimum of the likelihood"
     assert [one.name for one in found.validation.met] == [GIVEN, "optimum of the likelihood"]  # none is rescaled
 
 
@@ -251,21 +243,21 @@ def test_an_objective_without_a_run_is_that_of_the_other_runs():
 def test_no_trial_no_meeting_and_none_for_objectives_that_runs_have_not_each():
     plan = Plan("kf", (LinearProblem(),), objectives=("nis",))
     result = run_study(open_study("nis", plan), plan, 2)
-    assert result.validation is None and validate(plan, {}, plan.training_data()) is None
+    assert result.validation is None and validation.validate(plan, {}, plan.training_data()) is None
 
 
 def test_a_choice_outside_the_nis_band_is_in_the_headline_whatever_chose_it():
     plan, baseline = Plan("kf", (LinearProblem(),)), _met(GIVEN, 1.0, 1.0, 1.0, True)
     rescaled = _met("trial 3 rescaled", 0.5, 0.4, 0.6, False)._replace(nis=0.09)
     met = Validation((7, 8), True, (baseline, rescaled), GIVEN, "trial 3 rescaled", "trial 3 rescaled", 0.0)
-    _, said = choice_sentences(as_data(met), plan)
+    _, said = choice_sentences(validation.as_data(met), plan)
     assert said == (
         "On 2 validation seeds the mean NIS of trial 3 rescaled is 0.18, outside its band, 1.6 to 2.5, where 2 is "
         "right: do not rely on its innovation covariance."
     )
     inside = met._replace(met=(baseline, rescaled._replace(consistent=True)))
-    assert len(choice_sentences(as_data(inside), plan)) == 1
-    assert len(choice_sentences(as_data(met), plan._replace(consistent=False))) == 1
+    assert len(choice_sentences(validation.as_data(inside), plan)) == 1
+    assert len(choice_sentences(validation.as_data(met), plan._replace(consistent=False))) == 1
 
 
 def of_one_number(q=1.0):
@@ -280,7 +272,7 @@ def test_candidates_stay_within_own_parameters_and_a_full_q_is_an_option_that_th
     problem = ModelProblem(truth, of_one_number, Steps((1.0, 2.0), hold=5), parameters=parameters, **given)
     plan = Plan("kf", (problem,), full_q=full)
     result = run_study(open_study("own", plan), plan, 4)
-    met, said = result.validation, " ".join(choice_sentences(as_data(result.validation), plan))
+    met, said = result.validation, " ".join(choice_sentences(validation.as_data(result.validation), plan))
     if full:
         assert met.chosen == FULL_Q and len(result.choice.model["process_noise_cov"]) == 3 and met.full is None
         assert said.startswith("The study returns the noise estimation with a full Q")
@@ -300,7 +292,7 @@ def test_the_report_says_where_what_was_given_fails_and_why_a_trial_is_taken_or_
     given = _met(GIVEN, 0.0, 0.0, 0.0)
     meeting = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", "trial 3", None)
     meeting = meeting._replace(tested=GIVEN, failures=(failure,), failed=1, runs=48)
-    assert choice_sentences(as_data(meeting), plan) == [
+    assert choice_sentences(validation.as_data(meeting), plan) == [
         "The study returns trial 3: on 2 validation seeds its log-likelihood of a run is 610 [-523, 1740] above "
         "that of the best baseline, the given filter, and it is better in most of them (Wilcoxon's signed ranks, "
         "p = 0.004).",
@@ -308,13 +300,13 @@ def test_the_report_says_where_what_was_given_fails_and_why_a_trial_is_taken_or_
         "mean NIS of 2 is right.",
     ]
     lost = trial._replace(worse_in=("run1.csv",))
-    said = choice_sentences(as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
+    said = choice_sentences(validation.as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
     assert (
         "no trial is significantly better without being worse in a log (trial 3's log-likelihood of a" in said[0]
     )
     assert said[0].endswith("of a run is 610 [-523, 1740] higher, but it is worse in run1.csv).")
     lost = lost._replace(over=Interval(8.9, -51.6, 69.4))
-    said = choice_sentences(as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
+    said = choice_sentences(validation.as_data(meeting._replace(met=(meeting.met[0], lost), chosen=GIVEN)), plan)
     ends = "trial 3's log-likelihood of a run is 8.9 [-51.6, 69.4] lower, and it is worse in run1.csv)."
     assert said[0].endswith(f"no trial is significantly better ({ends}")
 
@@ -344,11 +336,11 @@ def test_where_own_numbers_give_way_to_a_noise_that_they_cannot_give_they_are_sa
     noise = _met(FULL_Q, 1.0, 1.0, 1.0)._replace(choice=of_q)
     given = _met(GIVEN, 1.0, 1.0, 1.0)._replace(choice=own)
     meeting = Validation((7, 8), True, (noise, trial), FULL_Q, "trial 3", FULL_Q, None)
-    said = choice_sentences(as_data(meeting), plan)
+    said = choice_sentences(validation.as_data(meeting), plan)
     begins = "Your own parameters cannot express the Q and R of the noise estimation with a full Q; those of "
     assert said[1].startswith(f"{begins}trial 3 are sigma_a = 0.25, ")
     meeting = Validation((7, 8), True, (given, trial), GIVEN, "trial 3", GIVEN, None)
-    assert len(choice_sentences(as_data(meeting), plan)) == 1
+    assert len(choice_sentences(validation.as_data(meeting), plan)) == 1
 
 
 def test_ranges_are_wide_hold_what_was_given_and_flag_what_ends_at_an_end():

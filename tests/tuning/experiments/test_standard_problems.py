@@ -16,14 +16,7 @@ from tests.filters.checks import refused
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.experiments import benchmark, lorenz63, lorenz96, pendulum, range_bearing
-from tuning.experiments.benchmark import (
-    BENCHMARKS,
-    Published,
-    against_published,
-    find_benchmark,
-    mean_of_roots,
-    noise_free_problem,
-)
+from tuning.experiments.benchmark import BENCHMARKS, Published
 from tuning.problems.check import checked_problem
 from tuning.problems.data import held_out_seeds
 from tuning.problems.find import find_problem
@@ -76,7 +69,7 @@ class TestModels:
 
 def test_the_score_is_the_mean_over_time_of_roots_over_states():
     errors = np.array([[[3.0, 4.0], [0.0, 0.0]], [[1.0, 1.0], [-1.0, 1.0]]])
-    np.testing.assert_allclose(mean_of_roots(errors), [math.sqrt(12.5) / 2, 1.0])
+    np.testing.assert_allclose(benchmark.mean_of_roots(errors), [math.sqrt(12.5) / 2, 1.0])
 
 
 # Mean and standard deviation over runs of 1000 analyses, from 16 runs each by `thruster reproduce`: the band is
@@ -106,7 +99,7 @@ QUICK = {
     ],
 )
 def test_a_published_score_comes_out(study, published, deviation):
-    (row,) = against_published(study.problem, study.model, [published])(range(4), lambda row: None)
+    (row,) = benchmark.against_published(study.problem, study.model, [published])(range(4), lambda row: None)
     assert abs(row.ours.value - published.value) < 3 * deviation / 2 and row.divergences == 0
     assert row.pooled > row.ours.value
 
@@ -115,7 +108,7 @@ def test_a_published_score_comes_out(study, published, deviation):
 def test_inflation_that_adapts_keeps_a_small_ensemble_on_the_ring_which_is_lost_without():
     numbers = {"ensemble_size": 24, "rotations": 1}
     rows = [Published("etkf", numbers | {"adaptive_inflation": number}, 0.18) for number in (0.0, 0.1)]
-    lost, kept = against_published(lorenz96.problem, lorenz96.model, rows)(range(4), lambda row: None)
+    lost, kept = benchmark.against_published(lorenz96.problem, lorenz96.model, rows)(range(4), lambda row: None)
     assert kept.ours.value < 0.2 < 1.0 < lost.ours.value
 
 
@@ -151,7 +144,7 @@ OF_PAGE = {
 def test_a_row_of_the_page_is_recomputed(name, study, label):
     problem, model, rows = study
     (published,) = [one for one in rows if one.label == label]
-    (row,) = against_published(problem, model, [published])(range(benchmark.RUNS), lambda row: None)
+    (row,) = benchmark.against_published(problem, model, [published])(range(benchmark.RUNS), lambda row: None)
     _, theirs, ours, _, median, *_ = row_of_page(name.partition(",")[0], label)
     half = (ours[2] - ours[1]) / 2
     assert theirs == [published.value] and abs(row.ours.value - ours[0]) < half
@@ -176,15 +169,15 @@ def test_the_inflation_that_a_study_found_has_its_score():
     cells = row_of_page("inflation", "etkf | 10")
     numbers = {"ensemble_size": 10, "inflation": cells[2][0], "relaxation": cells[3][0]}
     seeds, rows = held_out_seeds(0, benchmark.RUNS), [Published("etkf", numbers, 0.6)]
-    (row,) = against_published(lorenz63.problem, lorenz63.model, rows)(seeds, lambda row: None)
+    (row,) = benchmark.against_published(lorenz63.problem, lorenz63.model, rows)(seeds, lambda row: None)
     assert abs(row.ours.value - cells[4][0]) < cells[4][2] - cells[4][1]  # a chaotic state
 
 
 def small(why=""):
     settings = {"steps": 30, "first_scored_step": 5, "scale": [1.0] * 3}
     rows = [Published("ekf", {}, 0.92, {"inflation": 180.0}), Published("ekf", {}, 5.0, why=why)]
-    problem = noise_free_problem(lorenz63.model(), **settings)
-    return lorenz63.BENCHMARK._replace(rows=against_published(problem, lorenz63.model, rows))
+    problem = benchmark.noise_free_problem(lorenz63.model(), **settings)
+    return lorenz63.BENCHMARK._replace(rows=benchmark.against_published(problem, lorenz63.model, rows))
 
 
 @pytest.mark.usefixtures("as_python")
@@ -229,13 +222,13 @@ class TestReproduce:
 
 def test_every_benchmark_is_found_and_its_problem_is_one():
     for name, path in BENCHMARKS.items():
-        assert find_benchmark(name).name == name
+        assert benchmark.find_benchmark(name).name == name
         problem = f"{path.partition(':')[0]}:{'sparse' if 'sparse' in name else 'problem'}"
         assert find_problem(problem).name == problem
     for other in ("faded", "jittered"):
         (parameter,) = find_problem(f"tuning.experiments.lorenz63:{other}").parameters
         assert parameter.name in ("inflation", "jitter")
-    refused("benchmark must be one of lorenz63", find_benchmark, "lorenz84")
+    refused("benchmark must be one of lorenz63", benchmark.find_benchmark, "lorenz84")
 
 
 @pytest.mark.slow
@@ -245,7 +238,7 @@ def test_a_study_finds_the_acceleration_of_a_target():
 
 @pytest.mark.slow
 def test_a_study_tunes_inflation_and_nothing_else():
-    short = noise_free_problem(lorenz63.model(), steps=40, first_scored_step=10, scale=[1.0] * 3)
+    short = benchmark.noise_free_problem(lorenz63.model(), steps=40, first_scored_step=10, scale=[1.0] * 3)
     choice = benchmark.run_in_memory(Plan("etkf", (short,), hold_r=True), 3).choice
     errors, _ = benchmark.analysis_errors(choice.filter(short), short.data(short.held_out_seeds(0, 4)))
     assert set(choice.numbers) == {"ensemble_size", "inflation", "relaxation"} and 1 <= choice.numbers["inflation"]
