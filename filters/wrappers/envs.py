@@ -311,7 +311,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         self._watches = [watch for watch in watches_of_copies if watch is not None]  # of all copies, or of none
         self._reports: list = [None] * self.num_envs
         self._measured = list(split.measurements)
-        self._done, self._begun = np.zeros((2, self.num_envs), dtype=bool)
+        self._done, self._begun = np.zeros(self.num_envs, dtype=bool), False
         self._low, self._high = actions.low.ravel(), actions.high.ravel()
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict | None = None):
@@ -333,8 +333,8 @@ class EstimateStates(gym.vector.VectorWrapper):
 
         Raises ValueError, before the envs are stepped, for actions that are not numeric or have the wrong size.
         """
-        if not self._begun.all():
-            raise ValueError("copies must begin with reset(), but step came first")
+        if not self._begun:
+            raise gym.error.ResetNeeded("copies must begin with reset(), but step came first")
         ignored = self._done if self.autoreset_mode == AutoresetMode.NEXT_STEP else False
         u = np.zeros((self.num_envs, 0))
         if len(self._low):
@@ -362,7 +362,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         self._used = getattr(self._beliefs, "used", u)
 
     def _start(self, mask: np.ndarray, z: np.ndarray) -> None:
-        which, self._begun = np.flatnonzero(mask), self._begun | mask
+        which, self._begun = np.flatnonzero(mask), True  # the first time they are all
         self._restarts.start(which)
         self._last_measured[which] = 0.0
         for i in which if self._watches else ():

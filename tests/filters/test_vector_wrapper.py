@@ -187,7 +187,8 @@ def test_copies_begin_with_a_reset_of_all():
     env = SyncVectorEnv([Oscillator] * COPIES, autoreset_mode=AutoresetMode.DISABLED)
     env = EstimateStates(env, model=oscillator())
     actions = np.zeros((COPIES, 1), np.float32)
-    refused(r"must begin with reset\(\), but step came first", env.step, actions)
+    with pytest.raises(gym.error.ResetNeeded, match=r"must begin with reset\(\), but step came first"):
+        env.step(actions)
     env.reset(seed=1)
     env.step(actions)
 
