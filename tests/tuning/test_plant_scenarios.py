@@ -311,6 +311,7 @@ def test_a_bound_is_computed_once_for_the_same_inputs(monkeypatch):
     assert np.array_equal(NOMINAL.bound(of_integers, truths=3), NOMINAL.bound(rounded, truths=3))
     noisier = NOMINAL.replace(process_noise_cov=(4.0, 1.6e-3))
     assert (noisier.bound(first, truths=3) > before).all() and len(asked) == 4
+    assert not np.array_equal(NOMINAL.bound(first._replace(first_scored=400), truths=3), before)
 
 
 def test_estimates_in_an_env_with_a_scenarios_voltages_are_those_on_its_data():
