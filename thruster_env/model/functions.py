@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +17,9 @@ from thruster_env.core.modules import error_line
 from thruster_env.core.sources import as_value, is_array
 from thruster_env.graphs.python_floats import with_floats
 from thruster_env.model.turns import refuse_signs
+
+# Of Jacobians: the function that each was compared with, as models of other constants are made by the thousand.
+_compared_with: weakref.WeakKeyDictionary[Callable, weakref.ref] = weakref.WeakKeyDictionary()
 
 
 def check_functions(model) -> None:
@@ -44,15 +48,25 @@ def check_functions(model) -> None:
                 warnings.warn(sentence, stacklevel=5)
 
 
+def _was_compared(jacobian: Callable, function: Callable) -> bool:
+    """Whether a Jacobian was compared with a function before; from now on it was."""
+    try:
+        before = _compared_with.get(jacobian)
+        _compared_with[jacobian] = weakref.ref(function)
+    except TypeError:  # nothing that a weak reference can be had of
+        return False
+    return before is not None and before() is function
+
+
 def wrong_slope(model, name: str, arguments: str) -> str:
-    """A sentence on the entry of a user's Jacobian that is furthest from the function's slope, if one is.
+    """A sentence on the entry of a user's Jacobian that is furthest from the function's slope, once, if one is.
 
     The slope is a difference at a point near the prior mean, with inputs of zero. An entry counts if it is off by
     more than a tenth, if that is more than a thousandth of what its row changes by when each state does by its
     scale, and if differences of other lengths, above and below, are the same: elsewhere the function has a kink.
     """
     function, jacobian = getattr(model, name), getattr(model, f"{name}_jacobian")
-    if jacobian is None or by_complex_step(jacobian):
+    if jacobian is None or by_complex_step(jacobian) or _was_compared(jacobian, function):
         return ""
     mean, scales = model.prior_mean, model.scales
     reach = np.minimum(scales, np.maximum(1.0, abs(mean)))

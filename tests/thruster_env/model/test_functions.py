@@ -69,6 +69,19 @@ WRONG = {
 }
 
 
+def test_a_jacobian_is_compared_once_with_a_function():
+    def forgotten(x, u, c):
+        return (1.0, 0.0), slopes(x, u, c)[1]
+
+    with pytest.warns(UserWarning, match="must be the slope"):
+        model = made(transition_jacobian=forgotten)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.replace(constants=(1.0,))
+    with pytest.warns(UserWarning, match="must be the slope"):
+        made(lambda x, u, c: swing(x, u, c), transition_jacobian=forgotten)
+
+
 @pytest.mark.parametrize("changes", WRONG.values(), ids=list(WRONG))
 def test_a_jacobian_that_is_not_the_slope_is_said(changes):
     (name,) = changes
@@ -95,12 +108,12 @@ RIGHT = {  # the slopes are compared at 1.15
         "observe": lambda x, c: (abs(x[0] - 1.15),),
         "observe_jacobian": lambda x, c: ((math.copysign(1.0, x[0] - 1.15), 0.0),),
     },
-    "wide prior": {"prior_cov": [1e12, 1e12], "transition_jacobian": slopes},
+    "wide prior": {"prior_cov": [1e12, 1e12], "transition_jacobian": lambda x, u, c: slopes(x, u, c)},
     "small units": {
         "prior_mean": [4e-9, 0.0],
         "prior_cov": [1e-20, 1e-20],
         "process_noise_cov": [1e-20, 1e-20],
-        "transition_jacobian": slopes,
+        "transition_jacobian": lambda x, u, c: slopes(x, u, c),
     },
     "jump of an angle": {
         "observe": lambda x, c: (math.remainder(x[0] - 1.15 + math.pi - 1e-5, 2 * math.pi),),
@@ -109,6 +122,17 @@ RIGHT = {  # the slopes are compared at 1.15
     },
     "no value": {"observe": lambda x, c: (math.sqrt(0.5 - x[0]),), "observe_jacobian": lambda x, c: ((1.0, 0.0),)},
 }
+
+
+def test_a_jacobian_may_be_an_object_without_a_hash():
+    class Slopes:
+        __hash__ = None
+
+        def __call__(self, x, u, c):
+            return slopes(x, u, c)
+
+    for _ in range(2):
+        made(transition_jacobian=Slopes())
 
 
 @pytest.mark.parametrize("changes", RIGHT.values(), ids=list(RIGHT))
