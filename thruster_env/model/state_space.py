@@ -21,7 +21,7 @@ from thruster_env.core.equal_functions import first_equal
 from thruster_env.core.sources import as_value, is_array
 from thruster_env.graphs.python_floats import with_floats
 from thruster_env.model.euler import euler_outputs
-from thruster_env.model.functions import check_functions, takes_input
+from thruster_env.model.functions import check_functions, check_values, takes_input
 from thruster_env.model.quantities import (
     Positions,
     Quantities,
@@ -259,30 +259,38 @@ class StateSpaceModel:
 
     def replace(self, **changes) -> Self:
         """A copy of the model with some fields changed; ValueError as for a new model."""
+        changes |= {"constants": checked_constants(changes["constants"])} if "constants" in changes else {}
+        constants = changes.get("constants", self.constants)
         if (
-            changes.keys() <= NOISE
+            changes.keys() <= NUMBERS
             and not self._has_more
             and _channels(changes.get("measurement_noise_cov", self.measurement_noise_cov)) == self.m
+            and (type(constants), len(constants)) == (type(self.constants), len(self.constants))
+            and not ("constants" in changes and self.turns)
         ):
-            return self._with_noise(changes)
+            return self._with_numbers(changes)
         return dataclasses.replace(self, **changes)
 
     @property
     def _has_more(self) -> bool:
         """Whether a subclass checks or keeps more than the fields: it may depend on covariances, too."""
-        names = {attribute.name for attribute in dataclasses.fields(self)} | {"digest", "feeds"}
+        names = {attribute.name for attribute in dataclasses.fields(self)} | {*OF_FUNCTIONS, "digest", "_packed"}
         return type(self).__post_init__ is not StateSpaceModel.__post_init__ or not vars(self).keys() <= names
 
-    def _with_noise(self, changes: Mapping[str, Any]) -> Self:
-        """`replace` of covariances; no function depends on them, so none is tried again."""
+    def _with_numbers(self, changes: dict[str, Any]) -> Self:
+        """`replace` of covariances, on which no function depends, and of constants, with which each is tried."""
         model = object.__new__(type(self))
+        vars(model).update({name: vars(self)[name] for name in OF_FUNCTIONS & vars(self).keys()})
         for attribute in dataclasses.fields(self):
             value = getattr(self, attribute.name)  # arrays and outputs could be changed: each model has its own
             copied = value.copy() if isinstance(value, np.ndarray | dict) else value
             object.__setattr__(model, attribute.name, copied)
-        for name, value in changes.items():
+        for name in changes.keys() & NOISE:
             measured, size = (True, self.m) if name == "measurement_noise_cov" else (False, self.t)
-            object.__setattr__(model, name, covariance(name, value, size, positive_definite=measured))
+            object.__setattr__(model, name, covariance(name, changes[name], size, positive_definite=measured))
+        if "constants" in changes:
+            object.__setattr__(model, "constants", changes["constants"])
+            check_values(model)
         return model
 
     @property
@@ -433,6 +441,8 @@ def _rounded(value: float, largest: float) -> str:
 
 
 NOISE = {"process_noise_cov", "measurement_noise_cov", "prior_cov"}  # fields that no function depends on
+NUMBERS = {*NOISE, "constants"}  # which change no shape
+OF_FUNCTIONS = {"feeds", "reads_from_outside"}  # properties of functions alone
 
 
 def _channels(r) -> int:

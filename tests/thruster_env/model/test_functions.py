@@ -140,3 +140,23 @@ def test_a_right_jacobian_is_taken_without_a_word(changes):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         made(**changes)
+
+
+def test_a_model_with_other_constants_is_a_new_one_and_refused_as_one():
+    def grows(x, u, c):
+        return math.sqrt(c[0]) * x[0], x[1] + c[1] / c[0]
+
+    def means(model):
+        return run(make_filter("ekf", model), None, np.zeros((1, 2, 1)), np.array([[[0.3], [0.1], [0.4]]])).means
+
+    model, changes = made(grows, constants=(0.5, 0.1)), {"constants": (0.7, 0.2), "process_noise_cov": [0.3, 0.4]}
+    before, expected = (model.digest, model.numbers.tolist()), made(grows, **changes)
+    for changed in (model.replace(**changes), model.replace(**changes | {"constants": np.array([0.7, 0.2])})):
+        np.testing.assert_array_equal(changed.numbers, expected.numbers)
+        np.testing.assert_array_equal(means(changed), means(expected))
+        assert changed.digest == expected.digest != before[0]
+    assert (model.digest, model.numbers.tolist()) == before
+    refused("transition must not be NaN at the prior mean", model.replace, constants=(-1.0, 0.1))
+    refused("constants must be a NamedTuple or a tuple of finite", model.replace, constants=(math.nan, 0.1))
+    refused("must work for 2 states and 1 input, but raised IndexError", model.replace, constants=[0.5])
+    assert model.replace(constants=(0.0, 0.1)).constants == (0.0, 0.1)  # a division by zero is infinite
