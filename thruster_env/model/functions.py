@@ -49,7 +49,7 @@ def check_functions(model) -> None:
 
 
 def check_values(model) -> None:
-    """`check_functions` of a model whose functions passed it with other constants, in a tenth of the time."""
+    """`check_functions` of a model whose functions passed it with other numbers, in a tenth of the time."""
     arguments = {"transition": "x, u, c", "observe": "x, u, c" if model.feeds else "x, c"}
     by_users = (name for name in arguments if not by_complex_step(getattr(model, f"{name}_jacobian")))
     finite = True

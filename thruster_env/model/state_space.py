@@ -134,7 +134,7 @@ class StateSpaceModel:
         """Check shapes and signs, and try the functions; raise ValueError that states the rule and the value."""
         mean = vector("prior_mean", self.prior_mean)
         n, r = len(mean), self.measurement_noise_cov
-        m = _channels(r)
+        m = _length(r)
         states, turns = with_rotations(self.states, self.turns)
         measurements, measured_turns = with_rotations(self.measurements, self.measured_turns)
         t, channels = n - len(turns), m + len(measured_turns)
@@ -264,7 +264,8 @@ class StateSpaceModel:
         if (
             changes.keys() <= NUMBERS
             and not self._has_more
-            and _channels(changes.get("measurement_noise_cov", self.measurement_noise_cov)) == self.m
+            and _length(changes.get("measurement_noise_cov", self.measurement_noise_cov)) == self.m
+            and _length(changes.get("prior_mean", self.prior_mean)) == self.n
             and (type(constants), len(constants)) == (type(self.constants), len(self.constants))
             and not ("constants" in changes and self.turns)
         ):
@@ -278,7 +279,7 @@ class StateSpaceModel:
         return type(self).__post_init__ is not StateSpaceModel.__post_init__ or not vars(self).keys() <= names
 
     def _with_numbers(self, changes: dict[str, Any]) -> Self:
-        """`replace` of covariances, on which no function depends, and of constants, with which each is tried."""
+        """`replace` of covariances, on which no function depends, and of numbers with which each is tried."""
         model = object.__new__(type(self))
         vars(model).update({name: vars(self)[name] for name in OF_FUNCTIONS & vars(self).keys()})
         for attribute in dataclasses.fields(self):
@@ -288,8 +289,12 @@ class StateSpaceModel:
         for name in changes.keys() & NOISE:
             measured, size = (True, self.m) if name == "measurement_noise_cov" else (False, self.t)
             object.__setattr__(model, name, covariance(name, changes[name], size, positive_definite=measured))
+        if "prior_mean" in changes:
+            mean = unit_mean(vector("prior_mean", changes["prior_mean"], self.n), self.turns)
+            object.__setattr__(model, "prior_mean", mean)
         if "constants" in changes:
             object.__setattr__(model, "constants", changes["constants"])
+        if not changes.keys() <= NOISE:
             check_values(model)
         return model
 
@@ -441,10 +446,10 @@ def _rounded(value: float, largest: float) -> str:
 
 
 NOISE = {"process_noise_cov", "measurement_noise_cov", "prior_cov"}  # fields that no function depends on
-NUMBERS = {*NOISE, "constants"}  # which change no shape
+NUMBERS = {*NOISE, "prior_mean", "constants"}  # which change no shape
 OF_FUNCTIONS = {"feeds", "reads_from_outside"}  # properties of functions alone
 
 
-def _channels(r) -> int:
-    """Number m of measurements for which a measurement noise covariance is given: of a plain number one."""
-    return len(r) if isinstance(r, (list, tuple, np.ndarray)) and np.ndim(r) else 1
+def _length(value) -> int:
+    """Rows of a covariance or numbers of a vector as it is given: of a plain number one."""
+    return len(value) if isinstance(value, (list, tuple, np.ndarray)) and np.ndim(value) else 1

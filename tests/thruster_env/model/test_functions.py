@@ -142,7 +142,7 @@ def test_a_right_jacobian_is_taken_without_a_word(changes):
         made(**changes)
 
 
-def test_a_model_with_other_constants_is_a_new_one_and_refused_as_one():
+def test_a_model_with_other_numbers_is_a_new_one_and_refused_as_one():
     def grows(x, u, c):
         return math.sqrt(c[0]) * x[0], x[1] + c[1] / c[0]
 
@@ -160,3 +160,11 @@ def test_a_model_with_other_constants_is_a_new_one_and_refused_as_one():
     refused("constants must be a NamedTuple or a tuple of finite", model.replace, constants=(math.nan, 0.1))
     refused("must work for 2 states and 1 input, but raised IndexError", model.replace, constants=[0.5])
     assert model.replace(constants=(0.0, 0.1)).constants == (0.0, 0.1)  # a division by zero is infinite
+    moved, expected = model.replace(prior_mean=[2, 3]), made(grows, constants=(0.5, 0.1), prior_mean=[2.0, 3.0])
+    np.testing.assert_array_equal(moved.numbers, expected.numbers)
+    np.testing.assert_array_equal(means(moved), means(expected))
+    refused("prior_mean must be 2 finite numbers, but got", model.replace, prior_mean=[math.nan, 0.0])
+    refused("must be 3 x 3", model.replace, prior_mean=[1.0, 2.0, 3.0])
+    refused(
+        "observe must not be NaN", made(observe=lambda x, c: (math.log(x[0]),)).replace, prior_mean=[-1.0, 0.0]
+    )
