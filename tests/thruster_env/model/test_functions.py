@@ -164,7 +164,6 @@ def test_a_model_with_other_numbers_is_a_new_one_and_refused_as_one():
     np.testing.assert_array_equal(moved.numbers, expected.numbers)
     np.testing.assert_array_equal(means(moved), means(expected))
     refused("prior_mean must be 2 finite numbers, but got", model.replace, prior_mean=[math.nan, 0.0])
-    refused("must be 3 x 3", model.replace, prior_mean=[1.0, 2.0, 3.0])
-    refused(
-        "observe must not be NaN", made(observe=lambda x, c: (math.log(x[0]),)).replace, prior_mean=[-1.0, 0.0]
-    )
+    refused("prior_cov must be 3 variances", model.replace, prior_mean=[1.0, 2.0, 3.0])
+    of_logarithm = made(observe=lambda x, c: (math.log(x[0]),))
+    refused("observe must not be NaN at the prior mean", of_logarithm.replace, prior_mean=[-1.0, 0.0])
