@@ -13,7 +13,8 @@ import numpy as np
 from filters.engine.belief import Kernels, filter_offset, memory_offsets
 from filters.filter import Filter
 from filters.pages.kernels import nothing_to_summarise
-from thruster_env.core.angles import angle_writer, wrapped
+from thruster_env.core import matrices
+from thruster_env.core.angles import angle_writer, with_wrapped_angles, wrapped
 from thruster_env.core.checks import at_least, positive, short_repr
 from thruster_env.core.sources import Source, vector_reader, vector_writer, written_out
 from thruster_env.model.shape import (
@@ -21,7 +22,6 @@ from thruster_env.model.shape import (
     Shape,
     constants_reader,
     for_any_input,
-    innovation_of,
     number_offsets,
 )
 
@@ -116,7 +116,8 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     store_innovation, cov, s = vector_writer(m, layout.innovation), layout.cov, layout.innovation_cov
     prior_mean, control = vector_reader(n, source.prior_mean), vector_reader(shape.inputs)
     constants = constants_reader(shape)
-    measured, difference = vector_reader(m), innovation_of(shape)
+    subtract = matrices.innovation(m, 0)  # z - y, zero in channels that are NaN
+    measured, difference = vector_reader(m), with_wrapped_angles(subtract, "z, y", shape.measurement_angles)
     component, channel = inverted or (0, 0)
     angle, inverts = shape.measurement_angles[channel], inverted is not None
     of_both = written_out("of_both", "x, both", "observe(x, both[0], both[1])", observe=observe)

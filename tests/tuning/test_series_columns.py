@@ -8,8 +8,8 @@ import pytest
 import tuning
 from tests.filters.checks import refused
 from tests.tuning.test_series import NILE, simulated
-from thruster_env.logs.findings import resolution_of_values, unmeasured
-from tuning.series.column import column_of
+from thruster_env.logs.findings import unmeasured
+from tuning.series.column import column_of, resolution_of_values
 
 Z = np.random.default_rng(1).normal(size=60)
 

@@ -7,7 +7,6 @@ differ; and the way times were read, if the file does not state it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -41,7 +40,6 @@ ACROSS = 0.25  # share of a turn that their steps across its end have at most
 SELDOM = 0.25  # share of a channel's samples that a placeholder may have
 REPEATS, UNLIKE = 0.6, 0.9  # most new samples in all of a slower sensor, and fewest values in its new samples
 SINGLE, MOSTLY = 1.5, 0.9  # resolutions of a single step, and share of such steps in a quantised channel
-COARSE = 0.5  # most values of a quantised channel in its samples
 OFTENER = 4.0
 SPIKE, ALONE = 7.0, 2.0
 AROUND = 25  # samples before and after, whose differences tell the noise, too
@@ -267,19 +265,6 @@ def unmeasured(values: np.ndarray) -> tuple[np.ndarray, list[tuple[str, str]]]:
         text = f"has each number {times} times, as its sensor is slower than the log: repeats are left out"
         texts.append((REPEATED, text))
     return left_out, texts
-
-
-def resolution_of_values(values: np.ndarray) -> float:
-    """The step of which all differences of numbers without NaN are multiples, 0 if there is none."""
-    levels = np.unique(values)
-    if len(levels) < 2 or len(levels) > COARSE * len(values):
-        return 0.0
-    steps = np.diff(levels)
-    rounding = 1e-12 * float(np.abs(levels).max())
-    steps = steps[steps > 2.0 * rounding]  # the same number in other digits
-    unit = float(steps.min(initial=math.inf))
-    off = np.abs(steps - unit * np.round(steps / unit)) if math.isfinite(unit) else np.ones(1)
-    return unit if (off <= 1e-6 * unit + 2.0 * rounding).all() else 0.0
 
 
 def _is_staircase(changes: np.ndarray, regular: bool) -> bool:

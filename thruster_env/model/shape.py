@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thruster_env.core import matrices
-from thruster_env.core.angles import with_wrapped_angles
 from thruster_env.core.checks import covariance_root
 from thruster_env.core.derivatives import jacobian
 from thruster_env.core.equal_functions import first_equal
@@ -75,11 +73,6 @@ class Functions(NamedTuple):
     transition_jacobian: Callable | None
     observe: Callable
     observe_jacobian: Callable | None
-
-
-def innovation_of(shape: Shape, first: int = 0) -> Callable:
-    """Return `subtract(z, y)`: z - y[first:], angles wrapped, zero in channels that are NaN in z."""
-    return with_wrapped_angles(matrices.innovation(shape.m, first), "z, y", shape.measurement_angles)
 
 
 def constants_form(constants: tuple) -> type | int:

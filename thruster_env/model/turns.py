@@ -344,12 +344,6 @@ def errors_of(model: Any, means: np.ndarray, states: np.ndarray) -> np.ndarray:
     return angles.wrapped_where(errors, [quantity.angle for quantity in tangent_of(model, known)])
 
 
-def rotation_angles(errors: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
-    """The angle [rad] of the error of each rotation, pose or direction, (turns, ...) of errors (..., t)."""
-    parts = [slice(turn.tangent, turn.tangent + min(turn.size, 3)) for turn in turns]
-    return np.array([np.sqrt((errors[..., part] ** 2).sum(axis=-1)) for part in parts])
-
-
 # The steps, on sequences of components: floats, arrays of them, or numbers that are traced.
 
 

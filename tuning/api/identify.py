@@ -39,14 +39,17 @@ from tuning.api.result import Result, drawn, frame, plain_data
 from tuning.likelihood.identify import STARTS, Profile, Validation, profile_figure, profiles, validate
 from tuning.likelihood.identify import identify as identify_runs
 from tuning.likelihood.objective import Objective
-from tuning.likelihood.recorded import likelihood_of
-from tuning.likelihood.result import Identification, covariance, is_narrow
-from tuning.logs.problem import AnyStepFamily, check_offsets, family_of, remarks, split_runs, write_found
+from tuning.likelihood.parametric import ModelFamily
+from tuning.likelihood.recorded import CLOCK, likelihood_of
+from tuning.likelihood.result import Identification, covariance, is_narrow, write_values
+from tuning.logs.problem import AnyStepFamily, family_of, remarks, split_runs
 from tuning.logs.read import pairs
+from tuning.problems.find import logs_package
 from tuning.problems.problem import Coordinates, Parameter
 from tuning.search.parameters import index_pairs
 
 DEFAULT_OUT = Path("out/identified.toml")  # of the command
+OFFSET_SHARE = 4  # a clock offset may be at most the length of a log divided by this
 RANGE, START = "ranges (--range)", "start (--start)"
 
 if TYPE_CHECKING:
@@ -436,3 +439,35 @@ def check_excitation(objective: Objective, logs: Sequence[Log], start: np.ndarra
             f"logs must excite the free parameters, but constant inputs do not determine {', '.join(loose)}: "
             "hold these, or record steps"
         )
+
+
+def check_offsets(parameters: Sequence[Parameter], logs: Sequence[Log]) -> None:
+    """Raise ValueError unless ranges of clock offsets are short: without common data any model would fit."""
+    most = min(log.times[-1] for log in logs) / OFFSET_SHARE
+    for parameter in parameters:
+        if parameter.name.startswith(CLOCK) and max(-parameter.low, parameter.high) > most:
+            raise ValueError(
+                f"the range of {parameter.name} must be within a quarter of the shortest log, {most:g} s, but is "
+                f"from {parameter.low:g} to {parameter.high:g}"
+            )
+
+
+def write_found(path: str | Path, result: Identification, family: Any, logs: Sequence[str]) -> None:
+    """Write the preset file of a thruster, or the values of a model.
+
+    Args:
+        path: path of a file that ends in .toml.
+        result: from `tuning.likelihood.identify`.
+        family: from `family_of`.
+        logs: names of the training runs.
+
+    Raises:
+        ValueError: if the path has another ending or cannot be written.
+    """
+    if not str(path).endswith(".toml"):
+        raise ValueError(f"a file of identified parameters must end in .toml, but got {short_repr(str(path))}")
+    family = family.plain if isinstance(family, AnyStepFamily) else family
+    if isinstance(family, ModelFamily):
+        write_values(path, result, logs, getattr(family, "dt", None))  # of a family of logs
+    else:
+        logs_package().write_identified(path, result, family, logs)

@@ -9,15 +9,6 @@ from _signal import SIGINT, getsignal, signal  # `signal` itself takes milliseco
 INTERRUPTED = 130
 
 
-def loads_a_package(frame) -> bool:
-    """Whether an import is under way, in which an exception may get lost or leave a package in pieces."""
-    while frame is not None:
-        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
-            return True
-        frame = frame.f_back
-    return False
-
-
 def leave(*_) -> None:
     """End the process now, as an interrupted one, with the cursor that a progress bar may have hidden."""
     try:

@@ -14,9 +14,18 @@ import sys
 import warnings
 from _signal import SIG_IGN, SIGINT, getsignal, signal  # `signal` itself takes milliseconds: Ctrl-C may come
 
-from tuning.cli.interrupts import INTERRUPTED, leave, loads_a_package
+from tuning.cli.interrupts import INTERRUPTED, leave
 
 BROKEN_PIPE = 141
+
+
+def loads_a_package(frame) -> bool:
+    """Whether an import is under way, in which an exception may get lost or leave a package in pieces."""
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
 
 
 def run() -> None:

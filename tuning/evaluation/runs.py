@@ -15,7 +15,7 @@ from thruster_env.core.angles import difference
 from thruster_env.model.euler import EulerAngle
 from thruster_env.model.quantities import Quantity
 from thruster_env.model.state_space import StateSpaceModel
-from thruster_env.model.turns import errors_of, leading, readings, rotation_angles
+from thruster_env.model.turns import Turn, errors_of, leading, readings
 from tuning.problems.data import FIRST_SCORED_STEP, Data, estimates_in_parts, where_true
 
 LEAST = -1e6  # log score of a step whose covariance is singular or not finite
@@ -247,3 +247,9 @@ def _output_mean_squares(filter_: Filter, estimates: Estimates, data: Data) -> d
         errors = difference(values[..., None], truth[:, late, None], (angle,))[..., 0]
         mean_squares[symbol] = mean_of(errors**2)
     return mean_squares
+
+
+def rotation_angles(errors: np.ndarray, turns: Sequence[Turn]) -> np.ndarray:
+    """The angle [rad] of the error of each rotation, pose or direction, (turns, ...) of errors (..., t)."""
+    parts = [slice(turn.tangent, turn.tangent + min(turn.size, 3)) for turn in turns]
+    return np.array([np.sqrt((errors[..., part] ** 2).sum(axis=-1)) for part in parts])

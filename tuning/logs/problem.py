@@ -31,8 +31,8 @@ from thruster_env.model.state_space import StateSpaceModel
 from thruster_env.model.turns import innovations_of
 from tuning.likelihood.identify import identify
 from tuning.likelihood.parametric import ModelFamily
-from tuning.likelihood.recorded import CLOCK, clock_offsets, shifted
-from tuning.likelihood.result import Identification, write_values
+from tuning.likelihood.recorded import clock_offsets, shifted
+from tuning.likelihood.result import Identification
 from tuning.logs.read import (
     check_model,
     check_on_grid,
@@ -59,7 +59,6 @@ SHORTEST_HELD_OUT = 50  # rows of that part
 SHORTEST_PIECE = 10  # rows of a run between gaps: fewer tell little beside how they begin
 GYROSCOPE = ("gyroscope", "bias_walk")  # numbers of `attitude` that a log of motion does not determine
 CORRELATED = 0.1  # of innovations with later ones, at least
-OFFSET_SHARE = 4  # a clock offset may be at most the length of a log divided by this
 
 
 def log_problem(
@@ -551,35 +550,3 @@ def of_gyroscope(names: Sequence[str], model: StateSpaceModel, runs: Sequence[Lo
         "rises, and attitudes get worse. Hold it at the number of the data sheet, or of a log at rest (thruster "
         "log --allan)."
     ]
-
-
-def check_offsets(parameters: Sequence[Parameter], logs: Sequence[Log]) -> None:
-    """Raise ValueError unless ranges of clock offsets are short: without common data any model would fit."""
-    most = min(log.times[-1] for log in logs) / OFFSET_SHARE
-    for parameter in parameters:
-        if parameter.name.startswith(CLOCK) and max(-parameter.low, parameter.high) > most:
-            raise ValueError(
-                f"the range of {parameter.name} must be within a quarter of the shortest log, {most:g} s, but is "
-                f"from {parameter.low:g} to {parameter.high:g}"
-            )
-
-
-def write_found(path: str | Path, result: Identification, family: Any, logs: Sequence[str]) -> None:
-    """Write the preset file of a thruster, or the values of a model.
-
-    Args:
-        path: path of a file that ends in .toml.
-        result: from `tuning.likelihood.identify`.
-        family: from `family_of`.
-        logs: names of the training runs.
-
-    Raises:
-        ValueError: if the path has another ending or cannot be written.
-    """
-    if not str(path).endswith(".toml"):
-        raise ValueError(f"a file of identified parameters must end in .toml, but got {short_repr(str(path))}")
-    family = family.plain if isinstance(family, AnyStepFamily) else family
-    if isinstance(family, ModelFamily):
-        write_values(path, result, logs, getattr(family, "dt", None))  # of a family of logs
-    else:
-        logs_package().write_identified(path, result, family, logs)

@@ -16,18 +16,15 @@ from filters.consistency.time_constants import Run
 from filters.engine.batch import Estimates, run
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
-from filters.starts import begun_at, first_measured
 from thruster_env.core.checks import at_least, with_progress
 from thruster_env.core.parallel import cores
 from thruster_env.model.shape import LANES
-from thruster_env.model.state_space import StateSpaceModel
 
 FIRST_SCORED_STEP = 50  # RMSE is of steps 50 to 500; the start-up is reported separately
 MOST_BYTES = 2**28  # of a part's estimates: a run of 1000 steps with forty states and channels takes 26 MB
 MOST_SEEDS = 20_000  # runs of 500 steps with so many seeds take a gigabyte
 SEEDS_APART = 1_000_000  # training seeds of study seed s start at s times this, held-out seeds half-way on ...
 SIZES_FROM = SEEDS_APART // 4  # ... those that choose the ensemble size in between ...
-UNKNOWN = np.deg2rad(20.0)  # standard deviation of a prior's attitude from which it is none
 VALIDATION_FROM = 3 * SEEDS_APART // 4  # ... and those on which the best trials meet the baselines behind
 
 
@@ -170,18 +167,6 @@ class Data(NamedTuple):
             if array is not None:
                 array.setflags(write=False)
         return self
-
-
-def begun_if_unknown(model: StateSpaceModel, data: Data) -> Data:
-    """The data, whose runs begin where the first measurement says if the model's prior knows no attitude.
-
-    Filters that linearise need one that is near: from above 20 degrees on an axis of a rotation they do.
-    """
-    rotations = [slice(turn.tangent, turn.tangent + min(turn.size, 3)) for turn in model.turns]
-    variances = np.diag(model.prior_cov)
-    if not any((variances[part] > UNKNOWN**2).any() for part in rotations):
-        return data
-    return data._replace(begun=begun_at(model, first_measured(data.measurements)))
 
 
 def checked_first_scored_step(value: Any, steps: int) -> int:

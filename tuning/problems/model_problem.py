@@ -16,6 +16,7 @@ import numpy as np
 from filters.baselines import OpenLoop
 from filters.bounds import gathering_code, has_bound, posterior_variances, sequences_taken
 from filters.starts import PRIOR as RUNS_PROBLEM_PRIOR
+from filters.starts import begun_at, first_measured
 from filters.tuned_file import NOISE, PRIOR
 from thruster_env.core.angles import difference
 from thruster_env.core.checks import as_floats, short_repr
@@ -32,7 +33,6 @@ from tuning.problems.check import check_quantities
 from tuning.problems.data import (
     FIRST_SCORED_STEP,
     Data,
-    begun_if_unknown,
     checked_first_scored_step,
     estimates_in_parts,
 )
@@ -44,7 +44,20 @@ if TYPE_CHECKING:
     from thruster_env.graphs.loops import Loops
 
 
+UNKNOWN = np.deg2rad(20.0)  # standard deviation of a prior's attitude from which it is none
 _known: dict[str, tuple[float, ...]] = {}  # of this process
+
+
+def begun_if_unknown(model: StateSpaceModel, data: Data) -> Data:
+    """The data, whose runs begin where the first measurement says if the model's prior knows no attitude.
+
+    Filters that linearise need one that is near: from above 20 degrees on an axis of a rotation they do.
+    """
+    rotations = [slice(turn.tangent, turn.tangent + min(turn.size, 3)) for turn in model.turns]
+    variances = np.diag(model.prior_cov)
+    if not any((variances[part] > UNKNOWN**2).any() for part in rotations):
+        return data
+    return data._replace(begun=begun_at(model, first_measured(data.measurements)))
 
 
 def average_bound(model: StateSpaceModel, data: Data, truths: int = 100) -> np.ndarray:

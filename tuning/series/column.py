@@ -29,7 +29,6 @@ from thruster_env.logs.findings import (
     STUCK,
     WRAPPED,
     Remark,
-    resolution_of_values,
     sentences,
 )
 from thruster_env.logs.grid import resolution_of_digits
@@ -42,6 +41,7 @@ from thruster_env.model.state_space import StateSpaceModel
 
 LEAST_ROWS = 20  # with a number
 SPARSE = 2.0  # rows of a grid a number, from which on numbers have their own times
+COARSE = 0.5  # most values of a quantised column in its numbers
 DIGITS = 1e-12  # of the largest number: noise that is rounding
 MOST_AXES = 6
 RANGES = 1e-60, 1e60  # of a column's numbers, of which Q and R are squares
@@ -459,3 +459,16 @@ def _peaks(times: np.ndarray, values: np.ndarray, dt: float) -> tuple[float, ...
             peaks.append(float(frequencies[highest]))
             smooth[max(highest - 2 * width, 0) : highest + 2 * width + 1] = 0.0
     return tuple(dict.fromkeys(peaks))
+
+
+def resolution_of_values(values: np.ndarray) -> float:
+    """The step of which all differences of numbers without NaN are multiples, 0 if there is none."""
+    levels = np.unique(values)
+    if len(levels) < 2 or len(levels) > COARSE * len(values):
+        return 0.0
+    steps = np.diff(levels)
+    rounding = 1e-12 * float(np.abs(levels).max())
+    steps = steps[steps > 2.0 * rounding]  # the same number in other digits
+    unit = float(steps.min(initial=math.inf))
+    off = np.abs(steps - unit * np.round(steps / unit)) if math.isfinite(unit) else np.ones(1)
+    return unit if (off <= 1e-6 * unit + 2.0 * rounding).all() else 0.0
