@@ -110,7 +110,8 @@ def test_rounding_is_no_other_number_and_what_no_run_reaches_is_missed():
     assert digest_of(np.zeros((2, 3))) != digest_of(np.zeros((3, 2)))
     assert digest_of({"a": 1}) != digest_of({"a": 2})
     assert pendulums(model(transition=swing_beyond)).digest == pendulums(model()).digest
-    wrong = model(transition_jacobian=lambda x, u, c: ((1.0, 0.0), (0.0, 1.0)))
+    with pytest.warns(UserWarning, match="transition_jacobian must be the slope of transition"):
+        wrong = model(transition_jacobian=lambda x, u, c: ((1.0, 0.0), (0.0, 1.0)))
     assert pendulums(wrong).digest == pendulums(model()).digest
 
 
