@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -91,7 +92,8 @@ def fit(
         save_figure(fitted.plot(), plot)
     if code is not None:
         write_whole(code, "\n".join(_section(fitted, name) for name in LANGUAGES))
-    return fitted
+    files = tuple(str(path) for path in (plot, code) if path is not None)
+    return replace(fitted, files=files) if files else fitted
 
 
 def _section(fitted: SeriesFit, language: str) -> str:

@@ -137,6 +137,7 @@ class SeriesFit(Result):
         gate: number of standard deviations of S beyond which numbers are outliers, if some were left out.
         jumps: rows at which an axis jumps, and its innovations there [standard deviations].
         peaks: why numbers far from their prediction were not left out; empty if there are none.
+        files: that were written.
     """
 
     column: Column
@@ -148,6 +149,7 @@ class SeriesFit(Result):
     gate: float | None = None
     jumps: tuple[tuple[int, float], ...] = ()
     peaks: str = ""
+    files: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -417,6 +419,7 @@ class SeriesFit(Result):
                 {"model": name, "behind": loss, "standard_error": error} for name, loss, error in self._standings()
             ],
             "sentences": self.sentences(),
+            "files": list(self.files),
         }
         return plain_data(data)
 
@@ -456,6 +459,9 @@ class SeriesFit(Result):
             sentences.append(f"Log-likelihood of unseen blocks less the best model's: {', '.join(rivals)}.")
         heading = f"{heading}, {missing} missing" if missing else heading
         heading = f"{heading}, {outliers} outliers left out" if outliers else heading
+        further = "Next: --code FILE.md (fit.code) writes it for a controller; elsewhere it is"
+        if any(path.endswith(".md") for path in self.files):
+            further = "Other commands take it as"
         return [
             heading,
             *first,
@@ -463,7 +469,8 @@ class SeriesFit(Result):
             numbers,
             *lines,
             *sentences,
-            "Next: --code FILE.md (fit.code) writes it for a controller; elsewhere it is",
+            *(f"wrote {path}" for path in self.files),
+            further,
             Unfolded(f'--model "{self.text}"'),
         ]
 
