@@ -279,7 +279,7 @@ class StateSpaceModel:
         return type(self).__post_init__ is not StateSpaceModel.__post_init__ or not vars(self).keys() <= names
 
     def _with_numbers(self, changes: dict[str, Any]) -> Self:
-        """`replace` of covariances, on which no function depends, and of numbers with which each is tried."""
+        """`replace` of numbers; functions are tried with new constants and prior means, none needs covariances."""
         model = object.__new__(type(self))
         vars(model).update({name: vars(self)[name] for name in OF_FUNCTIONS & vars(self).keys()})
         for attribute in dataclasses.fields(self):
